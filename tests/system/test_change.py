@@ -99,9 +99,9 @@ def test_the_jump_is_told_with_its_time_size_and_letters(walked: Kept) -> None:
         assert event.since_ns is not None
         assert (event.since_ns - began_ns) / 1e9 == pytest.approx(JUMP_S, abs=3.0)
         assert (event.t_ns - began_ns) / 1e9 < JUMP_S + 15.0
-        assert event.what["N"]["before"] == pytest.approx(BEFORE["N"], rel=0.1)
-        assert event.what["N"]["after"] == pytest.approx(AFTER["N"], rel=0.25)
-        assert "Q" not in event.what
+        assert event.values["N"]["before"] == pytest.approx(BEFORE["N"], rel=0.1)
+        assert event.values["N"]["after"] == pytest.approx(AFTER["N"], rel=0.25)
+        assert "Q" not in event.values
 
 
 def test_n_rises_at_once_and_q_stays(walked: Kept) -> None:

@@ -147,7 +147,7 @@ def render_page(
     except ImportError as error:
         raise ConfigError(MISSING_MESSAGE) from error
     environment = Environment(
-        loader=PackageLoader("monitor.publishing"),
+        loader=PackageLoader("monitor.publishing.reports"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

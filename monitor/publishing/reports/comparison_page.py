@@ -103,7 +103,7 @@ def render_page(c: Comparison) -> str:
     except ImportError as error:
         raise ConfigError(MISSING) from error
     environment = Environment(
-        loader=PackageLoader("monitor.publishing"),
+        loader=PackageLoader("monitor.publishing.reports"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

@@ -36,8 +36,8 @@ def feed(clock, arrived_s, ticks=None, lost=None, values=None):
     for a, b in pairwise(edges):
         t_ns = np.rint(arrived_s[a:b] * NS).astype(np.int64)
         counted = None if ticks is None else np.array(ticks[a:b], np.int64)
-        out += clock.stamp(make_block(t_ns, values[a:b].copy(), None, counted, 0 if lost is None else int(lost[a])))
-    assert sum(len(one) for one in out) + clock.repeated == len(arrived_s)
+        out += clock.assign_times(make_block(t_ns, values[a:b].copy(), None, counted, 0 if lost is None else int(lost[a])))
+    assert sum(len(one) for one in out) + clock.repeated_rows == len(arrived_s)
     assert (np.diff(times(out)) > 0).all()
     return out
 
@@ -399,7 +399,7 @@ def stamp_given(clock, t_s, values, rows):
     return [
         one
         for at in range(0, len(t_ns), rows)
-        for one in clock.stamp(make_block(t_ns[at : at + rows].copy(), values[at : at + rows].copy()))
+        for one in clock.assign_times(make_block(t_ns[at : at + rows].copy(), values[at : at + rows].copy()))
     ]
 
 

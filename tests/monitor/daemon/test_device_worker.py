@@ -190,7 +190,7 @@ def test_no_sample_is_missing_from_the_courses_that_are_published():
         rig.work(1000.0 + 0.05 * i)
     rig.work(1010.0, drain=True)
     assert 18 <= len(rig.caught.estimates) <= 22
-    t_ns = np.concatenate([estimate.course.t_ns for _, estimate in rig.caught.estimates])
+    t_ns = np.concatenate([estimate.history.t_ns for _, estimate in rig.caught.estimates])
     assert np.array_equal(t_ns, np.arange(1000) * 10_000_000)
 
 
@@ -206,7 +206,7 @@ def test_a_fit_at_every_sample_waits_for_its_kernels():
     assert rig.caught.estimates == []
     ready.all.set()
     rig.work(1000.1)
-    assert rig.caught.estimates[-1][1].course.t_ns.size == 300
+    assert rig.caught.estimates[-1][1].history.t_ns.size == 300
 
 
 def test_a_pause_is_not_made_up_for():
@@ -366,7 +366,7 @@ def stamp(rig, n, rate_hz, rng):
     at, rig.stamped = rig.stamped, rig.stamped + n
     arrived_s = (at + np.arange(n)) / rate_hz + rng.uniform(0.0, 0.02, n)
     for t_ns in np.maximum.accumulate(10**12 + np.rint(arrived_s * 1e9).astype(np.int64)):
-        rig.station.clock.stamp(make_block(np.array([t_ns]), np.zeros((1, 6))))
+        rig.station.clock.assign_times(make_block(np.array([t_ns]), np.zeros((1, 6))))
 
 
 def statuses(estimate):
@@ -476,7 +476,7 @@ def test_a_replay_has_ended_when_its_samples_are_fitted():
     assert rig.station.ended
     rig.bring(10)
     rig.work(1003.0)
-    assert rig.station.chain.watch is not None
+    assert rig.station.chain.signal_monitor is not None
 
 
 def test_at_a_low_rate_everything_is_there_before_the_kernels_are_compiled():
@@ -563,7 +563,7 @@ def test_the_moment_it_disagrees_is_an_event_and_so_is_the_return(tmp_path):
         rig.work(1000.0 + 0.5 * i)
         for _, event in rig.caught.events:
             if event.kind == "model_disagrees":
-                told.setdefault((event.axis, event.what["model"]["agrees"]), i)
+                told.setdefault((event.axis, event.values["model"]["agrees"]), i)
     assert {axis for axis, _ in told} == {"gx", "gy", "gz", "ax", "ay", "az"}
     assert all(60 < i < 100 for (_, agrees), i in told.items() if not agrees)
     assert sum(1 for _, agrees in told if agrees) == 6
@@ -774,16 +774,16 @@ def replayed(tmp_path, **more):
 
 def test_before_its_first_sample_a_recording_has_no_time(tmp_path):
     rig = replayed(tmp_path)
-    rig.station.report([rig.caught], {}, 0)
+    rig.station.publish_status([rig.caught], {}, 0)
     rig.station.driver.state = "running"
-    rig.station.report([rig.caught], {}, 0)
-    rig.station.announce([rig.caught], "recording_stopped", "no room")
+    rig.station.publish_status([rig.caught], {}, 0)
+    rig.station.publish_event([rig.caught], "recording_stopped", "no room")
     rig.work(1000.0)
     assert rig.caught.health_times == [None, None]
     assert rig.caught.events == []
     rig.bring(10)
     rig.work(1001.0)
-    rig.station.report([rig.caught], {}, 0)
+    rig.station.publish_status([rig.caught], {}, 0)
     assert rig.caught.health_times[2:] == [0.09]
     assert [(at_s, event.text) for at_s, event in rig.caught.events] == [(0.09, "no room")]
     rig.station.driver.state = "lost"
@@ -826,7 +826,7 @@ def test_slow_statistics_of_a_rebuilt_window_have_its_time(tmp_path):
     rig = replayed(tmp_path)
     index = np.arange(400)
     values = 1e-3 * np.random.default_rng(1).standard_normal((400, 6))
-    rig.station.chain.relive(make_block(10**9 + index * 10_000_000, values), RATE)
+    rig.station.chain.replay(make_block(10**9 + index * 10_000_000, values), RATE)
     for i in range(10_000):
         rig.work(1000.0 + 100.0 * i)
         if rig.caught.totals:

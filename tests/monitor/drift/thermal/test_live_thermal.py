@@ -82,7 +82,7 @@ def test_how_samples_are_cut_makes_no_difference(edges):
 def test_a_step_of_the_bias_is_an_event():
     _, (event,) = stepped()
     assert (event.kind, event.axis) == (KIND, "gz")
-    assert event.what["bias"]["size"] == pytest.approx(STEP, rel=0.15)
+    assert event.values["bias"]["size"] == pytest.approx(STEP, rel=0.15)
     assert event.since_ns == pytest.approx(AT_H * 3600e9, abs=INTERVAL_S * 1e9)
     assert event.t_ns - event.since_ns == pytest.approx(4 * INTERVAL_S * 1e9, rel=0.3)
     assert event.sigma > 5.0
