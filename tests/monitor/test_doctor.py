@@ -345,6 +345,7 @@ def run(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
     )
 
 
+@pytest.mark.long
 def test_the_command_prints_a_sign_a_line_and_ends_with_1_if_anything_is_wrong(tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text(VIRTUAL + QUIET)
     (tmp_path / "c.toml").chmod(0o600)
@@ -362,6 +363,7 @@ def test_the_command_prints_a_sign_a_line_and_ends_with_1_if_anything_is_wrong(t
     assert "→ chmod o-w c.toml" in wrong.stdout
 
 
+@pytest.mark.long
 def test_json_alone_goes_to_standard_output(tmp_path: Path) -> None:
     done = run(tmp_path, "none.toml", "--json", "-")
     assert done.returncode == 1

@@ -55,6 +55,7 @@ def test_all_of_it(recording: Path) -> None:
     assert shares[-1] == 1.0
 
 
+@pytest.mark.long
 def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     t = np.arange(43_200) / 2.0
@@ -127,6 +128,7 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
         assert "† its slow part is temperature" in page
 
 
+@pytest.mark.long
 def test_listed_tau_are_those_of_every_curve_as_far_as_they_are_possible(recording: Path) -> None:
     listed = (0.1, 0.2, 0.5, 1.0, 2.0, 100.0)
     results = make(Request(recording, tau=listed, others=True))
@@ -158,6 +160,7 @@ def test_what_is_wrong_is_said(tmp_path: Path, recording: Path) -> None:
         make(Request(recording, window_s=0.1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "start"), [("x.png", b"\x89PNG"), ("x.html", b"<!DOCTYPE html>")])
 def test_a_drawing_has_the_changes_marked(recording: Path, name: str, start: bytes) -> None:
     pytest.importorskip("matplotlib")

@@ -243,6 +243,7 @@ def test_samples_wait_for_a_rate_and_none_is_left_out():
     assert (found.samples, found.curve.n, found.rate_hz) == (400, 400, 100.0)
 
 
+@pytest.mark.long
 def test_a_rate_known_better_is_the_new_label():
     lines = text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az"))
     rig = Rig(rate=None, decoder=text.build(lines))
@@ -606,6 +607,7 @@ def test_choosing_a_model_holds_no_round_up(monkeypatch):
     assert rig.station._can_take()  # a sensor never waits
 
 
+@pytest.mark.long
 def test_a_recording_waits_for_its_model(monkeypatch):
     rig = Rig(thermal_s=1.0, link=LoopbackLink(epoch="unix"))
     index = np.arange(4000)

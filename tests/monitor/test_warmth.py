@@ -50,6 +50,7 @@ def test_what_was_temperature_is_gone_and_the_rest_stays(warm):
     assert "without temperature (polynomial 1), K falls from " in note
 
 
+@pytest.mark.long
 def test_temperature_that_explains_nothing_takes_nothing(warm):
     result, warmth = warm
     still = result.values.copy()

@@ -46,6 +46,7 @@ def test_it_learns_how_bias_follows_temperature():
     assert not any(run.found)
 
 
+@pytest.mark.long
 def test_an_interval_is_expected_before_it_is_known():
     """Two records that differ in their last interval alone are expected to end the same."""
     means = hourly(2, 2, 0.05)
@@ -56,6 +57,7 @@ def test_an_interval_is_expected_before_it_is_known():
     assert two.one_step.side(other[-1]) == 1
 
 
+@pytest.mark.long
 def test_a_step_that_temperature_does_not_explain_is_told_once_and_then_expected():
     means = hourly(3, 2, 0.05)
     size = 0.5 * np.ptp(means.bias)
@@ -78,6 +80,7 @@ def test_a_step_that_temperature_explains_is_none():
     assert not any(run.found)
 
 
+@pytest.mark.long
 def test_a_new_offset_is_learned_and_nothing_is_told():
     means = hourly(5, 2, 0.05)
     run = Run().give(means.bias[:50], means.temperature_c[:50])
@@ -111,6 +114,7 @@ def test_a_choice_is_made_in_pieces_and_holds_nothing_up():
     assert run.looks[-1].one_step is not None
 
 
+@pytest.mark.long
 def test_choices_follow_at_growing_spacings():
     means = hourly(8, 1, 0.05)
     run, at = Run(slow=True), []
@@ -125,6 +129,7 @@ def test_choices_follow_at_growing_spacings():
     assert len(at) >= 6
 
 
+@pytest.mark.long
 def test_what_is_missing_is_passed_over():
     means = hourly(9, 2, 0.05)
     biases, warmth = means.bias.copy(), means.temperature_c.copy()

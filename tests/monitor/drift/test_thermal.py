@@ -53,6 +53,7 @@ def test_without_lag_a_polynomial_is_taken_and_nothing_lost(noise):
     assert all(one.model.shape == Shape(1, ()) for one in found)
 
 
+@pytest.mark.long
 def test_one_step_estimates_know_the_bias_before():
     """A bias that wanders by itself is met by the measured one before, which temperature says nothing of."""
     ratios, inside = [], []

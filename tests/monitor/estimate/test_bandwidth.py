@@ -63,6 +63,7 @@ def test_n_survives_any_bandwidth(order, cutoff_hz):
     assert found.bandwidth_hz[there] == pytest.approx(cutoff_hz, rel=0.3)
 
 
+@pytest.mark.long
 def test_white_noise_and_lines_have_no_bandwidth():
     white = N * 10.0 * np.random.default_rng(4).standard_normal((200_000, 6))
     assert np.isnan(analyzed(white).bandwidth_hz).all()

@@ -183,6 +183,7 @@ def test_a_departure_ends_where_the_curve_comes_back():
     assert findings._departure(curve, fit, 0) == (1, 2)  # the first is only many σ off, the fifth by chance
 
 
+@pytest.mark.long
 def test_a_filter_that_is_not_known_is_told_too():
     # a moving average of two: no Butterworth
     white = 1e-3 * np.random.default_rng(8).standard_normal((200_001, 6))

@@ -53,6 +53,7 @@ def test_equals_the_batch_on_the_window(samples, factors):
     check(SlowStatistics(window), window, values)
 
 
+@pytest.mark.long
 @settings(max_examples=12, deadline=None)
 @given(
     samples=st.integers(FEWEST, 400),
@@ -124,6 +125,7 @@ def test_an_emptied_window_takes_its_results_along():
     check(slow, window, np.concatenate([made(FEWEST - 1), made(100)]))
 
 
+@pytest.mark.long
 def test_a_growing_window_is_followed():
     values = made(400)
     window = AllanWindow(400, cluster_sizes(400, 1.0))

@@ -131,6 +131,7 @@ def test_a_suffix_that_is_none_is_said(tmp_path: Path) -> None:
         history_file.save(made(), tmp_path / "h.doc")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axes", [("gx", "gz", "az"), ("az",), ("gx",)], ids=str)
 def test_the_picture_is_drawn_of_any_axes(tmp_path: Path, axes: tuple[str, ...]) -> None:
     pytest.importorskip("matplotlib")

@@ -49,6 +49,7 @@ def lettered(axes) -> dict[str, list[tuple[float, float]]]:
     return found
 
 
+@pytest.mark.long
 def test_both_kinds_side_by_side_in_all_colours(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "plot.png"

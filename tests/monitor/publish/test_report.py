@@ -112,6 +112,7 @@ def test_the_facts_of_the_recording_are_on_the_page() -> None:
     assert dict(report.facts(analysis()))["missing samples"] == "none"
 
 
+@pytest.mark.long
 def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, long: Dynamic) -> None:
     path = tmp_path / "report.html"
     report.html_report(analysis(), path, "a <b> & c", dynamic=long, marks=[Mark(1500.0, "gz")])

@@ -260,6 +260,7 @@ def test_watch_prints_plain_tables_where_there_is_no_terminal(endpoint: str) -> 
     assert "\x1b" not in text
 
 
+@pytest.mark.long
 def test_watch_on_a_terminal_ends_with_ctrl_c_and_exit_0(endpoint: str) -> None:
     code = f"""
         from rich.console import Console
