@@ -179,12 +179,14 @@ def test_who_comes_late_gets_the_last_values_and_events(endpoint: str) -> None:
     kept = {topic: topic.kept for topic in (topics.STATUS, topics.COEFFICIENTS, topics.EVENT)}
     far = free_endpoint()
     with (
-        session(mode="router", listen=[endpoint]),
-        session(mode="router", listen=[far], connect=[endpoint]),
+        session(mode="router", listen=[endpoint]) as near,
+        session(mode="router", listen=[far], connect=[endpoint]) as beyond,
         contextlib.closing(ZenohOut(ZenohTable(listen=(), connect=(endpoint,)), ["a"])) as out,
     ):
         out.start()
         wait_for(lambda: out.state == "ok")
+        with near.declare_queryable("linked", lambda query: query.reply("linked", b"")):
+            wait_for(lambda: any(reply.ok for reply in beyond.get("linked")), "the link between the routers")
         for i in range(15):
             for topic in kept:
                 out.put(topic, "a", f"{topic.name} {i}".encode())
