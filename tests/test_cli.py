@@ -503,6 +503,7 @@ def test_a_model_without_a_rate_asks_for_one(call: Call) -> None:
     assert len(Path("x.csv").read_text().splitlines()) == 1201
 
 
+@pytest.mark.long
 def test_what_was_simulated_is_analyzed(call: Call) -> None:
     said = call("simulate", "consumer-mems", "--seconds", "3min", "--out", "x.parquet", "--truth")
     assert (said.status, said.err) == (0, "")
@@ -515,6 +516,7 @@ def test_what_was_simulated_is_analyzed(call: Call) -> None:
     assert noise["lo"] <= 1.5e-4 <= noise["hi"]
 
 
+@pytest.mark.long
 def test_the_end_of_a_recording_alone(call: Call, recording: Path) -> None:
     said = call("analyze", str(recording), "--last", "1min", "--json", "-")
     assert said.status == 0
@@ -559,6 +561,7 @@ def growing(pid: int, folder: Path) -> bool:
 # --- analyze ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_json_on_standard_output_is_all_there_is(call: Call, recording: Path) -> None:
     said = call("analyze", str(recording), "--json", "-")
     assert (said.status, said.err) == (0, "")
@@ -587,6 +590,7 @@ def test_json_on_standard_output_is_all_there_is(call: Call, recording: Path) ->
         assert table["coefficients"]["N"]["status"] == "estimated"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("grid", ["octave", "decade10", "0.01,0.05,0.5,5,50"])
 def test_deviations_are_those_of_allantools(call: Call, recording: Path, grid: str) -> None:
     said = call("analyze", str(recording), "--json", "x.json", "--tau", grid)
@@ -638,6 +642,7 @@ def test_a_rate_makes_a_recording_without_times_readable(call: Call) -> None:
     assert json.loads(said.out)["seconds"] == 120 / 50
 
 
+@pytest.mark.long
 def test_a_file_cut_off_in_the_middle_is_read_up_to_the_cut(call: Call, recording: Path) -> None:
     whole = recording.read_bytes()
     at = whole.index(b"\n", len(whole) // 2) + 20  # inside a line
@@ -701,6 +706,7 @@ def test_a_window_gives_curves_over_time(call: Call, recording: Path, window: st
     assert n["value"] == pytest.approx([whole] * 41, rel=0.1)
 
 
+@pytest.mark.long
 def test_a_window_longer_than_the_recording_is_an_answer_too(call: Call, recording: Path) -> None:
     said = call("analyze", str(recording), "--window", "1h", "--json", "x.json")
     assert said.status == 3
@@ -773,6 +779,7 @@ def test_a_model_is_exported(call: Call, arguments: tuple[str, ...], words: list
     assert Path("x").read_text() == said.out
 
 
+@pytest.mark.long
 def test_what_analyze_wrote_is_exported(call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert call("analyze", str(recording), "--json", "x.json").status == 0
     found = json.loads(Path("x.json").read_bytes())["axes"]
@@ -1223,6 +1230,7 @@ def histories(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_history_prints_plots_and_exports(call: Call, histories: Path, tmp_path: Path) -> None:
     said = call(
         "history", str(histories), "--device", "bench-1", "--axis", "gz",

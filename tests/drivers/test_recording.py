@@ -1006,6 +1006,7 @@ class TestRealRecordings:
     def folder(self):
         return recordings()
 
+    @pytest.mark.long
     def test_all_load(self, folder):
         files = sorted([*folder.glob("*/*.npz"), *folder.glob("lego-hub-temp/*.csv")])
         assert len(files) >= 25

@@ -292,6 +292,7 @@ def test_versions_are_compared_by_their_numbers(version: str, wanted: str, fits:
     assert satisfies(version, wanted) is fits
 
 
+@pytest.mark.long
 def test_kernels_that_cannot_be_kept_are_told(tmp_path: Path) -> None:
     assert cache_folder() is not None
     say = "from monitor.compiled import cache_folder; print(cache_folder())"

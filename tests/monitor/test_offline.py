@@ -37,6 +37,7 @@ def test_only_what_is_wanted_is_made(recording: Path) -> None:
     assert (change.axis, change.since) == (0, pytest.approx(15_000, abs=50))
 
 
+@pytest.mark.long
 def test_all_of_it(recording: Path) -> None:
     told: list[tuple[str, float | None]] = []
     results = make(Request(recording, window_s=30.0, others=True), lambda what, share: told.append((what, share)))

@@ -555,6 +555,7 @@ def test_the_window_is_held_against_the_model_in_force(tmp_path):
     assert rig.caught.events == []
 
 
+@pytest.mark.long
 def test_the_moment_it_disagrees_is_an_event_and_so_is_the_return(tmp_path):
     rig = Rig(window_s=20.0, model=model_file(tmp_path))
     told = {}
@@ -582,6 +583,7 @@ def follow_temperature(rig, seconds, begin_s=0.0):
         rig.work(begin_s + 0.1 * i)
 
 
+@pytest.mark.long
 def test_bias_is_held_against_temperature():
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 30.0)

@@ -32,6 +32,7 @@ def warm():
     return analyze([samples], RATE_HZ), warmth
 
 
+@pytest.mark.long
 def test_what_was_temperature_is_gone_and_the_rest_stays(warm):
     result, warmth = warm
     found = without_temperature(result, warmth)

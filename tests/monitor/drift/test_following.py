@@ -32,6 +32,7 @@ def shares(looks, biases):
     return np.mean([one.one_step.side(bias) == 0 for one, bias in zip(looks, biases, strict=True)])
 
 
+@pytest.mark.long
 def test_it_learns_how_bias_follows_temperature():
     means = hourly(1, 2, 0.05)
     run = Run().give(means.bias, means.temperature_c)
@@ -73,6 +74,7 @@ def test_a_step_that_temperature_does_not_explain_is_told_once_and_then_expected
     assert run.looks[-1].slope == pytest.approx(COEFFICIENT, rel=0.3)  # still known
 
 
+@pytest.mark.long
 def test_a_step_that_temperature_explains_is_none():
     means = hourly(4, 0, 0.05)
     jumped = means.temperature_c + 1.5 * (np.arange(72) >= 50)

@@ -37,6 +37,7 @@ def test_the_sensor_s_own_bandwidth_is_told_once_for_axes_alike():
     )
 
 
+@pytest.mark.long
 def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
     values = white(400_000)
     values[:, 1] += 2e-3 * np.sin(2.0 * np.pi * 0.5 * np.arange(400_000) / RATE_HZ)

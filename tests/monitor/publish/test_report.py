@@ -72,6 +72,7 @@ class Page(HTMLParser):
             self.cells[-1] = f"{self.cells[-1]} {data}".strip()
 
 
+@pytest.mark.long
 def test_numbers_stand_with_unit_interval_or_word() -> None:
     result = analysis()
     page = Page(report.html(result, "bench-1"))
@@ -144,6 +145,7 @@ def test_a_recording_without_accelerometers_has_one_column() -> None:
     assert "Accelerometers" not in text
 
 
+@pytest.mark.long
 def test_the_same_analysis_gives_the_same_page() -> None:
     result = analysis()
     result.estimate.curve.avar[:, 3:] = np.nan
@@ -157,6 +159,7 @@ def test_without_its_libraries_it_says_what_to_install(monkeypatch: pytest.Monke
         report.html(analysis())
 
 
+@pytest.mark.long
 def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot write the report"):
         report.html_report(analysis(), tmp_path / "absent" / "report.html")
