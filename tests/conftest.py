@@ -13,9 +13,9 @@ from tests.support.kernels import compile_kernels
 from tests.support.ports import release_claims
 from tests.support.waiting import PATIENCE_S
 
-WORKERS_PER_CORE: Final = 2
-"""Tests wait more than they compute, so two workers for each core keep the processor busy."""
-MAX_WORKERS: Final = 8
+WORKERS_PER_CORE: Final = 3
+"""Many tests wait, so three workers for each core keep the processors busy."""
+MAX_WORKERS: Final = 12
 LONG_FOLDERS: Final = {"experiments", "system"}
 """End-to-end, fault, network and fuzzing tests, blind trials of the reconciliation, and tests of the benchmarks."""
 

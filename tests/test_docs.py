@@ -213,6 +213,7 @@ def defined() -> set[str]:
     return names
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("page", "heading"),
     [

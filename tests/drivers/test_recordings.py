@@ -179,6 +179,7 @@ class TestPieceByPiece:
         assert list(path.parent.iterdir()) == [path]
         assert path.read_bytes() == before
 
+    @pytest.mark.long
     def test_memory_does_not_grow_with_the_rows(self, path):
         """What Python and NumPy hold; Arrow's own buffers are those of one piece."""
         t, values, temperature = samples(5_000)
@@ -435,6 +436,7 @@ class TestText:
         recording = load_samples(written(tmp_path / f"x{suffix}", "gx\n1\nx\n3\n"), 10.0)
         assert np.array_equal(recording.values[:, 0], [1.0, np.nan, 3.0], equal_nan=True)
 
+    @pytest.mark.long
     def test_line_numbers_far_into_the_file(self, tmp_path, suffix):
         line = "1.25,0.0000000000000000000000000001\n"
         n = 3 * READ_BYTES // len(line)
@@ -1004,6 +1006,7 @@ class TestRealRecordings:
     def folder(self):
         return recordings()
 
+    @pytest.mark.long
     def test_all_load(self, folder):
         files = sorted([*folder.glob("*/*.npz"), *folder.glob("lego-hub-temp/*.csv")])
         assert len(files) >= 25

@@ -87,6 +87,7 @@ def kept(folder: Path, step_s: int | None = 60) -> HistoryTable:
         return past.read_history(reader, "bench-1", TimeRange(-math.inf, math.inf), step_s=step_s)
 
 
+@pytest.mark.long
 def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, recording: Path) -> None:
     told = Told()
     # slow enough that each minute of the recording lasts seconds, in which a loaded machine publishes something
@@ -134,6 +135,7 @@ def asked(tmp_path: Path, recording: Path) -> Iterator[tuple[Service, Any]]:
         assert not thread.is_alive()
 
 
+@pytest.mark.long
 def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None:
     _, client = asked
 
@@ -159,6 +161,7 @@ def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None
     assert "nothing in that time; kept are 2020-09-13" in answer("_time=[now(-1h)..]")
 
 
+@pytest.mark.long
 def test_a_damaged_history_is_said_in_the_status_and_to_who_asks(asked: tuple[Service, Any]) -> None:
     service, client = asked
     assert service.history is not None

@@ -504,6 +504,7 @@ def test_a_model_without_a_rate_asks_for_one(call: Call) -> None:
     assert len(Path("x.csv").read_text().splitlines()) == 1201
 
 
+@pytest.mark.long
 def test_what_was_simulated_is_analyzed(call: Call) -> None:
     said = call("simulate", "consumer-mems", "--seconds", "3min", "--out", "x.parquet", "--truth")
     assert (said.status, said.err) == (0, "")
@@ -516,6 +517,7 @@ def test_what_was_simulated_is_analyzed(call: Call) -> None:
     assert noise["lo"] <= 1.5e-4 <= noise["hi"]
 
 
+@pytest.mark.long
 def test_the_end_of_a_recording_alone(call: Call, recording: Path) -> None:
     said = call("analyze", str(recording), "--last", "1min", "--json", "-")
     assert said.status == 0
@@ -530,6 +532,7 @@ def test_the_end_of_a_recording_alone(call: Call, recording: Path) -> None:
         assert len(found["gx"]) == 2000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("suffix", [".csv", ".npz"])
 def test_a_simulation_that_is_broken_off_leaves_nothing(tmp_path: Path, number: int, suffix: str) -> None:
@@ -559,6 +562,7 @@ def growing(pid: int, folder: Path) -> bool:
 # --- analyze ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_json_on_standard_output_is_all_there_is(call: Call, recording: Path) -> None:
     said = call("analyze", str(recording), "--json", "-")
     assert (said.status, said.err) == (0, "")
@@ -587,6 +591,7 @@ def test_json_on_standard_output_is_all_there_is(call: Call, recording: Path) ->
         assert table["coefficients"]["N"]["status"] == "estimated"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("grid", ["octave", "decade10", "0.01,0.05,0.5,5,50"])
 def test_deviations_are_those_of_allantools(call: Call, recording: Path, grid: str) -> None:
     said = call("analyze", str(recording), "--json", "x.json", "--tau", grid)
@@ -638,6 +643,7 @@ def test_a_rate_makes_a_recording_without_times_readable(call: Call) -> None:
     assert json.loads(said.out)["seconds"] == 120 / 50
 
 
+@pytest.mark.long
 def test_a_file_cut_off_in_the_middle_is_read_up_to_the_cut(call: Call, recording: Path) -> None:
     whole = recording.read_bytes()
     at = whole.index(b"\n", len(whole) // 2) + 20  # inside a line
@@ -665,6 +671,7 @@ def test_too_short_a_recording_is_an_answer_too(call: Call, target: str) -> None
     assert "at least 50 are needed" in result["notes"][0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("option", ["--json", "--plot"])
 def test_a_result_that_cannot_be_written_is_one_line(call: Call, recording: Path, option: str) -> None:
     Path("file").touch()
@@ -687,6 +694,7 @@ def test_total_and_hadamard_deviations_are_those_of_allantools(call: Call, recor
         np.testing.assert_allclose(table["total"]["deviation"], total, rtol=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("window", ["60", "1min"])
 def test_a_window_gives_curves_over_time(call: Call, recording: Path, window: str) -> None:
     said = call("analyze", str(recording), "--window", window, "--json", "-")
@@ -699,6 +707,7 @@ def test_a_window_gives_curves_over_time(call: Call, recording: Path, window: st
     assert n["value"] == pytest.approx([whole] * 41, rel=0.1)
 
 
+@pytest.mark.long
 def test_a_window_longer_than_the_recording_is_an_answer_too(call: Call, recording: Path) -> None:
     said = call("analyze", str(recording), "--window", "1h", "--json", "x.json")
     assert said.status == 3
@@ -716,6 +725,7 @@ def test_a_window_of_too_few_samples_is_wrong(call: Call, recording: Path) -> No
     assert "window of 0.1 s: 10 samples at 100 Hz; possible are 1 to" in said.only_line()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", ["x.png", "x.html"])
 def test_a_plot_is_what_its_name_says(call: Call, recording: Path, name: str) -> None:
     pytest.importorskip("matplotlib")
@@ -727,6 +737,7 @@ def test_a_plot_is_what_its_name_says(call: Call, recording: Path, name: str) ->
     assert start.startswith(b"\x89PNG" if name == "x.png" else b"<!DOCTYPE html>")
 
 
+@pytest.mark.long
 def test_motion_is_told_and_struck_out_on_demand(call: Call, recording: Path) -> None:
     columns = np.loadtxt(recording, delimiter=",", skiprows=1)
     columns[9000:9300, 1] += np.sin(np.arange(300) / 20)
@@ -769,6 +780,7 @@ def test_a_model_is_exported(call: Call, arguments: tuple[str, ...], words: list
     assert Path("x").read_text() == said.out
 
 
+@pytest.mark.long
 def test_what_analyze_wrote_is_exported(call: Call, recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert call("analyze", str(recording), "--json", "x.json").status == 0
     found = json.loads(Path("x.json").read_bytes())["axes"]
@@ -823,6 +835,7 @@ def hidden_line(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "bench.npz"
 
 
+@pytest.mark.long
 def test_what_is_missing_is_named_and_written_down(call: Call, hidden_line: Path) -> None:
     model = str(hidden_line.with_name("model.toml"))
     said = call("reconcile", str(hidden_line), "--model", model, "--out", "found", "--seed", "4")
@@ -894,6 +907,7 @@ def test_an_axis_that_stands_still_is_no_answer(call: Call) -> None:
 # --- as a process ----------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_bar_shows_on_a_terminal_and_is_gone_at_the_end(recording: Path) -> None:
     pty = pytest.importorskip("pty", reason="there are no pseudo-terminals here")
     master, terminal = pty.openpty()
@@ -911,6 +925,7 @@ def test_a_bar_shows_on_a_terminal_and_is_gone_at_the_end(recording: Path) -> No
     assert shown.rindex(b"\x1b[2K") < shown.index(b"Gyroscopes")  # erased before the table
 
 
+@pytest.mark.long
 def test_an_interrupt_ends_an_analysis_in_one_line(tmp_path: Path) -> None:
     values = np.random.default_rng(1).standard_normal((1_000_000, 6))
     np.savez(tmp_path / "long.npz", fs=100.0, **dict(zip(AXES, values.T, strict=True)))
@@ -932,6 +947,7 @@ main()
         assert one.rest() == "imu-monitor: interrupted\n"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_ends_a_comparison_in_one_line(tmp_path: Path, number: int) -> None:
     values = np.random.default_rng(1).standard_normal((400_000, 6))
@@ -965,6 +981,7 @@ def test_a_wrong_file_ends_a_real_process(tmp_path: Path) -> None:
     ]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "arguments", [("check", "--print-defaults"), ("analyze", "RECORDING", "--json", "-"), ("--help",)]
 )
@@ -978,6 +995,7 @@ def test_a_reader_that_has_gone_is_no_crash(recording: Path, arguments: tuple[st
     assert (done.returncode, done.stderr) == (1, b"")
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full here")
 @pytest.mark.parametrize("arguments", [("RECORDING", "--json", "-"), ("RECORDING",)])
 def test_a_full_disk_behind_standard_output_is_one_line(recording: Path, arguments: tuple[str, ...]) -> None:
@@ -1026,6 +1044,7 @@ def daemon(command: list[str]) -> Iterator[Daemon]:
         one.process.stderr.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize("command", ["demo", "run"])
 def test_a_signal_stops_in_order(tmp_path: Path, command: str, number: int) -> None:
@@ -1042,6 +1061,7 @@ def test_a_signal_stops_in_order(tmp_path: Path, command: str, number: int) -> N
     assert not Path(port).exists()  # the simulated port is taken away again
 
 
+@pytest.mark.long
 def test_a_second_interrupt_ends_at_once() -> None:
     source = """
 import sys, time
@@ -1102,6 +1122,7 @@ def test_the_demo_receives_every_sample_that_its_sensor_sent() -> None:
     assert lost + bad <= dropped
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("where", ["full disk", "closed pipe"])
 def test_a_log_that_cannot_be_written_stops_no_samples(where: str) -> None:
     if where == "full disk":
@@ -1146,6 +1167,7 @@ def bound(process: psutil.Process) -> list[tuple[str, int]]:
     return sorted(found)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("viewer", "least"), [("none", 1), ("web", 3)])
 def test_defaults_listen_on_loopback_only(viewer: str, least: int) -> None:
     """zenoh's port; with the page also Rerun's server and the page itself."""
@@ -1159,6 +1181,7 @@ def test_defaults_listen_on_loopback_only(viewer: str, least: int) -> None:
         assert one.status_after(signal.SIGTERM) == 0
 
 
+@pytest.mark.long
 def test_a_zenoh_file_opens_nothing_by_what_it_leaves_out(tmp_path: Path) -> None:
     """One that is there for TLS only must not turn scouting on."""
     (tmp_path / "zenoh.json5").write_text("{ /* nothing of scouting */ transport: {} }")
@@ -1170,6 +1193,7 @@ def test_a_zenoh_file_opens_nothing_by_what_it_leaves_out(tmp_path: Path) -> Non
         assert addresses[0][0] == "127.0.0.1"
 
 
+@pytest.mark.long
 def test_watching_listens_nowhere() -> None:
     with daemon([*PROGRAM, "watch", "--seconds", "3"]) as one:
         process = psutil.Process(one.process.pid)
@@ -1207,6 +1231,7 @@ def histories(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_history_prints_plots_and_exports(call: Call, histories: Path, tmp_path: Path) -> None:
     said = call(
         "history", str(histories), "--device", "bench-1", "--axis", "gz",

@@ -143,6 +143,7 @@ def one_signal_dbc(start: int, length: int, big: bool, signed: bool, scale: floa
     return text + (f"SIG_VALTYPE_ 100 S : {kind};\n" if kind else "")
 
 
+@pytest.mark.long
 @settings(max_examples=200, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data(), kind=KINDS, frames=st.lists(st.binary(min_size=8, max_size=8), min_size=1, max_size=5))
 def test_any_signal_decodes_as_cantools_says(

@@ -306,6 +306,7 @@ def test_a_fast_replay_by_arrival(rate):
     assert times(out)[-1] / NS == pytest.approx(T0 + 4.0, abs=0.1)
 
 
+@pytest.mark.long
 def test_a_crystal_that_drifts_is_followed_as_it_warms_up():
     index = np.arange(900 * 100)
     taken = T0 + np.cumsum((1.0 + 50e-6 * np.sin(2 * np.pi * index / index.size)) / 100.0)

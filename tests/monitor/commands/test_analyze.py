@@ -38,6 +38,7 @@ def test_only_what_is_wanted_is_made(recording: Path) -> None:
     assert (change.axis, change.since) == (0, pytest.approx(15_000, abs=50))
 
 
+@pytest.mark.long
 def test_all_of_it(recording: Path) -> None:
     told: list[tuple[str, float | None]] = []
     results = run_analysis(
@@ -58,6 +59,7 @@ def test_all_of_it(recording: Path) -> None:
     assert shares[-1] == 1.0
 
 
+@pytest.mark.long
 def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
     rng = np.random.default_rng(5)
     t = np.arange(43_200) / 2.0
@@ -130,6 +132,7 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
         assert "† its slow part is temperature" in page
 
 
+@pytest.mark.long
 def test_listed_tau_are_those_of_every_curve_as_far_as_they_are_possible(recording: Path) -> None:
     listed = (0.1, 0.2, 0.5, 1.0, 2.0, 100.0)
     results = run_analysis(Request(recording, tau=listed, total_and_hadamard=True))
@@ -161,6 +164,7 @@ def test_what_is_wrong_is_said(tmp_path: Path, recording: Path) -> None:
         run_analysis(Request(recording, window_s=0.1))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("name", "start"), [("x.png", b"\x89PNG"), ("x.html", b"<!DOCTYPE html>")])
 def test_a_drawing_has_the_changes_marked(recording: Path, name: str, start: bytes) -> None:
     pytest.importorskip("matplotlib")

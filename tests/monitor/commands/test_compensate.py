@@ -25,6 +25,7 @@ def write(path: Path, seconds: float = 300.0, turn: float = 0.0, **more: np.ndar
     return path
 
 
+@pytest.mark.long
 def test_the_recording_comes_out_without_its_drift(tmp_path, capsys):
     recording, out = write(tmp_path / "a.npz", turn=0.5), tmp_path / "out.csv"
     plot, told = tmp_path / "a.png", tmp_path / "a.json"
@@ -61,6 +62,7 @@ def test_every_method_is_judged_on_the_same_stretch(tmp_path, capsys, method):
         assert one["after"]["deviation"] < 0.8 * one["before"]["deviation"]
 
 
+@pytest.mark.long
 def test_the_order_can_be_given(tmp_path, capsys):
     recording = write(tmp_path / "a.npz")
     assert exit_status("compensate", recording, "--out", tmp_path / "out.npz", "--order", "2,1", "--json", "-") == 0

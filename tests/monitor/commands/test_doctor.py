@@ -298,6 +298,7 @@ def test_versions_are_compared_by_their_numbers(version: str, wanted: str, fits:
     assert satisfies(version, wanted) is fits
 
 
+@pytest.mark.long
 def test_kernels_that_cannot_be_kept_are_told(tmp_path: Path) -> None:
     assert cache_folder() is not None
     say = "from monitor.common.compiled import cache_folder; print(cache_folder())"
@@ -351,6 +352,7 @@ def run(folder: Path, *arguments: str) -> "subprocess.CompletedProcess[str]":
     )
 
 
+@pytest.mark.long
 def test_the_command_prints_a_sign_a_line_and_ends_with_1_if_anything_is_wrong(tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text(VIRTUAL + QUIET)
     (tmp_path / "c.toml").chmod(0o600)
@@ -368,6 +370,7 @@ def test_the_command_prints_a_sign_a_line_and_ends_with_1_if_anything_is_wrong(t
     assert "→ chmod o-w c.toml" in wrong.stdout
 
 
+@pytest.mark.long
 def test_json_alone_goes_to_standard_output(tmp_path: Path) -> None:
     done = run(tmp_path, "none.toml", "--json", "-")
     assert done.returncode == 1

@@ -106,6 +106,7 @@ def test_the_terminal_tells_the_same(compared: tuple[Path, str]) -> None:
     assert "not in run3: may differ: what happens once need not happen in another recording" in said
 
 
+@pytest.mark.long
 def test_without_a_model_that_of_the_first_is_for_all(tmp_path: Path) -> None:
     paths = tuple(recorded(tmp_path / f"{name}.csv", KNOWN + LINE, seed, 200.0) for name, seed in (("a", 1), ("b", 2)))
     told = []

@@ -23,6 +23,7 @@ def write(path: Path, seed: int, lag_h: float = 2.0, offset: float = 0.0) -> Pat
     return path
 
 
+@pytest.mark.long
 def test_fit_then_predict_another_start(tmp_path, capsys):
     first, second = write(tmp_path / "a.npz", 1), write(tmp_path / "b.npz", 2, offset=1e-4)
     model, plot, out = tmp_path / "m.json", tmp_path / "a.png", tmp_path / "out.json"

@@ -16,6 +16,7 @@ from monitor.estimation.fit import fit_kernel
 from tests.support.waiting import PATIENCE_S
 
 
+@pytest.mark.long
 def test_without_a_place_for_the_cache() -> None:
     program = """
         from numba.core import caching

@@ -244,6 +244,7 @@ def test_samples_wait_for_a_rate_and_none_is_left_out():
     assert (found.samples, found.curve.n, found.rate_hz) == (400, 400, 100.0)
 
 
+@pytest.mark.long
 def test_a_rate_known_better_is_the_new_label():
     lines = text.Settings(columns=("gx", "gy", "gz", "ax", "ay", "az"))
     rig = Rig(rate=None, decoder=text.build(lines))
@@ -555,6 +556,7 @@ def test_the_window_is_held_against_the_model_in_force(tmp_path):
     assert rig.caught.events == []
 
 
+@pytest.mark.long
 def test_the_moment_it_disagrees_is_an_event_and_so_is_the_return(tmp_path):
     rig = Rig(window_s=20.0, model=model_file(tmp_path))
     told = {}
@@ -582,6 +584,7 @@ def follow_temperature(rig, seconds, begin_s=0.0):
         rig.work(begin_s + 0.1 * i)
 
 
+@pytest.mark.long
 def test_bias_is_held_against_temperature():
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 30.0)
@@ -607,6 +610,7 @@ def test_choosing_a_model_holds_no_round_up(monkeypatch):
     assert rig.station._can_take()  # a sensor never waits
 
 
+@pytest.mark.long
 def test_a_recording_waits_for_its_model(monkeypatch):
     rig = Rig(thermal_s=1.0, link=LoopbackLink(epoch="unix"))
     index = np.arange(4000)

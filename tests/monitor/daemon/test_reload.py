@@ -138,6 +138,7 @@ def tokens(listener: Any) -> set[str]:
     return {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
 
 
+@pytest.mark.long
 def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow", reason="pyarrow is not installed")
     endpoint, path, gone = free_endpoint(), tmp_path / "c.toml", Gone()
@@ -201,6 +202,7 @@ def test_new_limits_and_hooks_hold_at_once_and_a_wrong_file_changes_nothing(tmp_
     assert "not TOML" in wrong[0]["error"]
 
 
+@pytest.mark.long
 def test_a_hang_up_reloads_and_systemd_is_told(tmp_path: Path) -> None:
     path = tmp_path / "c.toml"
     path.write_text(device("a") + QUIET + '[log]\nformat = "json"\n')
@@ -232,6 +234,7 @@ def test_a_hang_up_reloads_and_systemd_is_told(tmp_path: Path) -> None:
     assert order == ["READY", *again, *again, "STOPPING"]
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="needs /proc")
 def test_reloads_leave_nothing_behind(tmp_path: Path) -> None:
     """Descriptors and threads of a device that comes and goes."""

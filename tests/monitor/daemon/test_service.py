@@ -295,6 +295,7 @@ def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch
     assert ["No space left" in str(line.get("error")) for line in logs].count(True) == 1
 
 
+@pytest.mark.long
 def test_a_replay_that_is_stopped_loses_nothing_it_has_counted(tmp_path: Path) -> None:
     n = 1_000_000  # many times what the ring holds
     save_samples(tmp_path / "long.npz", np.arange(n) / 100.0, np.random.default_rng(1).standard_normal((n, 6)))

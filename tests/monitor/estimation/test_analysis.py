@@ -167,6 +167,7 @@ def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
     assert (struck.seconds, struck.estimate.curve.n) == (120.0, 12_000)
 
 
+@pytest.mark.long
 def test_motion_is_no_change_of_noise():
     values = moved(30_000)
     assert detect_events(analyze(recorded_blocks(np.arange(30_000) / 100, values), 100.0)).changes == ()

@@ -37,6 +37,7 @@ def test_the_sensor_s_own_bandwidth_is_told_once_for_axes_alike():
     )
 
 
+@pytest.mark.long
 def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
     values = white(400_000)
     values[:, 1] += 2e-3 * np.sin(2.0 * np.pi * 0.5 * np.arange(400_000) / RATE_HZ)
@@ -185,6 +186,7 @@ def test_a_departure_ends_where_the_curve_comes_back():
     assert analysis_notes._departure(curve, fit, 0) == (1, 2)  # the first is only many σ off, the fifth by chance
 
 
+@pytest.mark.long
 def test_a_filter_that_is_not_known_is_told_too():
     # a moving average of two: no Butterworth
     white = 1e-3 * np.random.default_rng(8).standard_normal((200_001, 6))

@@ -185,6 +185,7 @@ def test_an_axis_restarts_with_next_to_nothing(kept, every_sample):
     assert estimator.get().coefficients.value[1, 2] == pytest.approx(1e-4, rel=0.2)
 
 
+@pytest.mark.long
 def test_the_course_of_a_restarted_axis_is_that_of_a_young_window():
     mix = (QuantizationNoise(Q=5e-6), AngleRandomWalk(N=1.5e-4), BiasInstability(B=1e-4), RateRandomWalk(K=3e-5))
     differences, ramps = [], 0

@@ -45,6 +45,7 @@ def test_rows_out_of_order_are_put_in_order():
     assert notes == ["rows that came out of order: 1; put in order"]
 
 
+@pytest.mark.long
 def test_more_than_ten_notes_are_counted():
     t = np.arange(40000) / 100
     for i in range(44):

@@ -113,6 +113,7 @@ def test_an_event_is_found_where_no_row_is(tmp_path: Path) -> None:
     assert (len(found), found.events, found.events_in_all) == (0, (event,), 1)
 
 
+@pytest.mark.long
 def test_a_table_is_read_while_rows_are_written(tmp_path: Path) -> None:
     path, rng = tmp_path / "h.sqlite", np.random.default_rng(1)
     kept(path, [row(T0, rng)])

@@ -147,6 +147,7 @@ def test_a_reader_sees_one_moment_while_a_writer_goes_on(tmp_path: Path) -> None
     assert [one.width_s for one in rows_in(path)] == [900, 60]
 
 
+@pytest.mark.long
 def test_twenty_kills_leave_every_minute_once(tmp_path: Path) -> None:
     left = kill(tmp_path / "h.sqlite", 20, seed=1, within_s=0.05)
     assert len(left) == 20

@@ -241,6 +241,7 @@ def test_true_time_runs_at_the_true_rate():
         NoiseModel({"gx": (Sinusoidal(amplitude=1.0, frequency=45.0), SampleRateError(ratio=0.8))}).stream(100.0, 1)
 
 
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_length():
     axis = (
         QuantizationNoise(Q=1e-5),

@@ -132,6 +132,7 @@ def test_a_suffix_that_is_none_is_said(tmp_path: Path) -> None:
         history_file.save(made(), tmp_path / "h.doc")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("axes", [("gx", "gz", "az"), ("az",), ("gx",)], ids=str)
 def test_the_picture_is_drawn_of_any_axes(tmp_path: Path, axes: tuple[str, ...]) -> None:
     pytest.importorskip("matplotlib")
@@ -144,6 +145,7 @@ def test_the_picture_is_drawn_of_any_axes(tmp_path: Path, axes: tuple[str, ...])
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 100
 
 
+@pytest.mark.long
 def test_a_picture_of_one_row_and_of_nothing(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     history_plot(made(1, slice(0, 0)), tmp_path / "one.png")

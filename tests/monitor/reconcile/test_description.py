@@ -66,6 +66,7 @@ def told(name):
     return describe_axis(found(name), STRICT, STRICT)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
 def test_the_report_is_as_its_contract_says(name):
     result = told(name)

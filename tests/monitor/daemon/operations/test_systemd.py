@@ -132,6 +132,7 @@ class Freezing:
         self._closed.set()
 
 
+@pytest.mark.long
 def test_a_frozen_reader_ends_the_signs_of_life_and_nothing_else(tmp_path: Path) -> None:
     """zenoh's router is not there: that keeps nothing from starting."""
     endpoint = free_endpoint()

@@ -63,6 +63,7 @@ def test_a_known_rate_is_passed_on_and_not_learned():
     assert [i.outcome[2] for i in one.take_intervals()[245:297]] == [NOT_AT_REST] * 52
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("rate", [0.3, 1.0, 5.0])
 def test_a_slow_turn_is_no_drift(rate):
     values = still(400.0)
@@ -74,6 +75,7 @@ def test_a_slow_turn_is_no_drift(rate):
     assert {int(i.outcome[2]) for i in one.take_intervals()[203:258]} <= {REJECTED, NOT_AT_REST}
 
 
+@pytest.mark.long
 def test_a_step_of_the_bias_is_taken_in_the_end_and_forgets_what_was_before():
     values = still(700.0)
     values[20_000:, 0] += 1.0 * DEGREE
@@ -108,6 +110,7 @@ def test_a_stuck_sensor_stays_finite(value):
     np.testing.assert_allclose(out[2000:, :3], 0.0, atol=1e-9)
 
 
+@pytest.mark.long
 def test_gaps_outliers_and_missing_values():
     rng = np.random.default_rng(2)
     one = Compensator(RATE_HZ)
@@ -148,6 +151,7 @@ def test_models_are_identified_as_rest_goes_on_and_memory_stays():
     assert one.error == pytest.approx(SIGMA / np.sqrt(100.0 * 60.0), rel=0.9)
 
 
+@pytest.mark.long
 def test_the_drift_that_it_expects_is_as_near_as_it_says():
     one = Compensator(RATE_HZ)
     rng = np.random.default_rng(3)

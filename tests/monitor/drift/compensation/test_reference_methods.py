@@ -41,6 +41,7 @@ def test_motion_is_halved_by_an_autoregression_and_kept_by_modes():
     assert off["emd"] < 1.0
 
 
+@pytest.mark.long
 def test_pieces_fade_into_each_other():
     z, learned = noisy(np.linspace(0.0, 200.0, N))
     out = apply_reference_method(z, learned, REFERENCE_METHODS["emd"])

@@ -43,6 +43,7 @@ def fed(live, values, warmth, edges=None, lost=0, choose=True):
     return looks
 
 
+@pytest.mark.long
 def test_bias_is_expected_from_temperature():
     looks = fed(live := LiveThermal(RATE_HZ, INTERVAL_S), *day(24, 1))
     assert len(looks) == 144
@@ -118,6 +119,7 @@ def test_another_rate_begins_anew():
     assert looks[-1].axes["gz"].text.startswith("3 intervals")
 
 
+@pytest.mark.long
 def test_a_new_offset_leaves_nothing_of_the_interval_in_which_it_came():
     values, warmth = day(12, 9)
     live = LiveThermal(RATE_HZ, INTERVAL_S)

@@ -38,6 +38,7 @@ def shares(looks, biases):
     return np.mean([one.one_step.side(bias) == 0 for one, bias in zip(looks, biases, strict=True)])
 
 
+@pytest.mark.long
 def test_it_learns_how_bias_follows_temperature():
     means = hourly(1, 2, 0.05)
     run = Run().give(means.bias, means.temperature_c)
@@ -52,6 +53,7 @@ def test_it_learns_how_bias_follows_temperature():
     assert not any(run.found)
 
 
+@pytest.mark.long
 def test_an_interval_is_expected_before_it_is_known():
     """Two records that differ in their last interval alone are expected to end the same."""
     means = hourly(2, 2, 0.05)
@@ -62,6 +64,7 @@ def test_an_interval_is_expected_before_it_is_known():
     assert two.one_step.side(other[-1]) == 1
 
 
+@pytest.mark.long
 def test_a_step_that_temperature_does_not_explain_is_told_once_and_then_expected():
     means = hourly(3, 2, 0.05)
     size = 0.5 * np.ptp(means.bias)
@@ -77,6 +80,7 @@ def test_a_step_that_temperature_does_not_explain_is_told_once_and_then_expected
     assert run.looks[-1].slope == pytest.approx(COEFFICIENT, rel=0.3)  # still known
 
 
+@pytest.mark.long
 def test_a_step_that_temperature_explains_is_none():
     means = hourly(4, 0, 0.05)
     jumped = means.temperature_c + 1.5 * (np.arange(72) >= 50)
@@ -84,6 +88,7 @@ def test_a_step_that_temperature_explains_is_none():
     assert not any(run.found)
 
 
+@pytest.mark.long
 def test_a_new_offset_is_learned_and_nothing_is_told():
     means = hourly(5, 2, 0.05)
     run = Run().give(means.bias[:50], means.temperature_c[:50])
@@ -117,6 +122,7 @@ def test_a_choice_is_made_in_pieces_and_holds_nothing_up():
     assert run.looks[-1].one_step is not None
 
 
+@pytest.mark.long
 def test_choices_follow_at_growing_spacings():
     means = hourly(8, 1, 0.05)
     run, at = Run(slow=True), []
@@ -131,6 +137,7 @@ def test_choices_follow_at_growing_spacings():
     assert len(at) >= 6
 
 
+@pytest.mark.long
 def test_what_is_missing_is_passed_over():
     means = hourly(9, 2, 0.05)
     biases, warmth = means.bias.copy(), means.temperature_c.copy()

@@ -20,6 +20,7 @@ def recording(seed: int, n: int, holes: float) -> tuple[np.ndarray, np.ndarray]:
     return values, warmth
 
 
+@pytest.mark.long
 @given(
     length=st.integers(8, 300),
     seed=st.integers(0, 99),

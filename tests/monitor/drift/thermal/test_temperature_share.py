@@ -32,6 +32,7 @@ def warm():
     return analyze([samples], RATE_HZ), warmth
 
 
+@pytest.mark.long
 def test_what_was_temperature_is_gone_and_the_rest_stays(warm):
     result, warmth = warm
     found = remove_temperature(result, warmth)
@@ -50,6 +51,7 @@ def test_what_was_temperature_is_gone_and_the_rest_stays(warm):
     assert "without temperature (polynomial 1), K falls from " in note
 
 
+@pytest.mark.long
 def test_temperature_that_explains_nothing_takes_nothing(warm):
     result, warmth = warm
     still = result.values.copy()

@@ -27,6 +27,7 @@ def errors(seed, lag_h, noise):
     return np.sqrt(np.mean(apart**2) / np.mean(of_cubic**2)), inside[DAY:].mean(), found
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("lag_h", "noise", "most"), [(1, 0.05, 0.65), (2, 0.05, 0.45), (4, 0.05, 0.3), (4, 0.02, 0.15)]
 )
@@ -55,6 +56,7 @@ def test_without_lag_a_polynomial_is_taken_and_nothing_lost(noise):
     assert all(one.model.shape == ThermalModelForm(1, ()) for one in found)
 
 
+@pytest.mark.long
 def test_one_step_estimates_know_the_bias_before():
     """A bias that wanders by itself is met by the measured one before, which temperature says nothing of."""
     ratios, inside = [], []
@@ -70,6 +72,7 @@ def test_one_step_estimates_know_the_bias_before():
     assert np.median(inside) > 0.85
 
 
+@pytest.mark.long
 def test_missing_intervals_leave_their_place():
     means = hourly(2, 2, 0.02)
     bias, warmth = means.bias.copy(), means.temperature_c.copy()

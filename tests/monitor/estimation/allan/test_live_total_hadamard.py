@@ -53,6 +53,7 @@ def test_equals_the_batch_on_the_window(samples, factors):
     check(LiveTotalHadamard(window), window, values)
 
 
+@pytest.mark.long
 @settings(max_examples=12, deadline=None)
 @given(
     samples=st.integers(MIN_SAMPLES, 400),
@@ -70,6 +71,7 @@ def test_equals_the_batch_with_gaps_anywhere(samples, holes, skipped, seed):
     check(LiveTotalHadamard(window), window, np.concatenate([values, np.full((skipped, 6), np.nan)]))
 
 
+@pytest.mark.long
 def test_a_window_with_a_span_for_each_tau_gives_the_same():
     values = made(900)
     window = AllanWindow(500, np.array([1, 4, 4, 16]), np.array([64, 100, 500, 200]))
@@ -124,6 +126,7 @@ def test_an_emptied_window_takes_its_results_along():
     check(slow, window, np.concatenate([made(MIN_SAMPLES - 1), made(100)]))
 
 
+@pytest.mark.long
 def test_a_growing_window_is_followed():
     values = made(400)
     window = AllanWindow(400, cluster_sizes(400, 1.0))
@@ -149,6 +152,7 @@ def test_a_constant_axis_has_no_variance():
     assert (totals.tvar == 0.0).all()
 
 
+@pytest.mark.long
 def test_clusters_beyond_what_phase_can_hold_are_left_out():
     length = 200_000
     short = AllanWindow(length, np.array([1]))

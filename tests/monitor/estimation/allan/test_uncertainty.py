@@ -28,6 +28,7 @@ def plain_sum(n: int, first: int, second: int) -> np.ndarray:
     return np.array([(pairs * r[a] * r[b]).sum() for a, b in PAIRS]) / (2.0 * centres[0].size * centres[1].size)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n", [64, 501, 900])
 def test_table_is_the_plain_sum(n):
     factors = np.array([1, 2, 3, 4, 7, 8, 30, 32, 100, 128, 250, 400])

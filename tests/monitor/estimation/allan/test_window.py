@@ -512,6 +512,7 @@ class Calls(RuleBasedStateMachine):
             np.testing.assert_allclose(seen[:, whole], true[:, whole], rtol=1e-5, atol=1e-12)
 
 
+@pytest.mark.long
 def test_any_order_of_calls_leaves_the_batch_of_what_is_held():
     run_state_machine_as_test(Calls, settings=settings(max_examples=60, stateful_step_count=20, deadline=None))
 

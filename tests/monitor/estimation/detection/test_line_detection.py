@@ -85,6 +85,7 @@ def test_its_share_is_what_the_curve_has_more():
     assert line.share == pytest.approx(more[:8].max(), abs=0.02)
 
 
+@pytest.mark.long
 def test_what_adds_less_than_matters_is_not_told():
     strong, weak = with_line(600_000, 2.5e-4, 21.0), with_line(600_000, 2.5e-5, 21.0)
     [line] = found(strong)

@@ -40,6 +40,7 @@ def test_a_column_is_the_allan_variance_of_filtered_noise(order, cutoff_hz):
     assert measured == pytest.approx(stated, rel=0.12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("cutoff_hz", [3.0, 20.0])
 def test_an_analogue_filter_is_that_of_a_much_faster_digital_one(cutoff_hz):
     sections = butter(2, cutoff_hz, fs=20 * RATE_HZ, output="sos")
@@ -63,6 +64,7 @@ def test_n_survives_any_bandwidth(order, cutoff_hz):
     assert found.bandwidth_hz[there] == pytest.approx(cutoff_hz, rel=0.3)
 
 
+@pytest.mark.long
 def test_white_noise_and_lines_have_no_bandwidth():
     white = N * 10.0 * np.random.default_rng(4).standard_normal((200_000, 6))
     assert np.isnan(analyzed(white).bandwidth_hz).all()
@@ -86,6 +88,7 @@ def test_the_live_estimate_finds_it_too():
     np.testing.assert_allclose(after.fitted[0], after.curve.avar[0], rtol=0.03)
 
 
+@pytest.mark.long
 def test_what_does_not_fall_beyond_the_cutoff_is_no_filter():
     # a strong wide resonance: the shortest τ lie low as behind a low-pass, and the spectrum does not end
     rng = np.random.default_rng(3)

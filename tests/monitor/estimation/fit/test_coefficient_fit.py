@@ -139,6 +139,7 @@ def test_random_walk_is_not_called_a_ramp():
     assert (gather(looked, "status")[4] == Status.ESTIMATED).sum() <= binom.ppf(0.999, RECORDS, 0.02)
 
 
+@pytest.mark.long
 def test_a_ramp_is_found_and_does_not_pass_as_random_walk():
     sources = (*MIX[:3], RateRamp(R=5e-6))
     with_slope, _ = fits(sources)

@@ -44,6 +44,7 @@ def fresh(window, before):
     return fit(DESIGN, tables.at(window.n), window.avar(), window.terms(), before, slope, slopes, full=False)
 
 
+@pytest.mark.long
 def test_it_is_a_fresh_fit_to_a_small_part_of_the_scatter():
     off = []
     for seconds in (40, 70, 150, 210, 390, 600):

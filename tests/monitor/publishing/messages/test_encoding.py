@@ -83,6 +83,7 @@ def test_coefficients() -> None:
     assert found["axes"]["gz"]["R"] == {"value": None, "lo": 0.0, "hi": 3e-9, "status": "upper_bound"}
 
 
+@pytest.mark.long
 def test_total_and_hadamard_have_their_own_tau() -> None:
     total, hadamard = made.slow_curves()
     found = parsed(ALL[topics.TOTAL])

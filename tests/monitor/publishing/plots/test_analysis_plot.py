@@ -49,6 +49,7 @@ def lettered(axes) -> dict[str, list[tuple[float, float]]]:
     return found
 
 
+@pytest.mark.long
 def test_both_kinds_side_by_side_in_all_colours(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "plot.png"
@@ -146,6 +147,7 @@ def test_k_or_r_is_said_of_bounds_only() -> None:
     assert not analysis_plot.k_or_r(made.estimate(), "K", "gx")
 
 
+@pytest.mark.long
 def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing: DynamicAllan) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "plot.png"
@@ -201,6 +203,7 @@ def test_without_matplotlib_it_says_what_to_install(tmp_path: Path, monkeypatch:
         analysis_plot.allan_plot(made.estimate(), tmp_path / "plot.png")
 
 
+@pytest.mark.long
 def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     with pytest.raises(ConfigError, match="cannot write the plot"):

@@ -43,6 +43,7 @@ def lines_at(panel, colour: str) -> list[float]:
     ]
 
 
+@pytest.mark.long
 def test_a_change_is_marked_in_its_surface_and_through_the_courses(white: DynamicAllan) -> None:
     gx, gy, gz, *courses = panels(white, [ChangeMark(300.0, "gy"), ChangeMark(240.0, "az")])
     assert [lines_at(panel, DARK) for panel in (gx, gy, gz)] == [[], [300.0], []]

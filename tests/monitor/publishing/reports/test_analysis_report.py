@@ -72,6 +72,7 @@ class Page(HTMLParser):
             self.cells[-1] = f"{self.cells[-1]} {data}".strip()
 
 
+@pytest.mark.long
 def test_numbers_stand_with_unit_interval_or_word() -> None:
     result = analysis()
     page = Page(analysis_report.render_page(result, "bench-1"))
@@ -112,6 +113,7 @@ def test_the_facts_of_the_recording_are_on_the_page() -> None:
     assert dict(analysis_report.facts(analysis()))["missing samples"] == "none"
 
 
+@pytest.mark.long
 def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, long: DynamicAllan) -> None:
     path = tmp_path / "report.html"
     analysis_report.html_report(analysis(), path, "a <b> & c", dynamic=long, marks=[ChangeMark(1500.0, "gz")])
@@ -143,6 +145,7 @@ def test_a_recording_without_accelerometers_has_one_column() -> None:
     assert "Accelerometers" not in text
 
 
+@pytest.mark.long
 def test_the_same_analysis_gives_the_same_page() -> None:
     result = analysis()
     result.estimate.curve.avar[:, 3:] = np.nan
@@ -156,6 +159,7 @@ def test_without_its_libraries_it_says_what_to_install(monkeypatch: pytest.Monke
         analysis_report.render_page(analysis())
 
 
+@pytest.mark.long
 def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot write the report"):
         analysis_report.html_report(analysis(), tmp_path / "absent" / "report.html")

@@ -183,6 +183,7 @@ def test_a_stalled_view_counts_what_it_drops(server: sinks.ViewerProcess, monkey
     view.close(1.0)  # returns, although the viewer stays frozen
 
 
+@pytest.mark.long
 def test_a_process_with_a_frozen_viewer_exits(server: sinks.ViewerProcess) -> None:
     """Rerun's exit handler and its destructors would wait for the viewer for ever."""
     program = f"""
@@ -272,6 +273,7 @@ def test_the_page_takes_the_next_free_port_and_leaves_nothing_behind(monkeypatch
     assert not sinks.listens(port)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="a program ends with its parent where there is setpriv")
 def test_a_killed_daemon_takes_its_viewer_along() -> None:
     port, web_port = free_port(), free_port()
@@ -332,6 +334,7 @@ def test_without_rerun_the_service_goes_on(monkeypatch: pytest.MonkeyPatch) -> N
     view.close()
 
 
+@pytest.mark.long
 def test_mode_none_imports_and_starts_nothing() -> None:
     program = """
         import sys, threading

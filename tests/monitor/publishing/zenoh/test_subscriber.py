@@ -186,6 +186,8 @@ def test_who_comes_late_gets_the_last_values_and_events(endpoint: str) -> None:
     ):
         out.start()
         wait_for(lambda: out.state == "ok")
+        with near.declare_queryable("linked", lambda query: query.reply("linked", b"")):
+            wait_for(lambda: any(reply.ok for reply in beyond.get("linked")), "the link between the routers")
         for i in range(15):
             for topic in kept:
                 out.put(topic, "a", f"{topic.name} {i}".encode())
@@ -261,6 +263,7 @@ def test_watch_prints_plain_tables_where_there_is_no_terminal(endpoint: str) -> 
     assert "\x1b" not in text
 
 
+@pytest.mark.long
 def test_watch_on_a_terminal_ends_with_ctrl_c_and_exit_0(endpoint: str) -> None:
     code = f"""
         from rich.console import Console

@@ -102,6 +102,7 @@ def test_an_interval_of_a_shape_ends_where_its_profile_has_fallen():
         assert fallen == pytest.approx(0.5 * chi2.ppf(0.95, 1), abs=0.2)
 
 
+@pytest.mark.long
 def test_intervals_of_a_line_hold_its_frequency():
     """The error of a frequency is √(6/n)/(π T) × σ/A (Rife and Boorstyn 1974)."""
     inside = []

@@ -80,6 +80,7 @@ def test_tells_jumps_from_a_walk(rest):
         assert abs(compare_steps_with_random_walk(around + walk(HOUR, 1.4e-5, rng), TAU0_S, rest, 1.4e-5).gain) < 3.0
 
 
+@pytest.mark.long
 def test_parameters_lie_in_their_intervals_and_jumps_are_counted():
     inside, counted = [], []
     for seed in range(8):

@@ -86,6 +86,7 @@ def test_merging_costs_little_where_it_is_not(rest):
     assert abs(np.mean(off)) < 0.15
 
 
+@pytest.mark.long
 def test_unknown_level_is_an_average_over_levels():
     """Within a nat, also where a first dwell of 200 blocks could as well be in the lower level."""
     rest = BackgroundNoise(1.0)
@@ -129,6 +130,7 @@ def test_parameters_lie_in_their_intervals_and_switches_are_counted():
     assert np.mean(counted) == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.long
 def test_correlated_noise_gets_its_own_parameters():
     inside = []
     for seed in range(12):
