@@ -36,7 +36,9 @@ def feed(clock, arrived_s, ticks=None, lost=None, values=None):
     for a, b in pairwise(edges):
         t_ns = np.rint(arrived_s[a:b] * NS).astype(np.int64)
         counted = None if ticks is None else np.array(ticks[a:b], np.int64)
-        out += clock.assign_times(make_block(t_ns, values[a:b].copy(), None, counted, 0 if lost is None else int(lost[a])))
+        out += clock.assign_times(
+            make_block(t_ns, values[a:b].copy(), None, counted, 0 if lost is None else int(lost[a]))
+        )
     assert sum(len(one) for one in out) + clock.repeated_rows == len(arrived_s)
     assert (np.diff(times(out)) > 0).all()
     return out
