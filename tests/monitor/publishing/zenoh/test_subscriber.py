@@ -180,8 +180,8 @@ def test_who_comes_late_gets_the_last_values_and_events(endpoint: str) -> None:
     kept = {topic: topic.kept for topic in (topics.STATUS, topics.COEFFICIENTS, topics.EVENT)}
     far = free_endpoint()
     with (
-        session(mode="router", listen=[endpoint]),
-        session(mode="router", listen=[far], connect=[endpoint]),
+        session(mode="router", listen=[endpoint]) as near,
+        session(mode="router", listen=[far], connect=[endpoint]) as beyond,
         contextlib.closing(ZenohPublisher(ZenohTable(listen=(), connect=(endpoint,)), ["a"])) as out,
     ):
         out.start()
