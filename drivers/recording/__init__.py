@@ -8,7 +8,7 @@ Outcomes: a ``Recording`` with at least one sample; ``RecordingError`` when the 
 line: file, what is wrong, what would be right); ``ConfigError`` when the file is one but more has to
 be said (``--rate``) or installed (pyarrow). A file cut off in the middle is read up to the cut.
 What is doubtful is never passed on as a number: a line without its end, an unreadable field or an
-infinite value becomes missing, and a note counts it.
+infinite value, or one beyond 1e100, becomes missing, and a note counts it.
 
 Time stamps are passed on as stored, with their jitter, gaps and steps back. Nothing is resampled,
 sorted or filled here, no unit is guessed, and nothing is ever unpickled.
@@ -34,6 +34,8 @@ from drivers.small_file import check_regular
 
 __all__ = ["FORMATS", "Recording", "is_recording", "iter_blocks", "load_samples", "save_samples", "writing"]
 
+MAX_VALUE: Final = 1e100
+"""Maximum size of a value. Sums of squares of larger values can exceed the range of float64."""
 RESOLUTION_S: Final = 1e-6
 """Of Unix times in a double, and a little more."""
 
@@ -132,7 +134,7 @@ def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
         values[:, AXES.index(axis)] = table.columns[axis]
     temperature_c = table.columns.get("temperature", np.full(n, np.nan))
     values, temperature_c = values[rows], temperature_c[rows].copy()
-    _drop_infinite(values, temperature_c, notes)
+    _drop_large(values, temperature_c, notes)
     return _recording(t_s, values, temperature_c, rate, axes, notes)
 
 
@@ -197,14 +199,15 @@ def _usable_times(
     return t[usable], usable
 
 
-def _drop_infinite(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
+def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
+    """Replace values beyond MAX_VALUE by NaN, in place, and add a note that counts them."""
     count = 0
     for array in (values, temperature_c):
-        infinite = np.isinf(array)
-        count += int(np.count_nonzero(infinite))
-        array[infinite] = np.nan
+        large = np.abs(array) > MAX_VALUE
+        count += int(np.count_nonzero(large))
+        array[large] = np.nan
     if count:
-        notes.append(f"{count} infinite values were read as missing.")
+        notes.append(f"{count} values that are infinite or beyond {MAX_VALUE:g} were read as missing.")
 
 
 def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:

@@ -109,8 +109,8 @@ def slopes(values: Floats, factors: Ints) -> Floats:
     places, at = np.unique(ends, return_inverse=True)
     mean = _present_mean(rates)
     first, second, third, fourth, fifth, sixth = _sums_of_phase(rates, mean, places)[at.reshape(6, -1)]
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # sums beyond the largest float give no slope
-        blocks = (sixth - 2.0 * fifth + fourth) - (third - 2.0 * second + first)
+    blocks = (sixth - 2.0 * fifth + fourth) - (third - 2.0 * second + first)
+    with np.errstate(invalid="ignore", divide="ignore"):
         bent = blocks / (terms * m.astype(np.float64) ** 2)[:, None]
         return np.where((terms > 0)[:, None] & ~np.isnan(mean), bent, np.nan)
 

@@ -49,8 +49,7 @@ def coarse(values: Floats) -> list[Steps]:
         parts = [values[begin : begin + rows, axis] for begin in begins]
         away = np.abs(np.concatenate([np.diff(part) for part in parts]))
         away = away[np.isfinite(away)]
-        with np.errstate(over="ignore"):  # infinite for values near the largest float: no step is as large
-            noise = GAUSSIAN * float(away.mean()) if away.size else 0.0
+        noise = GAUSSIAN * float(away.mean()) if away.size else 0.0
         levels = np.unique(np.concatenate(parts))
         step = _step(levels[np.isfinite(levels)], COARSE * noise)
         if step is not None and noise > 0.0:

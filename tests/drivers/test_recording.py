@@ -278,11 +278,12 @@ class TestColumns:
         with pytest.raises(RecordingError, match=r"x\.npz: gy has 4 values but t has 5"):
             load_samples(path)
 
-    def test_infinite_values_become_missing(self, tmp_path):
-        recording = load_samples(written(tmp_path / "x.csv", "t,gx,temp\n0,inf,-inf\n1,2,3\n"))
+    @pytest.mark.parametrize("large", ["inf", "1e101", "1e307"])
+    def test_values_too_large_to_square_become_missing(self, tmp_path, large):
+        recording = load_samples(written(tmp_path / "x.csv", f"t,gx,temp\n0,{large},-{large}\n1,2,3\n"))
         assert np.isnan(recording.values[0, 0])
         assert np.isnan(recording.temperature_c[0])
-        assert recording.notes == ("2 infinite values were read as missing.",)
+        assert recording.notes == ("2 values that are infinite or beyond 1e+100 were read as missing.",)
 
 
 class TestRate:
