@@ -36,7 +36,7 @@ PIECE: Final = 512
 
 @dataclass(slots=True)
 class Ready:
-    """Which kernels are compiled, see ``monitor.kernels``, and who need not wait for them."""
+    """Flags of the compiled kernels (``monitor.kernels``), and the sample rate that Python can process until then."""
 
     window: Flag = field(default_factory=Flag)
     fit: Flag = field(default_factory=Flag)
@@ -104,17 +104,17 @@ class Chain:
 
     @property
     def can_fit(self) -> bool:
-        """Whether coefficients can be had."""
+        """True if the kernels of the fit can be called."""
         return self._interprets or self._ready.fit.is_set()
 
     @property
     def fits_slowly(self) -> bool:
-        """Whether a fit takes a tenth of a second, as its kernels are interpreted."""
+        """True if the kernels of the fit are interpreted. A fit then takes about 0.1 s."""
         return self._interprets and not self._ready.fit.is_set()
 
     @property
     def can_watch(self) -> bool:
-        """Whether all kernels that samples go through can be called."""
+        """True if the kernels of motion and change detection can be called."""
         return self._interprets or self._ready.all.is_set()
 
     def interpreted(self, rate_hz: float | None) -> AbstractContextManager[None]:

@@ -45,7 +45,7 @@ PROGRAM: Final = (
     "--from-stdin",
 )
 NICENESS: Final = 5
-"""Of the child processes: samples come first."""
+"""Niceness of the child processes. The processing of samples has priority."""
 BAR_LENGTH: Final = 12
 
 
@@ -200,7 +200,7 @@ class _Compilers:
                 child.kill()
 
     def wait_for(self, part: Part) -> bool:
-        """Wait until a child has compiled a part; False if none will. Progress is told meanwhile, by this thread."""
+        """Wait until a child has compiled a part and report the progress meanwhile; return False if none will."""
         job = self._jobs[part.name]
         while not (job.finished and self._changes.empty()):
             progress = self._changes.get()

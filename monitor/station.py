@@ -52,7 +52,7 @@ TOTAL_EVERY_S: Final = 0.1
 TOTAL_SHARE: Final = 0.005
 """Of a processor, that total and Hadamard deviations may take for a device."""
 SLOW_REFIT_S: Final = 1.0
-"""Between two fits while their kernels are interpreted: compilation needs the processors."""
+"""Minimum time between interpreted fits, because the compilation needs the processors."""
 UNTIMED_KEPT: Final = 100
 """Events that wait for the first sample's time; the oldest are dropped."""
 SET_S: Final = 1.0
@@ -412,7 +412,7 @@ class Station:
         return 0 if self.driver.times_are_unix else self._wall.offset_ns(t_ns)
 
     def _offsets_ns(self, samples: SampleBlock) -> Ints | int:
-        """Of each sample, so that their Unix times increase even if the host's clock was set back."""
+        """Return Unix time less the time of each sample [n]. Unix times increase even if the host's clock is set."""
         return 0 if self.driver.times_are_unix else self._wall.offsets_ns(samples.t_ns)
 
     def _can_take(self) -> bool:

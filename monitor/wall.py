@@ -15,7 +15,7 @@ from drivers.sample import Ints
 EASE: Final = 5e-4
 """A correction runs at no more than 0.5 ms a second."""
 MAX_KNOTS: Final = 100
-"""Corrections that are remembered. At one a second, samples may be asked for that are older than a minute."""
+"""Number of corrections that are kept. With one per second, they cover the samples of the last minute."""
 
 
 class WallClock:
@@ -55,7 +55,7 @@ class WallClock:
         Returns
         -------
         int
-            By how much the host's clock was set since the last call, in nanoseconds.
+            Step of the host's clock since the last call, in nanoseconds.
         """
         before_ns, self._host_ns = self._host_ns, unix_ns - monotonic_ns
         begun_ns, offset_ns, correction_ns = self._knots[-1].tolist()
