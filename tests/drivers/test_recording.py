@@ -15,12 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.recording import (
     FORMATS,
+    MAX_VALUE,
     Recording,
     arrow_format,
     is_recording,
@@ -86,12 +87,14 @@ class TestRoundTrip:
         assert recording.notes == ()
 
     @pytest.mark.parametrize("suffix", [".csv", ".npz", ".arrow"])
-    @given(numbers=st.lists(st.floats(allow_infinity=False, width=64), min_size=1, max_size=8))
-    def test_any_float_comes_back(self, tmp_path_factory, suffix, numbers):
+    @given(numbers=st.lists(st.floats(), min_size=1, max_size=8))
+    @example(numbers=[MAX_VALUE, np.nextafter(MAX_VALUE, np.inf), -np.inf])
+    def test_any_float_comes_back_and_beyond_the_limit_as_missing(self, tmp_path_factory, suffix, numbers):
         path = tmp_path_factory.mktemp("any") / f"x{suffix}"
         values = np.full((len(numbers), 6), np.nan)
         values[:, 4] = numbers
         save_samples(path, np.arange(float(len(numbers))), values, axes=["ay"])
+        values[np.abs(values) > MAX_VALUE] = np.nan
         assert np.array_equal(load_samples(path).values, values, equal_nan=True)
 
     def test_absent_column_is_absent_not_zero(self, path):
