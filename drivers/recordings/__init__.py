@@ -7,7 +7,8 @@ columns (``Table``). ``_assemble`` gives the columns their meaning.
 There are three outcomes. A ``Recording`` has at least one sample. ``RecordingError`` means that the file is not a
 recording. Its text is one line that names the file, the error and the expected content. ``ConfigError`` means that a
 setting (``--rate``) or a package (pyarrow) is missing. A truncated file is read up to the cut. Doubtful data never
-become numbers: an incomplete line, an unreadable field or an infinite value is read as missing, and a note counts it.
+become numbers: an incomplete line, an unreadable field, or a value that is infinite or beyond
+1e100 is read as missing, and a note counts it.
 
 Times are returned as stored, with their jitter, gaps and steps back. The module does not resample, sort or interpolate
 data, it does not guess units, and it never unpickles objects.
@@ -41,6 +42,8 @@ __all__ = [
     "save_samples",
 ]
 
+MAX_VALUE: Final = 1e100
+"""Maximum size of a value. Sums of squares of larger values can exceed the range of float64."""
 TIME_RESOLUTION_S: Final = 1e-6
 """Slightly more than the resolution of Unix times in a float64."""
 
@@ -162,7 +165,7 @@ def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
         values[:, AXES.index(axis)] = table.columns[axis]
     temperature_c = table.columns.get("temperature", np.full(n, np.nan))
     values, temperature_c = values[rows], temperature_c[rows].copy()
-    _drop_infinite(values, temperature_c, notes)
+    _drop_large(values, temperature_c, notes)
     return _recording(t_s, values, temperature_c, rate, axes, notes)
 
 
@@ -230,15 +233,15 @@ def _usable_times(
     return t[usable], usable
 
 
-def _drop_infinite(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
-    """Replace infinite values by NaN, and add a note."""
+def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
+    """Replace values beyond MAX_VALUE by NaN, in place, and add a note that counts them."""
     count = 0
     for array in (values, temperature_c):
-        infinite = np.isinf(array)
-        count += int(np.count_nonzero(infinite))
-        array[infinite] = np.nan
+        large = np.abs(array) > MAX_VALUE
+        count += int(np.count_nonzero(large))
+        array[large] = np.nan
     if count:
-        notes.append(f"{count} infinite values were read as missing.")
+        notes.append(f"{count} values that are infinite or beyond {MAX_VALUE:g} were read as missing.")
 
 
 def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:

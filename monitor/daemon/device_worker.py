@@ -293,14 +293,14 @@ class DeviceWorker:
         if tail is None:
             return
         rate_hz = self.clock.rate_hz or tail.newest.state.rate or 0.0
+        offset_ns = self._offset_ns(time.monotonic_ns())
         try:
-            offset_ns = self._offset_ns(time.monotonic_ns())
             text = window_restore.restore_window(self.chain, tail, rate_hz, self.device.window_s, offset_ns)
         except (ImuError, OSError) as error:
             text = f"the window could not be rebuilt: {error}"
             self.chain.reset()
         finally:
-            t_ns = int(tail.newest.samples.t_ns[-1]) - self._offset_ns(time.monotonic_ns())
+            t_ns = int(tail.newest.samples.t_ns[-1]) - offset_ns
             self._pending_events.append(Event("window_rebuilt", t_ns, text))
             self._tail = None
             self._wake.set()
@@ -618,8 +618,9 @@ class DeviceWorker:
         blocks, self._unpublished = self._unpublished, []
         for samples in merge_contiguous_blocks(blocks):
             self.published += len(samples)
+            offsets_ns = self._offsets_ns(samples)
             for output in outputs:
-                output.samples(self.name, self.published, samples, self._offsets_ns(samples))
+                output.samples(self.name, self.published, samples, offsets_ns)
             if self.chain.compensation is not None and np.isfinite(samples.values[:, :3]).any():
                 self._publish_compensated(outputs, self.chain.compensation, samples)
         return True
@@ -632,8 +633,9 @@ class DeviceWorker:
             at += len(piece)
             without = live.update(piece)
             self.chain.update_drift_models()
+            offsets_ns = self._offsets_ns(without)
             for output in outputs:
-                output.compensated(self.name, self.published - len(samples) + at, without, self._offsets_ns(without))
+                output.compensated(self.name, self.published - len(samples) + at, without, offsets_ns)
         for look in live.take():
             for output in outputs:
                 output.drift(self.name, self.unix_s(look.t_ns), look)

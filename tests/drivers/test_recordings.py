@@ -15,12 +15,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.recordings import (
     FORMATS,
+    MAX_VALUE,
     Recording,
     arrow_format,
     is_recording,
@@ -86,12 +87,14 @@ class TestRoundTrip:
         assert recording.notes == ()
 
     @pytest.mark.parametrize("suffix", [".csv", ".npz", ".arrow"])
-    @given(numbers=st.lists(st.floats(allow_infinity=False, width=64), min_size=1, max_size=8))
-    def test_any_float_comes_back(self, tmp_path_factory, suffix, numbers):
+    @given(numbers=st.lists(st.floats(), min_size=1, max_size=8))
+    @example(numbers=[MAX_VALUE, np.nextafter(MAX_VALUE, np.inf), -np.inf])
+    def test_any_float_comes_back_and_beyond_the_limit_as_missing(self, tmp_path_factory, suffix, numbers):
         path = tmp_path_factory.mktemp("any") / f"x{suffix}"
         values = np.full((len(numbers), 6), np.nan)
         values[:, 4] = numbers
         save_samples(path, np.arange(float(len(numbers))), values, axes=["ay"])
+        values[np.abs(values) > MAX_VALUE] = np.nan
         assert np.array_equal(load_samples(path).values, values, equal_nan=True)
 
     def test_absent_column_is_absent_not_zero(self, path):
@@ -278,11 +281,12 @@ class TestColumns:
         with pytest.raises(RecordingError, match=r"x\.npz: gy has 4 values but t has 5"):
             load_samples(path)
 
-    def test_infinite_values_become_missing(self, tmp_path):
-        recording = load_samples(written(tmp_path / "x.csv", "t,gx,temp\n0,inf,-inf\n1,2,3\n"))
+    @pytest.mark.parametrize("large", ["inf", "1e101", "1e307"])
+    def test_values_too_large_to_square_become_missing(self, tmp_path, large):
+        recording = load_samples(written(tmp_path / "x.csv", f"t,gx,temp\n0,{large},-{large}\n1,2,3\n"))
         assert np.isnan(recording.values[0, 0])
         assert np.isnan(recording.temperature_c[0])
-        assert recording.notes == ("2 infinite values were read as missing.",)
+        assert recording.notes == ("2 values that are infinite or beyond 1e+100 were read as missing.",)
 
 
 class TestRate:

@@ -53,8 +53,7 @@ def find_coarse_axes(values: Floats) -> list[QuantizationStep]:
         parts = [values[begin : begin + rows, axis] for begin in begins]
         away = np.abs(np.concatenate([np.diff(part) for part in parts]))
         away = away[np.isfinite(away)]
-        with np.errstate(over="ignore"):  # infinite for values near the largest float, where no step is found
-            noise = SIGMA_PER_MEAN_DISTANCE * float(away.mean()) if away.size else 0.0
+        noise = SIGMA_PER_MEAN_DISTANCE * float(away.mean()) if away.size else 0.0
         levels = np.unique(np.concatenate(parts))
         step = _step(levels[np.isfinite(levels)], MIN_STEP_TO_NOISE * noise)
         if step is not None and noise > 0.0:

@@ -66,7 +66,7 @@ def signal(rng: np.random.Generator, n: int) -> Floats:
 
 
 def results(seed: int) -> list[Any]:
-    """What a stream of samples gives, as lists of numbers."""
+    """Process a random stream of samples and return all results as arrays and lists."""
     rng = np.random.default_rng(seed)
     n = int(rng.integers(200, 700))
     values = signal(rng, n)
