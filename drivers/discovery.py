@@ -88,7 +88,7 @@ def format_choices(word: str, known: Sequence[str]) -> str:
     known
         All known words.
 
-    >>> possible("serail", ("can", "serial"))
+    >>> format_choices("serail", ("can", "serial"))
     '; possible are serial, can'
     """
     near = {one: SequenceMatcher(None, word.lower(), one.lower()).ratio() for one in known}

@@ -33,7 +33,7 @@ class ImuError(Exception):
 def format_one_line(text: str) -> str:
     """Return the text in one line without control characters, cut after LONGEST characters.
 
-    >>> in_one_line("no key \\x1b[2J\\nhere")
+    >>> format_one_line("no key \\x1b[2J\\nhere")
     'no key  [2J here'
     """
     text = "".join(c if c.isprintable() else " " for c in text[: MAX_TEXT_CHARACTERS + 1].strip())

@@ -390,7 +390,7 @@ def chunk_per_sample(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
 def xor_checksum(data: bytes) -> int:
     """Return the exclusive or of all bytes. One long integer is folded in halves, which takes 1 µs for a sentence.
 
-    >>> xor(b"VNRRG,8") == 0x4B
+    >>> xor_checksum(b"VNRRG,8") == 0x4B
     True
     """
     bits = 8 << max(len(data) - 1, 0).bit_length()

@@ -194,7 +194,7 @@ def segment_name(number: int, unix_s: float) -> str:
 def segment_start_s(path: Path) -> float:
     """Return the Unix time in the name of a segment in whole seconds; 0 if the name contains none.
 
-    >>> began_s(Path("00000042_2023-11-14T22-13-20Z.arrows"))
+    >>> segment_start_s(Path("00000042_2023-11-14T22-13-20Z.arrows"))
     1700000000.0
     """
     try:

@@ -138,7 +138,7 @@ def snap_to_standard_rate(measured_hz: float) -> float:
 
     Otherwise return the measured rate rounded to 5 digits.
 
-    >>> made_rate(99.97), made_rate(99.32)
+    >>> snap_to_standard_rate(99.97), snap_to_standard_rate(99.32)
     (100.0, 99.32)
     """
     nearest = float(STANDARD_RATES_HZ[np.argmin(np.abs(np.log(STANDARD_RATES_HZ / measured_hz)))])

@@ -168,7 +168,7 @@ def unique_names(recordings: Sequence[Path]) -> dict[str, Path]:
 
     Examples
     --------
-    >>> list(names([Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/warm.npz")]))
+    >>> list(unique_names([Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/warm.npz")]))
     ['run', 'run-2', 'warm']
     """
     found: dict[str, Path] = {}

@@ -46,7 +46,7 @@ def format_service_status(healths: Mapping[str, Health], outputs: Mapping[str, s
 
     Examples
     --------
-    >>> sentence({}, {"zenoh": "ok", "viewer": "off"})
+    >>> format_service_status({}, {"zenoh": "ok", "viewer": "off"})
     '0 devices; all well'
     """
     states = Counter(one.state for one in healths.values())

@@ -26,7 +26,7 @@ def format_rate(axis: str, si: float, sign: bool = False) -> str:
 
     Examples
     --------
-    >>> amount("gz", 2.79), amount("ax", -0.0324, sign=True), amount("az", 27.0), amount("gx", 1e-6)
+    >>> format_rate("gz", 2.79), format_rate("ax", -0.0324, sign=True), format_rate("az", 27.0), format_rate("gx", 1e-6)
     ('160 °/s', '-3.3 mg', '27 m/s²', '0.000057 °/s')
     """
     if axis.startswith("g"):

@@ -126,7 +126,7 @@ def format_number(value: float, digits: int = 3) -> str:
 
     Examples
     --------
-    >>> number(0.51566), number(1234.5), number(2.4e-6), number(float("nan"))
+    >>> format_number(0.51566), format_number(1234.5), format_number(2.4e-6), format_number(float("nan"))
     ('0.516', '1230', '2.40e-6', '—')
     """
     if not math.isfinite(value):

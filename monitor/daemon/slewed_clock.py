@@ -28,12 +28,12 @@ class SlewedClock:
 
     Examples
     --------
-    >>> wall = SlewedClock(monotonic_ns=5_000_000_000, unix_ns=1_700_000_000_000_000_000)
-    >>> wall.unix_ns(6_000_000_000)
+    >>> clock = SlewedClock(monotonic_ns=5_000_000_000, unix_ns=1_700_000_000_000_000_000)
+    >>> clock.unix_ns(6_000_000_000)
     1700000001000000000
-    >>> wall.follow(6_000_000_000, 1_700_000_003_000_000_000)   # the host clock was set forward by 2 s
+    >>> clock.slew_to(6_000_000_000, 1_700_000_003_000_000_000)   # the host clock was set forward by 2 s
     2000000000
-    >>> wall.unix_ns(7_000_000_000)
+    >>> clock.unix_ns(7_000_000_000)
     1700000002000500000
     """
 

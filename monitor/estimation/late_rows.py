@@ -59,7 +59,7 @@ def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -
     >>> t_ns = 10_000_000 * np.arange(300)
     >>> t_ns[100:110] += 10_000_000  # late
     >>> t_ns[200:] += 10_000_000  # missing
-    >>> truly_missing(t_ns, np.array([100, 200]), np.array([1, 1]), np.array([], int)).tolist()
+    >>> count_missing_samples(t_ns, np.array([100, 200]), np.array([1, 1]), np.array([], int)).tolist()
     [0, 1]
     """
     period_ns = _period_ns(t_ns, np.concatenate([rows, breaks]))

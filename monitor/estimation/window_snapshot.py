@@ -133,7 +133,7 @@ class TemperatureRing:
     length : int
         Number of samples to keep.
 
-    >>> newest = Temperatures(3)
+    >>> newest = TemperatureRing(3)
     >>> newest.push(0, np.array([20.0, 21.0]))
     >>> newest.push(1, np.array([22.0]))
     >>> newest.newest(3).tolist()

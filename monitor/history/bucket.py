@@ -56,10 +56,10 @@ class HistoryRow:
 class RunningExtremes:
     """Running count, minimum, maximum and last value of k numbers.
 
-    >>> seen = Extremes(("a", "b"))
+    >>> seen = RunningExtremes(("a", "b"))
     >>> for numbers in ([1.0, 5.0], [3.0, np.nan], [2.0, 4.0]):
     ...     seen.add(np.array(numbers))
-    >>> seen.n.tolist(), seen.low.tolist(), seen.high.tolist(), seen.last.tolist()
+    >>> seen.count.tolist(), seen.minimum.tolist(), seen.maximum.tolist(), seen.last.tolist()
     ([3, 2], [1.0, 4.0], [3.0, 5.0], [2.0, 4.0])
     """
 

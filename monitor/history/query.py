@@ -43,7 +43,7 @@ class HistoryQuery:
     def selects(self, name: str) -> bool:
         """Return True if the query requests the column ``name`` (see ``columns``).
 
-        >>> Question(axes=("gz",)).wants("gz.N.lo"), Question(axes=("gz",)).wants("gx.N"), Question().wants("rate")
+        >>> HistoryQuery(axes=("gz",)).selects("gz.N.lo"), HistoryQuery(axes=("gz",)).selects("gx.N"), HistoryQuery().selects("rate")
         (True, False, True)
         """
         axis, _, rest = name.partition(".")
@@ -57,7 +57,7 @@ class HistoryQuery:
     def parameters(self) -> str:
         """Format the query as the parameters of a zenoh selector.
 
-        >>> Question(Span(0.0, float("inf"), end_in=False), 900, ("status",), ("gz",)).parameters()
+        >>> HistoryQuery(TimeRange(0.0, float("inf"), end_included=False), 900, ("status",), ("gz",)).parameters()
         '_time=[1970-01-01T00:00:00.000000Z..[;step=900s;what=status;axis=gz;letter=Q,N,B,K,R'
         """
         parts = {
@@ -73,8 +73,8 @@ class HistoryQuery:
 def parse_query(parameters: str, now_s: float) -> HistoryQuery:
     """Parse the parameters of a zenoh selector.
 
-    >>> question("_time=[now(-2h);30m];axis=gz;what=coefficients", 7200.0).span
-    Span(start_s=0.0, end_s=1800.0, start_in=True, end_in=True)
+    >>> parse_query("_time=[now(-2h);30m];axis=gz;what=coefficients", 7200.0).span
+    TimeRange(start_s=0.0, end_s=1800.0, start_included=True, end_included=True)
 
     Parameters
     ----------

@@ -38,7 +38,7 @@ _NOW: Final = re.compile(r"now\(\s*([+-]?)\s*([^)]*)\)")
 class TimeRange:
     """A time range from ``start_s`` to ``end_s`` in Unix seconds; an open end is infinite.
 
-    >>> Span(10.0, 20.0).holds(20.0), Span(10.0, 20.0, end_in=False).holds(20.0)
+    >>> TimeRange(10.0, 20.0).contains(20.0), TimeRange(10.0, 20.0, end_included=False).contains(20.0)
     (True, False)
     """
 
@@ -64,7 +64,7 @@ class TimeRange:
     def overlaps(self, start_s: float, end_s: float) -> bool:
         """Return True if the range overlaps the row from ``start_s`` (included) to ``end_s`` (excluded).
 
-        >>> Span(60.0, 120.0).touches(0.0, 60.0), Span(60.0, 120.0).touches(120.0, 180.0)
+        >>> TimeRange(60.0, 120.0).overlaps(0.0, 60.0), TimeRange(60.0, 120.0).overlaps(120.0, 180.0)
         (False, True)
 
         Parameters
@@ -81,10 +81,10 @@ class TimeRange:
 def parse_zenoh_range(text: str, now_s: float) -> TimeRange:
     """Parse the ``_time`` parameter of a zenoh selector.
 
-    >>> zenoh_span("[now(-1h)..now()]", 7200.0)
-    Span(start_s=3600.0, end_s=7200.0, start_in=True, end_in=True)
-    >>> zenoh_span("]1970-01-01T01:00:00Z;2m[", 0.0)
-    Span(start_s=3600.0, end_s=3720.0, start_in=False, end_in=False)
+    >>> parse_zenoh_range("[now(-1h)..now()]", 7200.0)
+    TimeRange(start_s=3600.0, end_s=7200.0, start_included=True, end_included=True)
+    >>> parse_zenoh_range("]1970-01-01T01:00:00Z;2m[", 0.0)
+    TimeRange(start_s=3600.0, end_s=3720.0, start_included=False, end_included=False)
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def parse_zenoh_range(text: str, now_s: float) -> TimeRange:
 def parse_time(text: str, now_s: float) -> float:
     """Parse a time as a user writes it, and return Unix time [s].
 
-    >>> moment("-1d", 90_000.0), moment("1970-01-02", 0.0), moment("1970-01-01T00:01:30Z", 0.0)
+    >>> parse_time("-1d", 90_000.0), parse_time("1970-01-02", 0.0), parse_time("1970-01-01T00:01:30Z", 0.0)
     (3600.0, 86400.0, 90.0)
 
     Parameters
@@ -148,7 +148,7 @@ def parse_time(text: str, now_s: float) -> float:
 def parse_duration_s(text: str) -> float:
     """Parse a duration above zero, and return it in seconds.
 
-    >>> length("15min"), length("1d"), length("90")
+    >>> parse_duration_s("15min"), parse_duration_s("1d"), parse_duration_s("90")
     (900.0, 86400.0, 90.0)
 
     Raises
@@ -165,7 +165,7 @@ def parse_duration_s(text: str) -> float:
 def format_utc(t_s: float) -> str:
     """Format a Unix time [s] as date and time in UTC.
 
-    >>> said(90.0)
+    >>> format_utc(90.0)
     '1970-01-01 00:01:30'
     """
     try:

@@ -26,7 +26,7 @@ def butterworth_sections(order: int, cutoff_hz: float, rate_hz: float) -> Floats
 
     Examples
     --------
-    >>> butterworth(1, 25.0, 100.0).round(9).tolist()
+    >>> butterworth_sections(1, 25.0, 100.0).round(9).tolist()
     [[0.5, 0.5, 0.0, -0.0, 0.0]]
     """
     w = np.tan(np.pi * cutoff_hz / rate_hz)

@@ -58,7 +58,7 @@ def format_coefficient(coefficients: Coefficients, letter: str, axis: str, digit
 def mark_temperature_axis(axis: str, axes_of_temperature: Collection[str]) -> str:
     """Return the name of an axis, with TEMPERATURE_MARK if temperature explains most of its slow variance.
 
-    >>> marked("gy", ("gy", "gz")), marked("gx", ("gy", "gz"))
+    >>> mark_temperature_axis("gy", ("gy", "gz")), mark_temperature_axis("gx", ("gy", "gz"))
     ('gy †', 'gx')
 
     Parameters

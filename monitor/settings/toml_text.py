@@ -14,7 +14,7 @@ MAX_INTEGER: Final = 1 << 63
 def format_tables(text: str) -> dict[str, Any]:
     """The tables of the text.
 
-    >>> tables("a = 1")
+    >>> format_tables("a = 1")
     {'a': 1}
 
     Raises:

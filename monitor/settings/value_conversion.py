@@ -45,8 +45,8 @@ def convert(value: Any, kind: Any, hook: Hook) -> tuple[Any, list[Problem]]:
         The converted value, and all problems with it. With problems, the value holds the elements that could be
         converted, or is ``WRONG``.
 
-    >>> from drivers.quantities import SHARE
-    >>> convert([1.0, -1.0, "x"], list[Annotated[float, SHARE.meta]], lambda kind, value: value)
+    >>> from drivers.quantities import FRACTION
+    >>> convert([1.0, -1.0, "x"], list[Annotated[float, FRACTION.meta]], lambda kind, value: value)
     ([1.0], [('[1]', '-1 is outside the supported range 0 to 1'), ('[2]', 'expected a number from 0 to 1, got "x"')])
     """
     problems: list[Problem]

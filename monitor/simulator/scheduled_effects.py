@@ -27,7 +27,7 @@ def parse_effects(text: str) -> list[tuple[str, Effect]]:
 
     Examples
     --------
-    >>> effects_of("gz.angle_random_walk:N=1e-3")
+    >>> parse_effects("gz.angle_random_walk:N=1e-3")
     [('gz', AngleRandomWalk(N=0.001))]
     """
     written = EFFECT_SYNTAX.fullmatch(text)

@@ -223,7 +223,7 @@ def format_result(result: dict[str, Any], status: int = DONE) -> str:
 
     Examples
     --------
-    >>> said({"verdict": "explained", "axes": {"gz": {"steps": [
+    >>> format_result({"verdict": "explained", "axes": {"gz": {"steps": [
     ...     {"kind": "added", "effect": "sinusoidal", "confidence": 0.998}]}}})
     'reconcile: explained: gz sinusoidal added (0.998)'
     """

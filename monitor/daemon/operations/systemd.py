@@ -57,7 +57,7 @@ class SystemdNotifier:
         Examples
         --------
         >>> environment = {"NOTIFY_SOCKET": "/run/notify", "WATCHDOG_USEC": "60000000", "HOME": "/"}
-        >>> Unit.of(environment).watched, environment
+        >>> SystemdNotifier.from_environment(environment).watched, environment
         (True, {'HOME': '/'})
         """
         address, usec, pid = (environment.pop(name, "") for name in VARIABLES)

@@ -59,7 +59,7 @@ START_VARIANCE_SHARES: Final = (1e-3, 0.03, 0.5)
 class ArmaModel:
     """Parameters of one identified ARMA process.
 
-    >>> Arma((0.5, 0.3), -0.2, 1.0).green
+    >>> ArmaModel((0.5, 0.3), -0.2, 1.0).green
     (1.0, 0.3)
     """
 

@@ -76,7 +76,7 @@ def score_in_motion(rate: Floats, truth: Floats, rate_hz: float) -> MotionScore:
     Examples
     --------
     >>> t = np.arange(1000) / 100.0
-    >>> one = in_motion(np.sin(t - 0.02), np.sin(t), 100.0)
+    >>> one = score_in_motion(np.sin(t - 0.02), np.sin(t), 100.0)
     >>> round(one.delay_s, 4)
     0.02
     """

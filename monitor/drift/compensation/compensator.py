@@ -125,7 +125,7 @@ class Compensator:
     --------
     >>> one = Compensator(100.0)
     >>> still = np.random.default_rng(0).normal(0.0, 1e-3, (3000, 6)) + 0.02
-    >>> out = np.concatenate([one.update(still[k : k + 50]) for k in range(0, 3000, 50)])
+    >>> out = np.concatenate([one.compensate(still[k : k + 50]) for k in range(0, 3000, 50)])
     >>> bool(out[1000:, :3].std() < 2e-4), bool(np.array_equal(out[:, 3:], still[:, 3:]))
     (True, True)
     """

@@ -53,7 +53,7 @@ AGE, EXCEEDANCES = range(2)
 def filter_memories(rate_hz: float) -> Ints:
     """Return the filter memories in samples: 2, 4, 8, … up to about MAX_MEMORY_S.
 
-    >>> memories(4.0).tolist()
+    >>> filter_memories(4.0).tolist()
     [2, 4, 8, 16, 32]
     """
     return np.asarray(2 ** np.arange(1, max(round(log2(MAX_MEMORY_S * rate_hz)), 1) + 1), dtype=np.int64)

@@ -51,7 +51,7 @@ def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float
 
     Examples
     --------
-    >>> means = interval_means(np.arange(100.0), np.full(100, 25.0), 10.0, 5.0)
+    >>> means = compute_interval_means(np.arange(100.0), np.full(100, 25.0), 10.0, 5.0)
     >>> means.bias.tolist(), means.temperature_c.tolist()
     ([24.5, 74.5], [25.0, 25.0])
     """

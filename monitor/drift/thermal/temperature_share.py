@@ -155,7 +155,7 @@ def interpolate_smoothly(course: Floats, length: int, n: int) -> Floats:
 
     Examples
     --------
-    >>> drawn(np.array([1.0, 3.0, 5.0]), 2, 6).tolist()
+    >>> interpolate_smoothly(np.array([1.0, 3.0, 5.0]), 2, 6).tolist()
     [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     """
     bend = _natural_spline(course)

@@ -37,7 +37,7 @@ class ThermalModelForm:
     def name(self) -> str:
         """Return the name of the form for display.
 
-        >>> Shape(0, ()).name, Shape(3, ()).name, Shape(0, (3600.0,)).name, Shape(1, (60.0, 600.0)).name
+        >>> ThermalModelForm(0, ()).name, ThermalModelForm(3, ()).name, ThermalModelForm(0, (3600.0,)).name, ThermalModelForm(1, (60.0, 600.0)).name
         ('constant', 'polynomial 3', 'difference 1, 0', 'difference 2, 2')
         """
         if self.memory:
@@ -83,7 +83,7 @@ def regressors(
 
     Examples
     --------
-    >>> responses(Shape(1, ()), np.array([0.0, 2.0]), 60.0).tolist()
+    >>> regressors(ThermalModelForm(1, ()), np.array([0.0, 2.0]), 60.0).tolist()
     [[1.0, 0.0], [1.0, 2.0]]
     """
     n = excess_c.size
@@ -167,7 +167,7 @@ def difference_equation(shape: ThermalModelForm, sizes: Floats, interval_s: floa
 
     Examples
     --------
-    >>> a, b, c = equation(Shape(0, (1.0 / np.log(2.0),)), np.array([3.0, 10.0]), 1.0)
+    >>> a, b, c = difference_equation(ThermalModelForm(0, (1.0 / np.log(2.0),)), np.array([3.0, 10.0]), 1.0)
     >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12)
     ([-0.5], [5.0], 1.5)
     """

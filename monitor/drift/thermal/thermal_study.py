@@ -115,7 +115,7 @@ def round_interval_s(seconds: float, rate_hz: float) -> float:
 
     Examples
     --------
-    >>> nice_interval(72 * 3600.0, 100.0), nice_interval(8784.0, 4.16), nice_interval(60.0, 100.0)
+    >>> round_interval_s(72 * 3600.0, 100.0), round_interval_s(8784.0, 4.16), round_interval_s(60.0, 100.0)
     (3600, 120, 0.5)
     """
     most = max(seconds / DEFAULT_INTERVALS, 1.0 / rate_hz) * 1.01

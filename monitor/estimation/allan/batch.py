@@ -74,7 +74,7 @@ def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tup
     terms : ndarray of int64, shape (m, k)
         Number of terms.
 
-    >>> overlapping(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().tolist()
+    >>> overlapping_avar(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().tolist()
     [0.5, 0.0]
     """
     columns = list(each(lambda column: overlapping_avar_axis(column, factors), values.T))
@@ -113,7 +113,7 @@ def slope_of_recording(values: Floats) -> Floats:
 
     The slope is NaN if more than a fiftieth of the samples is missing.
 
-    >>> slope(0.5 * np.arange(9.0)[:, None]).tolist()
+    >>> slope_of_recording(0.5 * np.arange(9.0)[:, None]).tolist()
     [0.5]
     """
     third = len(values) // 3
@@ -146,7 +146,7 @@ def slope_per_tau(values: Floats, factors: Ints) -> Floats:
     ndarray of float64, shape (m, k)
         Slope in units per sample; NaN where no term is complete, and for axes with more than a fiftieth missing.
 
-    >>> slopes(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
+    >>> slope_per_tau(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
     [0.5, 0.5]
     """
     m = np.asarray(factors, np.int64)

@@ -85,7 +85,7 @@ def compute_dynamic_allan(
     NotReady
         If the recording is shorter than the window.
 
-    >>> steady = dynamic(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0, step_s=50.0)
+    >>> steady = compute_dynamic_allan(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0, step_s=50.0)
     >>> steady.t_s.tolist()
     [100.0, 150.0, 200.0, 250.0, 300.0]
     >>> steady.deviation.shape, steady.value.shape

@@ -66,7 +66,7 @@ def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
         Number of terms.
 
     >>> ramp = np.arange(90.0)[:, None]
-    >>> hadamard(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
+    >>> hadamard_variance(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
     [0.166666666667, 0.0]
     """
     phase, missing = integrate_to_phase(values)

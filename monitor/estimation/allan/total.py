@@ -84,7 +84,7 @@ def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     terms : ndarray of int64, shape (m, k)
         Number of terms.
 
-    >>> total(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().round(9).tolist()
+    >>> total_variance(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().round(9).tolist()
     [0.5, 0.002525253]
     """
     phase, missing = integrate_to_phase(values)

@@ -138,7 +138,7 @@ def covariance_table(n: int, factors: Ints) -> CovarianceTable:
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
 
-    >>> t = table(30_001, np.array([1, 2]))
+    >>> t = covariance_table(30_001, np.array([1, 2]))
     >>> round(2 * 1.0**2 / t.covariance[0, 0, PAIRS.index((1, 1))])
     20000
     """

@@ -91,7 +91,7 @@ def display_spans(factors: Ints, rate_hz: float, length: int) -> Ints:
     ndarray of int64, shape (m,)
         Span of each cluster size in samples.
 
-    >>> quick_spans(np.array([1, 100, 10_000]), 100.0, 100_000).tolist()
+    >>> display_spans(np.array([1, 100, 10_000]), 100.0, 100_000).tolist()
     [1000, 1600, 100000]
     """
     return np.minimum(np.maximum(QUICK_CLUSTERS * factors, round(QUICK_S * rate_hz)), length)

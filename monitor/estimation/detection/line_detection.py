@@ -150,7 +150,7 @@ def outlier_share(values: Floats, moving: Mask) -> Floats:
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[::50, 2] = 30.0
-    >>> outliers(noise, np.zeros(20_000, bool)).round(3).tolist()
+    >>> outlier_share(noise, np.zeros(20_000, bool)).round(3).tolist()
     [0.0, 0.0, 0.02, 0.0, 0.0, 0.0]
     """
     shares = np.full(len(AXES), np.nan)

@@ -95,7 +95,7 @@ def format_tau_range(gap: AxisGap) -> str:
 
     >>> import numpy as np
     >>> one = np.ones(1)
-    >>> place(AxisGap("gz", one, one, one, 9.0, (0.04, 1.28), 0, 2.0, 3.0, 3.5, 1000))
+    >>> format_tau_range(AxisGap("gz", one, one, one, 9.0, (0.04, 1.28), 0, 2.0, 3.0, 3.5, 1000))
     '0.04 to 1.28 s'
     """
     lo, hi = gap.tau_s

@@ -283,7 +283,7 @@ def max_z_limit(share: float, numbers: int) -> float:
     numbers : int
         Number of z.
 
-    >>> f"{limit(0.05, 1):.3f} {limit(0.01, 6 * 14):.3f}"
+    >>> f"{max_z_limit(0.05, 1):.3f} {max_z_limit(0.01, 6 * 14):.3f}"
     '1.960 3.847'
     """
     return -normal_quantile(float(-0.5 * np.expm1(np.log1p(-share) / numbers)))

@@ -66,10 +66,10 @@ class MotionDetector:
     rate_hz : float
         Sample rate in Hz.
 
-    >>> rest = Rest(100.0)
+    >>> rest = MotionDetector(100.0)
     >>> still = np.random.default_rng(0).normal(0.0, 1e-3, (2000, 6))
     >>> still[1000:1200, 0] += np.sin(np.arange(200) / 20)
-    >>> out = rest.update(block(np.arange(2000), still)) + rest.flush()
+    >>> out = rest.update(make_block(np.arange(2000), still)) + rest.flush()
     >>> [motion.text for motion in rest.take()]
     ['moved for 2.0 s: gx up to 57 °/s']
     >>> rest.moved_samples, sum(int(np.isnan(one.values[:, 0]).sum()) for one in out)

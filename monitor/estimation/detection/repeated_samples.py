@@ -30,7 +30,7 @@ def repeated_share(values: Floats) -> float:
     one equation for s. NaN means missing.
 
     >>> noise = np.random.default_rng(0).normal(size=(5000, 6)).round()
-    >>> stale_share(noise), round(stale_share(noise.repeat(2, axis=0)), 1)
+    >>> repeated_share(noise), round(repeated_share(noise.repeat(2, axis=0)), 1)
     (0.0, 0.5)
     """
     there = np.array([not np.isnan(column[:1]).all() or not np.isnan(column).all() for column in values.T])

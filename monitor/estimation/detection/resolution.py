@@ -42,7 +42,7 @@ def find_coarse_axes(values: Floats) -> list[QuantizationStep]:
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[:, 4] = noise[:, 4].round()
-    >>> [(one.axis, one.step, round(one.noise, 1)) for one in coarse(noise)]
+    >>> [(one.axis, one.step, round(one.noise, 1)) for one in find_coarse_axes(noise)]
     [(4, 1.0, 1.0)]
     """
     rows = min(ROWS, len(values))

@@ -17,8 +17,8 @@ class BandwidthLimit(Transform):
     Butterworth, "On the theory of filter amplifiers", 1930. The Allan variance after the filter is an integral over the
     spectrum. The filter starts in its settled state at the first sample, so that gravity causes no transient.
 
-    >>> from monitor.noise.spectrum import white
-    >>> half = BandwidthLimit(cutoff=10.0, order=2).reshape(white(1.0, 0.01)).density(np.array([10.0]))
+    >>> from monitor.noise.spectrum import white_noise_spectrum
+    >>> half = BandwidthLimit(cutoff=10.0, order=2).transform_spectrum(white_noise_spectrum(1.0, 0.01)).density(np.array([10.0]))
     >>> print(f"{half[0]:.6g}")
     0.005
     """

@@ -23,8 +23,8 @@ class Resolution(Transform):
     of at least 0.6 steps. Below, the output depends on the position of the rate between two steps, and the result is
     NaN.
 
-    >>> one = white(1.0, 0.01)
-    >>> [round(float(Resolution(step=x).reshape(one).allan(np.array([1.0]))[0]), 6) for x in (1.2, 3.0)]
+    >>> one = white_noise_spectrum(1.0, 0.01)
+    >>> [round(float(Resolution(step=x).transform_spectrum(one).avar(np.array([1.0]))[0]), 6) for x in (1.2, 3.0)]
     [0.0112, nan]
     """
 

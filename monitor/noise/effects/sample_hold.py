@@ -20,9 +20,9 @@ class SampleHold(Transform):
     S_out(f) = |G|² S + V τ0 (1 − h²)/|1 − h/z|². This is exact for any input with stationary increments. The Allan
     variance is an integral over this spectrum.
 
-    >>> from monitor.noise.spectrum import white
-    >>> held = SampleHold(fraction=0.5).reshape(white(1.0, 0.01))
-    >>> print(f"{held.allan(np.array([0.01]))[0]:.3f}")  # r(0) − r(1) of white noise held: 1 − h
+    >>> from monitor.noise.spectrum import white_noise_spectrum
+    >>> held = SampleHold(fraction=0.5).transform_spectrum(white_noise_spectrum(1.0, 0.01))
+    >>> print(f"{held.avar(np.array([0.01]))[0]:.3f}")  # r(0) − r(1) of white_noise_spectrum noise held: 1 − h
     0.500
     """
 

@@ -21,9 +21,9 @@ class SampleRateError(Transform):
     the clock is wrong. The effect applies to all axes, whichever axis names it. If it is named twice, the ratios must
     be equal.
 
-    >>> from monitor.noise.spectrum import white
-    >>> stated = SampleRateError(ratio=2.0).restated(white(1.0, 0.005))
-    >>> stated.tau0_s, float(stated.allan(np.array([0.01]))[0])
+    >>> from monitor.noise.spectrum import white_noise_spectrum
+    >>> stated = SampleRateError(ratio=2.0).restated(white_noise_spectrum(1.0, 0.005))
+    >>> stated.tau0_s, float(stated.avar(np.array([0.01]))[0])
     (0.01, 1.0)
     """
 

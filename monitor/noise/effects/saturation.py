@@ -22,8 +22,8 @@ class Saturation(Transform):
     If level, lines and six standard deviations of the noise of an hour stay within the range, nothing is clipped.
     Spectrum and Allan variance are then unchanged. Otherwise there is no closed form, and they are NaN.
 
-    >>> from monitor.noise.spectrum import white
-    >>> [float(Saturation(limit=x).reshape(white(1.0, 0.01)).allan(np.array([1.0]))[0]) for x in (10.0, 1.0)]
+    >>> from monitor.noise.spectrum import white_noise_spectrum
+    >>> [float(Saturation(limit=x).transform_spectrum(white_noise_spectrum(1.0, 0.01)).avar(np.array([1.0]))[0]) for x in (10.0, 1.0)]
     [0.01, nan]
     """
 

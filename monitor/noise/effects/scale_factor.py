@@ -14,8 +14,8 @@ from monitor.noise.spectrum import Spectrum
 class ScaleFactor(Transform):
     """Factor on the measurement of the axis, y = f·x: σ²(τ) and S(f) times f² (IEEE Std 952, scale factor).
 
-    >>> from monitor.noise.spectrum import white
-    >>> float(ScaleFactor(factor=2.0).reshape(white(1.0, 0.01)).allan(np.array([0.01]))[0])
+    >>> from monitor.noise.spectrum import white_noise_spectrum
+    >>> float(ScaleFactor(factor=2.0).transform_spectrum(white_noise_spectrum(1.0, 0.01)).avar(np.array([0.01]))[0])
     4.0
     """
 

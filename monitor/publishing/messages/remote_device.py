@@ -219,9 +219,9 @@ class RemoteDevice:
 def split_key(key: str) -> tuple[str, topics.Topic] | None:
     """Split a key into the device's part and the topic; None if the topic is not in ``monitor.common.topics``.
 
-    >>> split("imu/bench-1/status")
+    >>> split_key("imu/bench-1/status")
     ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz', kept=1))
-    >>> split("imu/bench-1/mood")
+    >>> split_key("imu/bench-1/mood")
     """
     for topic in topics.TOPICS:
         device = key.removesuffix(f"/{topic.name}")
@@ -303,7 +303,7 @@ def noise(message: CoefficientsMessage) -> Noise:
 def strip_control_characters(text: Any) -> str:
     """Replace control characters by spaces, because a terminal would interpret them.
 
-    >>> clean("link\\x1b[2J lost\\nnow")
+    >>> strip_control_characters("link\\x1b[2J lost\\nnow")
     'link [2J lost now'
     """
     return "".join(c if c.isprintable() else " " for c in str(text))

@@ -65,7 +65,7 @@ class TimeUnit:
     def of(cls, span_s: float) -> "TimeUnit":
         """Return the unit that suits a time span given in seconds.
 
-        >>> Clock.of(7200.0).name, Clock.of(5e5).name
+        >>> TimeUnit.of(7200.0).name, TimeUnit.of(5e5).name
         ('min', 'd')
         """
         return next(cls(name, seconds) for name, seconds, below in UNITS_S if span_s < below)
@@ -116,7 +116,7 @@ def height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
 def relative(dynamic: DynamicAllan) -> Floats:
     """Return the deviation divided by its median over time, shape [T, m, 6]; NaN if missing or if the median is 0.
 
-    >>> from monitor.estimation.allan.dynamic_allan import dynamic as of
+    >>> from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan as of
     >>> steady = of(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0)
     >>> bool(np.allclose(np.median(relative(steady), axis=0), 1.0))
     True

@@ -156,7 +156,7 @@ def span(low: float, high: float, unit: str) -> str:
 def format_range(where: Location, axis: str) -> str:
     """Format the range in which a diagnostic found a gap; "everywhere" if no range is given.
 
-    >>> place(Where(tau=(1.0, 4.0), source="ax"), "gz")
+    >>> format_range(Location(tau=(1.0, 4.0), source="ax"), "gz")
     'τ = 1 … 4 s, from ax'
 
     Parameters
@@ -196,7 +196,7 @@ def score_line(one: Score, axis: str) -> str:
 def format_gap(size: float) -> str:
     """Format the size of a gap.
 
-    >>> gap(0.6), gap(41.23), gap(12345.0)
+    >>> format_gap(0.6), format_gap(41.23), format_gap(12345.0)
     ('0.60', '41.2', '12300')
     """
     if not isfinite(size) or size >= 1000.0:

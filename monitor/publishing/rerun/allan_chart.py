@@ -82,7 +82,7 @@ def finite_sections(positions: Floats) -> list[Floats]:
 def dash_line(line: Floats, length: float = 0.22) -> list[Floats]:
     """Divide a line of shape [n, 2] into dashes with gaps of the same length.
 
-    >>> [stroke.tolist() for stroke in dashes(np.array([[0.0, 0.0], [4.0, 0.0]]), 1.0)]
+    >>> [stroke.tolist() for stroke in dash_line(np.array([[0.0, 0.0], [4.0, 0.0]]), 1.0)]
     [[[0.0, 0.0], [1.0, 0.0]], [[2.0, 0.0], [3.0, 0.0]]]
 
     Parameters

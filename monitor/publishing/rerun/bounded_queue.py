@@ -10,7 +10,7 @@ T = TypeVar("T")
 class BoundedQueue(Generic[T]):
     """Queue whose items have a total weight of at most ``limit`` (bytes); thread-safe.
 
-    >>> backlog = Backlog[str](limit=2)
+    >>> backlog = BoundedQueue[str](limit=2)
     >>> for word in ("a", "b", "c"):
     ...     backlog.push(word, 1)
     >>> backlog.take(0.0), backlog.dropped

@@ -166,7 +166,7 @@ def _coefficients_in_model(model: ArmaModel) -> tuple[bool, bool, bool]:
 def format_duration(seconds: float) -> str:
     """Format a duration given in seconds with two units.
 
-    >>> duration(3725.0), duration(0.5), duration(90.0)
+    >>> format_duration(3725.0), format_duration(0.5), format_duration(90.0)
     ('1 h 02 min', '0.500 s', '1 min 30 s')
     """
     if seconds < 60:

@@ -343,7 +343,7 @@ def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[]
 def total_memory_limit(memory: str) -> str:
     """Return the memory limit of a window, increased by the memory of the program; a percentage is not changed.
 
-    >>> with_program("256MiB"), with_program("1GiB"), with_program("25%")
+    >>> total_memory_limit("256MiB"), total_memory_limit("1GiB"), total_memory_limit("25%")
     ('512MiB', '1280MiB', '25%')
     """
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(MiB|GiB)", memory.strip())

@@ -279,9 +279,9 @@ class _EndpointSession:
 def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
     """Return the key expressions for the messages of ``topic`` that a key expression selects; a device selects all.
 
-    >>> narrowed("imu/**", topics.STATUS), narrowed("imu/bench-1", topics.STATUS)
+    >>> topic_keys("imu/**", topics.STATUS), topic_keys("imu/bench-1", topics.STATUS)
     (('imu/**/status',), ('imu/bench-1/**/status',))
-    >>> narrowed("imu/*/*", topics.STATUS), narrowed("imu/*/status", topics.EVENT)
+    >>> topic_keys("imu/*/*", topics.STATUS), topic_keys("imu/*/status", topics.EVENT)
     (('imu/*/status', 'imu/*/*/**/status'), ())
 
     Parameters

@@ -87,7 +87,7 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
     >>> rng = np.random.default_rng(0)
     >>> w = rng.standard_normal(20_000)
     >>> w[::400] += 8.0 * rng.standard_normal(50)
-    >>> found = outliers(w)
+    >>> found = fit_outliers(w)
     >>> print(f"{found.fraction.value:.4f} {found.scale.value:.1f} {found.gain > 100.0} {found.over_student > 5.0}")
     0.0023 7.2 True True
     """

@@ -120,7 +120,7 @@ def fit_variance_history(w: Floats, tau0_s: float) -> VarianceHistory:
     >>> rng = np.random.default_rng(0)
     >>> w = rng.standard_normal(60_000)
     >>> w[20_000:] *= 1.2
-    >>> found = variance_course(w, 0.01)
+    >>> found = fit_variance_history(w, 0.01)
     >>> print(f"{found.step.gain > 100} {found.step.time.value:.1f} {found.step.ratio.value:.1f}")
     True 200.5 1.2
     """
@@ -164,7 +164,7 @@ def find_least_constant_tiles(w: Floats, tau0_s: float) -> SpectrogramExtremes:
     >>> rng = np.random.default_rng(0)
     >>> w, t = rng.standard_normal(60_000), 0.01 * np.arange(60_000)
     >>> w[30_000:40_000] += 0.3 * np.sin(2.0 * np.pi * 17.3 * t[30_000:40_000])
-    >>> found = tiles(w, 0.01)
+    >>> found = find_least_constant_tiles(w, 0.01)
     >>> found.gain > 50.0, found.frequency[0] < 17.3 < found.frequency[1]
     (True, True)
     """

@@ -73,7 +73,7 @@ def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] 
 
     Examples
     --------
-    >>> found = bins(360_000, 100.0)
+    >>> found = frequency_bins(360_000, 100.0)
     >>> int(found.count.sum()), 700 < found.count.size < 1000
     (359999, True)
     """
@@ -120,7 +120,7 @@ def inverse_cosine_transform(coefficients: Floats) -> Floats:
     Examples
     --------
     >>> y = np.array([1.0, 4.0, -5.0])
-    >>> bool(np.allclose(series(transform(y)), y))
+    >>> bool(np.allclose(inverse_cosine_transform(cosine_transform(y)), y))
     True
     """
     return np.asarray(idct(np.concatenate([[0.0], coefficients]), norm="ortho"))

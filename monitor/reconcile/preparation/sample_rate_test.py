@@ -74,7 +74,7 @@ def in_stated_time(effect: Effect, ratio: float) -> Effect:
 
     Examples
     --------
-    >>> restated(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
+    >>> in_stated_time(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
     10.0
     """
     changed: dict[str, Any] = {

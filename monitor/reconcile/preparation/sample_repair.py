@@ -70,7 +70,7 @@ def fill_missing(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
     --------
     >>> rng = np.random.default_rng(0)
     >>> y = 5.0 + rng.standard_normal(100_000)
-    >>> new = filled(y, rng.random(100_000) < 0.3, rng)
+    >>> new = fill_missing(y, rng.random(100_000) < 0.3, rng)
     >>> print(f"{new.mean():.2f} {new.std():.2f}")
     5.00 1.00
     """
@@ -120,7 +120,7 @@ def restore_clipped(y: Floats, limit: float, sigma: float, rng: np.random.Genera
     --------
     >>> rng = np.random.default_rng(0)
     >>> x = 0.5 + rng.standard_normal(100_000)
-    >>> new = unclipped(np.clip(x, -1.0, 1.0), 1.0, 1.0, rng)
+    >>> new = restore_clipped(np.clip(x, -1.0, 1.0), 1.0, 1.0, rng)
     >>> print(f"{new.mean():.2f} {new.std():.2f}")
     0.50 1.00
     """

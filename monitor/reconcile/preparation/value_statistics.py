@@ -126,9 +126,9 @@ def detect_quantization(y: Floats) -> QuantizationGrid | None:
     Examples
     --------
     >>> x = np.random.default_rng(0).standard_normal(10_000)
-    >>> round(levels(0.013 * np.rint(x / 0.013) + 9.81).step.value, 9)
+    >>> round(detect_quantization(0.013 * np.rint(x / 0.013) + 9.81).step.value, 9)
     0.013
-    >>> levels(x), levels(x.astype(np.float32).astype(float)), levels(x.round(4))
+    >>> detect_quantization(x), detect_quantization(x.astype(np.float32).astype(float)), detect_quantization(x.round(4))
     (None, None, None)
     """
     values = _finite_values(y)
@@ -164,8 +164,8 @@ def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
     Examples
     --------
     >>> x = np.random.default_rng(0).standard_normal(10_000)
-    >>> found = clipped(np.clip(x, -2.5, 2.5))
-    >>> round(found.limit.value, 3), found.count, clipped(x)
+    >>> found = detect_clipping(np.clip(x, -2.5, 2.5))
+    >>> round(found.limit.value, 3), found.count, detect_clipping(x)
     (2.5, 131, None)
     """
     values = _finite_values(y)
@@ -214,7 +214,7 @@ def detect_repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> Repea
     --------
     >>> x = np.random.default_rng(0).standard_normal(10_000)
     >>> x[5000] = x[4999]
-    >>> repeats(x).count
+    >>> detect_repeats(x).count
     1.0
     """
     if step == 0.0 and not (y[1:] == y[:-1]).any():

@@ -75,7 +75,7 @@ def distance(effect: str, a: ParameterInterval | None, b: ParameterInterval | No
 
     Examples
     --------
-    >>> distance("sinusoidal", Bounds(17.30), Bounds(17.32)) is None, distance("sinusoidal", Bounds(17.3), Bounds(19.0))
+    >>> distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(17.32)) is None, distance("sinusoidal", ParameterInterval(17.3), ParameterInterval(19.0))
     (False, None)
     """
     if a is None or b is None:

@@ -55,7 +55,7 @@ def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
 
     Examples
     --------
-    >>> both = pooled([Bounds(10.0, 8.04, 11.96), Bounds(12.0, 10.04, 13.96)])  # ± 1 standard deviation each
+    >>> both = pool_parameter([ParameterInterval(10.0, 8.04, 11.96), ParameterInterval(12.0, 10.04, 13.96)])  # ± 1 standard deviation each
     >>> print(both.bounds.value, round(both.chi2, 3), both.freedom)
     11.0 2.0 1
     """
@@ -89,7 +89,7 @@ def distance_in_sigma(bounds: ParameterInterval, value: float) -> float:
 
     Examples
     --------
-    >>> round(deviations(Bounds(10.0, 8.04, 11.96), 13.0), 3)
+    >>> round(distance_in_sigma(ParameterInterval(10.0, 8.04, 11.96), 13.0), 3)
     3.0
     """
     three = _finite_interval(bounds)
