@@ -13,7 +13,8 @@ import pytest
 from drivers import file_access
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.links import replay_link
-from drivers.recordings import load_samples, open_recording_writer, segment
+from drivers.recordings import load_samples, segment
+from drivers.recordings.writing import atomic_write_path
 from drivers.zenoh.session import configuration
 from monitor.commands import thermal
 from monitor.common import config_files
@@ -118,7 +119,7 @@ def test_a_segment(kind: str, read: Callable[[Path], object], tmp_path: Path) ->
 
 def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.csv.part")
-    with open_recording_writer.whole(tmp_path / "a.csv") as part:
+    with atomic_write_path(tmp_path / "a.csv") as part:
         part.write_text("x")
     assert (tmp_path / "a.csv").read_text() == "x"
     pytest.importorskip("pyarrow")

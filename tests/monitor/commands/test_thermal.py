@@ -53,7 +53,7 @@ def test_the_model_file_comes_back_as_it_went(tmp_path):
     assert written["schema"] == "imu-monitor/thermal-model/1"
     assert written["axes"]["gz"]["equation"] == one.equation == other.equation
     assert one.shape == other.shape
-    for name in ("sizes", "start", "covariance"):
+    for name in ("coefficients", "initial_state", "covariance"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     assert (one.phi, one.sigma, one.reference_c) == (other.phi, other.sigma, other.reference_c)
 

@@ -41,7 +41,7 @@ class Caught:
     def estimate(self, device, unix_s, estimate):
         self.estimates.append((unix_s, estimate))
 
-    def gap(self, device, unix_s, gap):
+    def model_gap(self, device, unix_s, gap):
         self.gaps.append((unix_s, gap))
 
     def thermal(self, device, unix_s, received, look):
@@ -736,7 +736,7 @@ def test_a_step_of_the_bias_is_an_event_of_its_time():
         rig.finish_models()
     told = [event for _, event in rig.caught.events if event.kind == "drift_unexplained" and "stepped" in event.text]
     assert [event.axis for event in told] == ["gy"]
-    assert told[0].what["bias"]["size"] == pytest.approx(0.02, rel=0.05)
+    assert told[0].values["bias"]["size"] == pytest.approx(0.02, rel=0.05)
     assert 390 < told[0].t_ns / 1e9 < 510  # as long as the level before had been confirmed, 5 min at most
 
 

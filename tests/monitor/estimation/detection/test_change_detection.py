@@ -160,8 +160,8 @@ def test_louder_white_noise_is_named(factor):
     values[40_000:, GZ] = 0.1 + factor * (values[40_000:, GZ] - 0.1)
     change = only(values)
     assert change.kind == "noise_changed"
-    assert list(change.values) == ["N"]
-    before, after = change.values["N"]
+    assert list(change.what) == ["N"]
+    before, after = change.what["N"]
     assert before == pytest.approx(SIGMA / 10.0, rel=0.1)
     assert after / before == pytest.approx(factor, rel=0.15)
     assert abs(change.since - 40_000) < 200
@@ -186,8 +186,8 @@ def test_a_new_resonance_is_a_band_of_frequencies():
     values[20_000:, GZ] += SIGMA * made / made.std()
     change = found(values)[0]
     assert change.kind == "noise_changed"
-    assert set(change.values) == {"band", "rms"}
-    low, high = change.values["band"]
+    assert set(change.what) == {"band", "rms"}
+    low, high = change.what["band"]
     assert low < 20.0 < high
     assert "Hz rose by" in change.text
 
@@ -197,7 +197,7 @@ def test_a_step_is_told_once_with_its_height():
     values[50_011:, GZ] += 4 * SIGMA
     change = only(values)
     assert change.kind == "bias_stepped"
-    before, after = change.values["bias"]
+    before, after = change.what["bias"]
     assert after - before == pytest.approx(4 * SIGMA, rel=0.25)
     assert abs(change.since - 50_011) <= 40
     assert change.text.startswith("gz bias stepped by +0.2")
@@ -225,8 +225,8 @@ def test_a_burst_is_told_once_and_forgotten():
     detector.update(values)
     (change,) = detector.take()
     assert (change.kind, AXES[change.axis]) == ("outlier_burst", "gz")
-    assert 8 <= change.values["count"][1] <= 20
-    assert change.values["scale"][1] == pytest.approx(0.05, rel=0.5)
+    assert 8 <= change.what["count"][1] <= 20
+    assert change.what["scale"][1] == pytest.approx(0.05, rel=0.5)
     assert detector._state.born[GZ] == 0
 
 
@@ -266,9 +266,9 @@ def test_the_papers_experiment():
         assert change.kind == "noise_changed"
         assert abs(change.since / 100.0 - 250.0) < 5.0
         assert change.found / 100.0 < 260.0
-        assert "N" in change.values
-        assert "Q" not in change.values
-        assert change.values["N"][1] == pytest.approx(3e-4, rel=0.2)
+        assert "N" in change.what
+        assert "Q" not in change.what
+        assert change.what["N"][1] == pytest.approx(3e-4, rel=0.2)
 
 
 # --- letters
