@@ -18,8 +18,8 @@ class BandwidthLimit(Transform):
     spectrum. The filter starts in its settled state at the first sample, so that gravity causes no transient.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
-    >>> half = BandwidthLimit(cutoff=10.0, order=2).transform_spectrum(white_noise_spectrum(1.0, 0.01)).density(np.array([10.0]))
-    >>> print(f"{half[0]:.6g}")
+    >>> limited = BandwidthLimit(cutoff=10.0, order=2).transform_spectrum(white_noise_spectrum(1.0, 0.01))
+    >>> print(f"{limited.density(np.array([10.0]))[0]:.6g}")
     0.005
     """
 

@@ -23,7 +23,8 @@ class Saturation(Transform):
     Spectrum and Allan variance are then unchanged. Otherwise there is no closed form, and they are NaN.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
-    >>> [float(Saturation(limit=x).transform_spectrum(white_noise_spectrum(1.0, 0.01)).avar(np.array([1.0]))[0]) for x in (10.0, 1.0)]
+    >>> white = white_noise_spectrum(1.0, 0.01)
+    >>> [float(Saturation(limit=x).transform_spectrum(white).avar(np.array([1.0]))[0]) for x in (10.0, 1.0)]
     [0.01, nan]
     """
 

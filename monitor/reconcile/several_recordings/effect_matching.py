@@ -75,8 +75,11 @@ def distance(effect: str, a: ParameterInterval | None, b: ParameterInterval | No
 
     Examples
     --------
-    >>> distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(17.32)) is None, distance("sinusoidal", ParameterInterval(17.3), ParameterInterval(19.0))
-    (False, None)
+    >>> line = ParameterInterval(17.30)
+    >>> distance("sinusoidal", line, ParameterInterval(17.32)) is None
+    False
+    >>> distance("sinusoidal", line, ParameterInterval(19.0)) is None
+    True
     """
     if a is None or b is None:
         return 0.0

@@ -55,7 +55,8 @@ def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
 
     Examples
     --------
-    >>> both = pool_parameter([ParameterInterval(10.0, 8.04, 11.96), ParameterInterval(12.0, 10.04, 13.96)])  # ± 1 standard deviation each
+    >>> intervals = [ParameterInterval(10.0, 8.04, 11.96), ParameterInterval(12.0, 10.04, 13.96)]  # ± 1.96 σ, σ = 1
+    >>> both = pool_parameter(intervals)
     >>> print(both.bounds.value, round(both.chi2, 3), both.freedom)
     11.0 2.0 1
     """
