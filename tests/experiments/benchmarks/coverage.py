@@ -105,15 +105,15 @@ def tables(chunks: list[Chunk]) -> str:
         markdown(
             ("record", "noise", "records", "holds, %", "worst and best τ, %"), [_deviations(*g) for g in groups.items()]
         ),
-        "Terms that are there:",
+        "Terms that are present:",
         markdown(
-            ("record", "noise", "term", "what is said holds, %", "estimated, %", "interval holds, %", "bound holds, %"),
+            ("record", "noise", "term", "result holds, %", "estimated, %", "interval holds, %", "bound holds, %"),
             [row for group in groups.items() for row in _present(*group)],
         ),
-        "Terms that are absent, and enter all the same, %:",
+        "Absent terms that are estimated, %:",
         markdown(("record", "noise", *SYMBOLS), [_absent(*group) for group in groups.items()]),
-        f"Bold: all of the figure's interval lies outside {_percent(*TWO_SIDED)} % (intervals), "
-        f"{_percent(*ONE_SIDED)} % (bounds), {_percent(*SAID)} % (what is said), {_percent(*FALSE)} % (absent terms).",
+        f"Bold: the interval of the figure lies entirely outside {_percent(*TWO_SIDED)} % (intervals), "
+        f"{_percent(*ONE_SIDED)} % (bounds), {_percent(*SAID)} % (all results), {_percent(*FALSE)} % (absent terms).",
     ]
     return "\n\n".join(parts)
 
