@@ -23,8 +23,10 @@ def mask_secrets(text: str) -> str:
 
     >>> mask_secrets("rfc2217://bench:hunter2@10.0.0.7:4000 is busy")
     'rfc2217://bench:***@10.0.0.7:4000 is busy'
-    >>> mask_secrets('usrpwd: {user: "nose", password: "hunter2"}'), mask_secrets("tls/h:7447#listen_private_key_base64=MIIE;so=1")
-    ('usrpwd: {user: "nose", password: ***}', 'tls/h:7447#listen_private_key_base64=***;so=1')
+    >>> mask_secrets('usrpwd: {user: "nose", password: "hunter2"}')
+    'usrpwd: {user: "nose", password: ***}'
+    >>> mask_secrets("tls/h:7447#listen_private_key_base64=MIIE;so=1")
+    'tls/h:7447#listen_private_key_base64=***;so=1'
     """
     return _NAMED_SECRET.sub(rf"\1{MASK}", _URL_PASSWORD.sub(rf"\1:{MASK}@", text))
 
