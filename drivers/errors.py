@@ -31,13 +31,18 @@ class ImuError(Exception):
 
 
 def format_one_line(text: str) -> str:
-    """Return the text in one line without control characters, cut after LONGEST characters.
+    """Return the text in one line without control characters, cut after MAX_TEXT_CHARACTERS characters.
 
     >>> format_one_line("no key \\x1b[2J\\nhere")
     'no key  [2J here'
     """
     text = "".join(c if c.isprintable() else " " for c in text[: MAX_TEXT_CHARACTERS + 1].strip())
     return text if len(text) <= MAX_TEXT_CHARACTERS else f"{text[:MAX_TEXT_CHARACTERS]} …"
+
+
+def describe_error(error: Exception) -> str:
+    """Return the text of an exception in one line. For an error of the system, this is the reason without the path."""
+    return " ".join(str(getattr(error, "strerror", None) or error).split())
 
 
 class ConfigError(ImuError, ValueError):

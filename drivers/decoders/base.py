@@ -9,10 +9,11 @@ key: "scale.gx: ...".
 next block counts it in ``lost``, so that its place in time stays empty.
 """
 
+from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, Final, Protocol, runtime_checkable
+from typing import ClassVar, Final, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 import numpy as np
@@ -25,15 +26,15 @@ from drivers.sample import SenderTiming as SenderTiming  # noqa: PLC0414 - re-ex
 from drivers.sample import Timing as Timing  # noqa: PLC0414 - re-exported for decoders
 
 MAX_GYRO_RAD_S: Final = 1000.0
-"""Largest plausible angular rate in rad/s. No MEMS gyroscope turns this fast (the widest range sold is 4000 °/s = 70
-rad/s).
-"""
+"""Largest plausible angular rate in rad/s. The widest range of MEMS gyroscopes is 4000 °/s, which is 70 rad/s."""
 MAX_ACCEL_M_S2: Final = 10_000.0
-"""Largest plausible acceleration in m/s², about 1000 g. It is above every inertial-grade MEMS range."""
+"""Largest plausible acceleration in m/s², about 1000 g. It is above the range of every inertial-grade MEMS sensor."""
 VALUE_LIMITS: Final = np.repeat([MAX_GYRO_RAD_S, MAX_ACCEL_M_S2], 3)
 """Largest plausible values [6] in the order of ``AXES``."""
 TEMPERATURE_LIMITS_C: Final = (-100.0, 300.0)
 """Lowest and highest plausible temperature."""
+
+Bytes = NDArray[np.uint8]
 
 
 class DecoderSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
@@ -47,7 +48,7 @@ class Decoder(Protocol):
 
     @property
     def timing(self) -> Timing:
-        """Timing that the frames carry. It does not change during the life of the decoder."""
+        """Timing information that the frames carry. It does not change during the life of the decoder."""
 
     @property
     def bad(self) -> int:
@@ -67,7 +68,7 @@ class Decoder(Protocol):
         """Return the samples in the wire format as a device would send them. Counters are taken from ``ticks``."""
 
     def reset(self) -> None:
-        """Forget an incomplete frame, because the link was opened again."""
+        """Discard an incomplete frame, because the link was opened again."""
 
 
 @runtime_checkable
@@ -76,7 +77,7 @@ class AddressFilter(Protocol):
 
     @property
     def addresses(self) -> tuple[int, ...]:
-        """Addresses to receive, in the form of ``Chunk.address``."""
+        """Addresses to receive, encoded as in ``Chunk.address``."""
 
 
 @runtime_checkable
@@ -87,7 +88,7 @@ class LateFrameCounter(Protocol):
     def late(self) -> int:
         """Number of samples left out because some of their frames arrived too late.
 
-        They are not included in ``bad``.
+        These samples are not included in ``bad``.
         """
 
     @property
@@ -95,29 +96,54 @@ class LateFrameCounter(Protocol):
         """Delay of the late frames and the remedy, for the status; "" if no frame has been late for a while."""
 
 
-class BlockBuilder:
-    """Collector of decoded rows. It splits them into blocks where frames were rejected."""
+HINT_FRAMES: Final = 1000
+"""Number of good frames after a rejected frame until the hint about the rejected frame ends."""
+
+
+class RejectionHint:
+    """Reason for the last rejected frame. It is shown until HINT_FRAMES good frames have followed."""
 
     def __init__(self) -> None:
-        self.bad = 0  # rejected frames and implausible rows so far
-        self._missing = 0
+        self._text = ""
+        self._good_frames = HINT_FRAMES
+
+    @property
+    def text(self) -> str:
+        """Reason for the last rejected frame; "" if there is none."""
+        return self._text if self._good_frames < HINT_FRAMES else ""
+
+    def note_rejected(self, text: str) -> None:
+        """Store the reason for a rejected frame."""
+        self._text, self._good_frames = text, 0
+
+    def count_good(self, frames: int = 1) -> None:
+        """Count good frames."""
+        self._good_frames += frames
+
+
+class BlockBuilder:
+    """Builder of blocks from decoded samples. A new block begins where frames were rejected."""
+
+    def __init__(self) -> None:
+        self.bad = 0  # rejected frames and implausible samples so far
+        self._missing = 0  # samples missing before the next block
 
     def reset(self) -> None:
-        """Forget rejected frames that were not followed by a sample."""
+        """Discard the number of rejected frames that were not followed by a sample."""
         self._missing = 0
 
-    def blocks(
+    def build_blocks(
         self,
         t_ns: Ints,
         values: Floats,
-        temperature_c: Floats,
-        ticks: Ints,
-        bad_before: Ints,
+        temperature_c: Floats | None = None,
+        ticks: Ints | None = None,
+        bad_before: Ints | None = None,
         bad_after: int = 0,
     ) -> list[SampleBlock]:
-        """Return the plausible rows as blocks.
+        """Return the plausible samples as blocks.
 
-        A row with an infinite or implausible value is dropped and leaves an empty place. NaN means not measured and is
+        A sample with an infinite or implausible value is dropped and counted as missing. NaN means not measured and is
         accepted unless all axes are NaN.
 
         Parameters
@@ -127,49 +153,50 @@ class BlockBuilder:
         values
             [n, 6] float64 in the order of AXES, rad/s and m/s².
         temperature_c
-            [n] float64 in °C.
+            [n] float64 in °C. None if the format contains no temperature.
         ticks
-            [n] int64, counter of the device; NO_TICK = none.
+            [n] int64, counter of the device, NO_TICK for a frame without a counter. None if the format contains none.
         bad_before
-            [n] int64, number of frames that were rejected just before each row.
+            [n] int64, number of frames that were rejected just before each sample. None if no frame was rejected.
         bad_after
-            Number of frames that were rejected after the last row. They count before the first row of the next call.
+            Number of frames that were rejected after the last sample. The next call counts them before its first
+            sample.
         """
-        good = plausible(values)
-        if good.size and good.all() and not bad_before.any():  # fast path for nearly all calls
-            carried, self._missing = self._missing, bad_after
-            self.bad += bad_after
-            return [make_block(t_ns, values, _valid_temperatures(temperature_c), ticks, carried)]
-        kept = np.flatnonzero(good)
-        # places lost before each kept row: rejected frames plus implausible rows since the last kept one
-        places = np.cumsum(bad_before + ~good)
-        at_kept = places[kept]
-        missing = np.diff(at_kept, prepend=0)
-        total = int(places[-1]) if places.size else 0
-        self.bad += total + bad_after
+        n = t_ns.size
+        bad_before = np.zeros(n, np.int64) if bad_before is None else bad_before
+        ticks = np.full(n, NO_TICK, np.int64) if ticks is None else ticks
+        temperature_c = np.full(n, np.nan) if temperature_c is None else _valid_temperatures(temperature_c)
+        good = are_plausible(values)
         carried, self._missing = self._missing, bad_after
+        if n and good.all() and not bad_before.any():  # fast path for nearly all calls
+            self.bad += bad_after
+            return [make_block(t_ns, values, temperature_c, ticks, carried)]
+        kept = np.flatnonzero(good)
+        # number of frames and samples that have been dropped up to each sample
+        dropped = np.cumsum(bad_before + ~good)
+        total = int(dropped[-1]) if n else 0
+        self.bad += total + bad_after
         if kept.size == 0:
             self._missing += carried + total
             return []
+        missing = np.diff(dropped[kept], prepend=0)
         missing[0] += carried
-        self._missing += total - int(at_kept[-1])
-        temperature_c = _valid_temperatures(temperature_c)
+        self._missing += total - int(dropped[kept[-1]])
         cuts = np.flatnonzero(missing[1:]) + 1
         return [
-            make_block(t_ns[rows], values[rows], temperature_c[rows], ticks[rows], int(missing[at]))
-            for at, rows in zip((0, *cuts), np.split(kept, cuts), strict=True)
+            make_block(t_ns[rows], values[rows], temperature_c[rows], ticks[rows], int(missing[first]))
+            for first, rows in zip((0, *cuts), np.split(kept, cuts), strict=True)
         ]
 
 
-def plausible(values: Floats) -> NDArray[np.bool_]:
-    """Return a mask [n] of plausible rows [n, 6].
+def are_plausible(values: Floats) -> NDArray[np.bool_]:
+    """Return a mask [n] of the plausible samples among ``values`` [n, 6].
 
-    A plausible row has at least one measured axis. None of its values is infinite or above the range of a MEMS IMU.
+    A plausible sample has at least one measured axis. None of its values is infinite or above the range of a MEMS IMU.
     """
-    size = np.abs(values)
-    too_large: NDArray[np.bool_] = np.any(size > VALUE_LIMITS, axis=1)
-    absent: NDArray[np.bool_] = np.all(np.isnan(values), axis=1)
-    return ~(too_large | absent)
+    too_large: NDArray[np.bool_] = np.any(np.abs(values) > VALUE_LIMITS, axis=1)
+    unmeasured: NDArray[np.bool_] = np.all(np.isnan(values), axis=1)
+    return ~(too_large | unmeasured)
 
 
 def _valid_temperatures(temperature_c: Floats) -> Floats:
@@ -185,57 +212,62 @@ class Frames:
     data: list[bytes]
     t_ns: Ints  # [n] arrival of the chunk that completed each frame
     bad_before: Ints  # [n] number of frames rejected just before each frame
-    at_once: NDArray[np.bool_]  # [n] True if the frame follows the previous one without other bytes
+    adjacent: NDArray[np.bool_]  # [n] True if the frame follows the previous one without other bytes
 
-    def keep(self, rows: Sequence[int]) -> tuple["Frames", int]:
-        """Return the frames of these rows, and the number of frames rejected after the last of them.
+    def select_frames(self, rows: Sequence[int]) -> tuple["Frames", int]:
+        """Return the frames with these indices, and the number of frames rejected after the last of them.
 
-        Frames that were rejected before a frame left out count before the next kept one.
+        Frames that were rejected before an unselected frame count before the next selected frame.
         """
         if len(rows) == len(self.data):
             return self, 0
-        places = np.cumsum(self.bad_before)
-        at_kept = places[list(rows)]
-        after = int(places[-1] if places.size else 0) - int(at_kept[-1] if at_kept.size else 0)
         at = list(rows)
-        kept = Frames([self.data[i] for i in rows], self.t_ns[at], np.diff(at_kept, prepend=0), self.at_once[at])
-        return kept, after
+        rejected = np.cumsum(self.bad_before)
+        rejected_at = rejected[at]
+        after = int(rejected[-1] if rejected.size else 0) - int(rejected_at[-1] if rejected_at.size else 0)
+        bad_before = np.diff(rejected_at, prepend=0)
+        return Frames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at]), after
+
+    def stack_bytes(self, rows: Sequence[int]) -> Bytes:
+        """Return the frames with these indices, which have the same length, as an array [n, length] of uint8."""
+        return np.frombuffer(b"".join([self.data[i] for i in rows]), np.uint8).reshape(len(rows), -1)
 
 
 NEED_MORE: Final = 0
-"""Result of a ``Match`` function if the buffer ends before the frame does."""
+"""Result of a ``FrameMatcher`` if the buffer ends before the frame does."""
 REJECT: Final = -1
-"""Result of a ``Match`` function if there is no valid frame."""
+"""Result of a ``FrameMatcher`` if there is no valid frame."""
 
-Match = Callable[[bytes, int], int]
-"""Function (buffer, offset of a sync) that returns the length of the valid frame there, NEED_MORE, or REJECT."""
+FrameMatcher = Callable[[bytes, int], int]
+"""Function of the buffer and the offset of a sync pattern that returns the length of the frame, NEED_MORE or REJECT."""
 
 MAX_BYTES_WITHOUT_FRAME: Final = 2000
-"""Bytes without a valid frame after which a hint is given. No supported frame is as long."""
-HINT_FRAMES: Final = 1000
-"""Number of good frames after a rejected one until the hint about it ends."""
+"""Bytes without a valid frame after which a hint is given. Every supported frame is shorter."""
+NO_OFFSET: Final = -(1 << 62)
+"""Offset far before every byte of the stream."""
 
 
 class FrameBuffer:
-    """Finder of frames in a byte stream that may be split anywhere, damaged, or joined in the middle.
+    """Buffer that finds the frames in a byte stream. The stream may be split anywhere, damaged, or begin anywhere.
 
     After a rejected candidate, the search continues one byte later in the same bytes, since a sync pattern may occur
     inside a payload. The number of frames lost between two valid frames is the larger of two counts: rejected
-    candidates at least one frame length apart, and complete frames that fit between them. Bytes before the first frame
-    (joined in the middle of the stream) are not counted. At most ``longest`` bytes are kept between calls of ``feed``.
+    candidates at least one frame length apart, and complete frames that fit between the valid frames. Bytes before the
+    first frame are not counted, because reading may begin inside a frame. At most ``longest`` bytes are kept between
+    calls of ``feed``.
 
     Parameters
     ----------
     sync
         Fixed start of a frame; empty if a frame can start with any byte. ``match`` may narrow the attribute ``sync`` to
-        the first byte of all further frames. It is widened again after MUTE_BYTES without a frame.
+        the first byte of all further frames. The attribute is widened again after MAX_BYTES_WITHOUT_FRAME bytes.
     match
         Function that checks one candidate.
     longest
         Maximum length of a frame in bytes.
     """
 
-    def __init__(self, sync: bytes, match: Match, longest: int) -> None:
+    def __init__(self, sync: bytes, match: FrameMatcher, longest: int) -> None:
         self.sync = self._initial_sync = sync
         self._match = match
         self._longest = longest
@@ -245,7 +277,7 @@ class FrameBuffer:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the buffered bytes, the synchronization, and the narrowed ``sync``."""
+        """Discard the buffered bytes, the synchronization, and the narrowed ``sync``."""
         self.sync = self._initial_sync
         self._buffer_offset += len(self._buffer)
         self._buffer = b""
@@ -254,72 +286,70 @@ class FrameBuffer:
         self._frame_length = 0
         self._skipped_bytes = 0  # bytes skipped since the last frame
         self._rejected = 0  # candidates rejected since the last frame
-        self._last_rejected = -(1 << 62)  # stream offset of the last rejected candidate
-        self._frames_since_reject = HINT_FRAMES  # number of good frames since the last rejected one
-
-    @property
-    def mute(self) -> bool:
-        """True if many bytes have arrived without a valid frame."""
-        return self._skipped_bytes >= MAX_BYTES_WITHOUT_FRAME
+        self._last_rejected = NO_OFFSET  # stream offset of the last rejected candidate
+        self._hint = RejectionHint()
 
     @property
     def hint(self) -> str:
         """Reason for rejected or missing frames; "" if there is none."""
-        if self.mute:
+        if self._skipped_bytes >= MAX_BYTES_WITHOUT_FRAME:
             return f"{self._skipped_bytes} bytes without a valid frame: is the baud rate right, and the decoder?"
-        if self._frames_since_reject < HINT_FRAMES:
-            return "frames fail their check: bytes are lost or damaged on the line"
-        return ""
+        return self._hint.text
 
     def feed(self, chunks: Sequence[Chunk]) -> Frames:
         """Return all frames that these chunks complete."""
-        buffer, match, longest = self._join(chunks), self._match, self._longest
+        buffer = self._append_chunks(chunks)
         found: list[bytes] = []
         ends: list[int] = []  # offset in the buffer after each frame
         bad_before: list[int] = []
-        at_once: list[bool] = []
+        adjacent: list[bool] = []
         at = 0
         while True:
-            start = buffer.find(self.sync, at)
-            if self.sync != self._initial_sync:
-                mute = at + MAX_BYTES_WITHOUT_FRAME - self._skipped_bytes
-                if mute <= len(buffer) and not at <= start < mute:
-                    self._skipped_bytes += mute - at
-                    at, self.sync = mute, self._initial_sync
-                    continue
-            if start < 0:
-                # the tail may be the first part of a sync
-                start = max(at, len(buffer) - len(self.sync) + 1)
-                self._skipped_bytes += start - at
-                at = start
+            start, length = self._examine_candidate(buffer, at)
+            at = start + max(length, 0)
+            if length == NEED_MORE:
                 break
-            self._skipped_bytes += start - at
-            length = match(buffer, start)
-            if length > 0:
-                at = start + length
-                found.append(buffer[start:at])
-                ends.append(at)
-                at_once.append(not self._skipped_bytes)
-                bad_before.append(self._close_hole() if self._skipped_bytes else 0)
-                self._frame_length = length
-                self._synchronized = True
-            elif length == NEED_MORE and len(buffer) - start < longest:
-                at = start
-                break
-            else:
-                self._reject(start)
+            if length == REJECT:
+                self._count_rejected(start)
                 self._skipped_bytes += 1
                 at = start + 1
-        frames = Frames(found, self._arrived(ends), np.array(bad_before, np.int64), np.array(at_once, np.bool_))
+                continue
+            found.append(buffer[start:at])
+            ends.append(at)
+            adjacent.append(not self._skipped_bytes)
+            bad_before.append(self._take_lost_frames() if self._skipped_bytes else 0)
+            self._frame_length = length
+            self._synchronized = True
+        frames = Frames(found, self._arrival_times(ends), np.array(bad_before, np.int64), np.array(adjacent, np.bool_))
         self._buffer = buffer[at:]
         self._buffer_offset += at
         while len(self._arrivals) > 1 and self._arrivals[0][0] <= self._buffer_offset:
             self._arrivals.popleft()
-        self._frames_since_reject += len(found)
+        self._hint.count_good(len(found))
         return frames
 
-    def _join(self, chunks: Sequence[Chunk]) -> bytes:
-        """Append the data of chunks to the buffer, and note their arrival times."""
+    def _examine_candidate(self, buffer: bytes, at: int) -> tuple[int, int]:
+        """Return the offset of the next candidate and the length of its frame, NEED_MORE or REJECT."""
+        start = buffer.find(self.sync, at)
+        if self.sync != self._initial_sync:
+            widen_at = at + MAX_BYTES_WITHOUT_FRAME - self._skipped_bytes
+            if widen_at <= len(buffer) and not at <= start < widen_at:
+                self._skipped_bytes += widen_at - at
+                self.sync = self._initial_sync
+                return self._examine_candidate(buffer, widen_at)
+        if start < 0:
+            # the end of the buffer may be the first part of a sync pattern
+            start = max(at, len(buffer) - len(self.sync) + 1)
+            self._skipped_bytes += start - at
+            return start, NEED_MORE
+        self._skipped_bytes += start - at
+        length = self._match(buffer, start)
+        if length == NEED_MORE and len(buffer) - start >= self._longest:
+            return start, REJECT
+        return start, length
+
+    def _append_chunks(self, chunks: Sequence[Chunk]) -> bytes:
+        """Return the buffer with the data of these chunks, and note their arrival times."""
         end = self._buffer_offset + len(self._buffer)
         for chunk in chunks:
             if chunk.data:
@@ -327,30 +357,98 @@ class FrameBuffer:
                 self._arrivals.append((end, chunk.t_ns))
         return b"".join((self._buffer, *[chunk.data for chunk in chunks]))
 
-    def _reject(self, at: int) -> None:
+    def _count_rejected(self, at: int) -> None:
         """Count a rejected candidate unless it lies within a frame length of the previous one."""
         offset = self._buffer_offset + at
         if offset - self._last_rejected >= max(self._frame_length, 1):
             self._rejected += 1
             self._last_rejected = offset
 
-    def _close_hole(self) -> int:
+    def _take_lost_frames(self) -> int:
         """Return the number of frames lost since the last frame, and reset the counts."""
         fitting = round(self._skipped_bytes / self._frame_length) if self._frame_length else 0
         count = max(self._rejected, fitting) if self._synchronized else 0
         self._skipped_bytes = self._rejected = 0
-        self._last_rejected = -(1 << 62)
+        self._last_rejected = NO_OFFSET
         if count:
-            self._frames_since_reject = 0
+            self._hint.note_rejected("frames fail their check: bytes are lost or damaged on the line")
         return count
 
-    def _arrived(self, ends: list[int]) -> Ints:
+    def _arrival_times(self, ends: list[int]) -> Ints:
         """Return the arrival times [n] of the chunks that contain the last byte of each frame."""
         if not ends:
             return np.empty(0, np.int64)
         offsets, t_ns = np.array(self._arrivals, np.int64).T
         arrived: Ints = t_ns[np.searchsorted(offsets, np.array(ends) + self._buffer_offset)]
         return arrived
+
+
+class FrameStreamDecoder(ABC):
+    """Common part of the decoders that find frames with a ``FrameBuffer`` in a byte stream.
+
+    A subclass defines ``encode``, ``timing`` and ``_decode``.
+
+    Parameters
+    ----------
+    buffer
+        Buffer that finds the frames.
+    """
+
+    carrier: ClassVar[str] = "bytes"
+
+    def __init__(self, buffer: FrameBuffer) -> None:
+        self._buffer = buffer
+        self._builder = BlockBuilder()
+
+    @property
+    def bad(self) -> int:
+        """Number of frames that failed their check, and of implausible samples."""
+        return self._builder.bad
+
+    @property
+    def hint(self) -> str:
+        """Reason for rejected frames; "" if there is none."""
+        return self._buffer.hint
+
+    def reset(self) -> None:
+        """Discard an incomplete frame."""
+        self._buffer.reset()
+        self._builder.reset()
+
+    def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
+        """Return the samples of the frames that these chunks complete."""
+        frames = self._buffer.feed(chunks)
+        return self._decode(frames) if frames.data else []
+
+    def _build_measured_blocks(
+        self, frames: Frames, values: Floats, temperature_c: Floats, ticks: Ints
+    ) -> tuple[list[SampleBlock], int | None]:
+        """Return the samples of the frames with at least one measured axis, and the index of the last such frame."""
+        rows = np.flatnonzero(~np.isnan(values).all(axis=1))
+        kept, bad_after = frames.select_frames(rows.tolist())
+        blocks = self._builder.build_blocks(
+            kept.t_ns, values[rows], temperature_c[rows], ticks[rows], kept.bad_before, bad_after
+        )
+        return blocks, int(rows[-1]) if rows.size else None
+
+    @abstractmethod
+    def _decode(self, frames: Frames) -> list[SampleBlock]:
+        """Return the samples of these frames, of which there is at least one."""
+
+
+Key = TypeVar("Key", bound=Hashable)
+
+
+def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, list[int]]]:
+    """Yield each different key with the indices at which it occurs.
+
+    >>> list(group_indices("aba"))
+    [('a', [0, 2]), ('b', [1])]
+    """
+    groups: dict[Key, list[int]] = {}
+    for i, key in enumerate(keys):
+        groups.setdefault(key, []).append(i)
+    yield from groups.items()
 
 
 def nan_to_infinity(values: Floats) -> Floats:
@@ -399,17 +497,3 @@ def xor_checksum(data: bytes) -> int:
         bits >>= 1
         folded = (folded >> bits) ^ (folded & ((1 << bits) - 1))
     return folded
-
-
-class Unmeasured:
-    """Constant columns for formats that do not measure a quantity."""
-
-    @staticmethod
-    def temperature(n: int) -> Floats:
-        """Return a column [n] of NaN."""
-        return np.full(n, np.nan)
-
-    @staticmethod
-    def ticks(n: int) -> Ints:
-        """Return a column [n] of NO_TICK."""
-        return np.full(n, NO_TICK, np.int64)

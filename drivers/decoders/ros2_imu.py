@@ -18,9 +18,9 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Decoder, DecoderSettings, SenderTiming, Timing
+from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint, SenderTiming, Timing
 from drivers.errors import DecodeError
-from drivers.sample import NO_TICK, Chunk, SampleBlock
+from drivers.sample import NO_TICK, Chunk, Floats, SampleBlock
 
 HEADER_BYTES: Final = 4
 DOUBLES: Final = 37
@@ -33,10 +33,10 @@ NOT_PROVIDED: Final = -1.0
 MAX_FRAME_ID_BYTES: Final = 1024
 FRAME_ID: Final = b"imu_link\0"
 """frame_id that ``encode`` writes (REP 145)."""
-LABELLED_BYTES: Final = 77
-LABELLED_SEQUENCE: Final = 16  # after the string "sequence_number" with its length byte
-BARE_BYTES: Final = 33
-BARE_SEQUENCE: Final = 0
+SEQUENCE_OFFSETS: Final = {77: 16, 33: 0}
+"""Offset of the sequence number by the length of the attachment. In the labelled layout, the string "sequence_number"
+with its length byte precedes the number.
+"""
 MAX_GAP_MESSAGES: Final = 1_000_000_000
 """Largest gap in messages. A larger jump, eleven days at 1 kHz, indicates another count and not a loss."""
 GID_BYTES: Final = 16  # the last bytes of both layouts
@@ -63,21 +63,29 @@ class Ros2ImuDecoder:
 
     def __init__(self) -> None:
         self.timing: Timing = SenderTiming()
-        self.bad = 0  # number of rejected messages
-        self.hint = ""
-        self._messages_since_reject = 0  # number of messages since the last rejected one
-        self._rows = BlockBuilder()
-        self._lost_in_rows = 0  # lost messages that ``Rows`` has counted as bad
-        self._lost = 0  # messages lost before the next one
+        self._hint = RejectionHint()
+        self._builder = BlockBuilder()
+        self._lost_in_builder = 0  # lost messages that the builder has counted as bad
+        self._lost = 0  # messages lost before the next message
         self._sequence: int | None = None
         self._publisher = b""
         self._encoded = 0
+
+    @property
+    def bad(self) -> int:
+        """Number of rejected messages and of implausible samples."""
+        return self._builder.bad - self._lost_in_builder
+
+    @property
+    def hint(self) -> str:
+        """Reason for the last rejected message, while it is recent."""
+        return self._hint.text
 
     def reset(self) -> None:
         """Start the count of lost messages again. There are no incomplete messages."""
         self._sequence = None
         self._lost = 0
-        self._rows.reset()
+        self._builder.reset()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return one sample per message at its own time stamp. ``ticks`` is the sequence number of the publisher."""
@@ -86,33 +94,25 @@ class Ros2ImuDecoder:
         missing: list[int] = []
         rejected = 0
         for chunk in chunks:
-            sequence = self._numbered(chunk.attachment)
+            sequence = self._read_sequence(chunk.attachment)
             try:
-                messages.append(_parse(chunk.data))
+                messages.append(_parse_message(chunk.data))
             except DecodeError as error:
-                self.hint = str(error)
-                self._messages_since_reject = 0
+                self._hint.note_rejected(str(error))
                 rejected += 1
                 continue
-            self._messages_since_reject += 1
+            self._hint.count_good()
             ticks.append(sequence)
             missing.append(self._lost + rejected)
-            self._lost_in_rows += self._lost
+            self._lost_in_builder += self._lost
             self._lost = rejected = 0
-        values = _values(messages)
-        n = len(messages)
-        blocks = self._rows.blocks(
+        return self._builder.build_blocks(
             np.array([m.t_ns for m in messages], np.int64),
-            values,
-            np.full(n, np.nan),
-            np.array(ticks, np.int64),
-            np.array(missing, np.int64),
-            rejected,
+            _read_values(messages),
+            ticks=np.array(ticks, np.int64),
+            bad_before=np.array(missing, np.int64),
+            bad_after=rejected,
         )
-        if self._messages_since_reject >= HINT_FRAMES:
-            self.hint = ""
-        self.bad = self._rows.bad - self._lost_in_rows
-        return blocks
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return little-endian messages with the bare attachment.
@@ -123,12 +123,12 @@ class Ros2ImuDecoder:
         for t_ns, values, tick in zip(samples.t_ns, samples.values, samples.ticks, strict=True):
             self._encoded = self._encoded + 1 if tick == NO_TICK else int(tick)
             attachment = struct.pack("<qqB16s", self._encoded, int(t_ns), GID_BYTES, b"imu-monitor")
-            chunks.append(Chunk(_payload(int(t_ns), values), int(t_ns), attachment=attachment))
+            chunks.append(Chunk(_encode_payload(int(t_ns), values), int(t_ns), attachment=attachment))
         return chunks
 
-    def _numbered(self, attachment: bytes) -> int:
+    def _read_sequence(self, attachment: bytes) -> int:
         """Return the sequence number of a message, and count the messages missing before it."""
-        at = {LABELLED_BYTES: LABELLED_SEQUENCE, BARE_BYTES: BARE_SEQUENCE}.get(len(attachment))
+        at = SEQUENCE_OFFSETS.get(len(attachment))
         if at is None:
             return NO_TICK
         sequence: int = struct.unpack_from("<q", attachment, at)[0]
@@ -140,7 +140,7 @@ class Ros2ImuDecoder:
         return sequence
 
 
-def _parse(data: bytes) -> _Message:
+def _parse_message(data: bytes) -> _Message:
     """Find the numbers in a payload. Raise ``DecodeError`` if it is not an Imu message."""
     end = BYTE_ORDERS.get(data[:2])
     if end is None:
@@ -156,7 +156,7 @@ def _parse(data: bytes) -> _Message:
     return _Message(sec * 1_000_000_000 + nanosec, data[start : start + BODY_BYTES], end == "<")
 
 
-def _values(messages: Sequence[_Message]) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+def _read_values(messages: Sequence[_Message]) -> Floats:
     """Return values [n, 6] in rad/s and m/s²; NaN if the message states that a quantity is not provided."""
     raw = np.frombuffer(b"".join(m.body for m in messages), "<f8").reshape(-1, DOUBLES).astype(np.float64)
     big = np.array([not m.little for m in messages], bool)
@@ -167,7 +167,7 @@ def _values(messages: Sequence[_Message]) -> np.ndarray[tuple[int, int], np.dtyp
     return values
 
 
-def _payload(t_ns: int, values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> bytes:
+def _encode_payload(t_ns: int, values: Floats) -> bytes:
     """Return the payload of a message with these values [6]."""
     body = np.zeros(DOUBLES)
     body[3] = 1.0  # orientation w

@@ -10,9 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Final
 
-import numpy as np
-
-from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Decoder, DecoderSettings, SenderTiming, Timing
+from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint, SenderTiming, Timing
 from drivers.errors import DecodeError
 from drivers.sample import Chunk, SampleBlock
 from drivers.zenoh.sample_message import decode_samples, encode_samples
@@ -32,35 +30,39 @@ class SamplesDecoder:
 
     def __init__(self) -> None:
         self.timing: Timing = SenderTiming()
-        self.bad = 0  # rejected messages and implausible rows
-        self.hint = ""
-        self._messages_since_reject = 0  # number of messages since the last rejected one
-        self._rows = BlockBuilder()
+        self._hint = RejectionHint()
+        self._builder = BlockBuilder()
         self._rejected = 0  # messages
         self._received: int | None = None  # count of the publisher in its last message
-        self._lost = 0  # rows missing before the next block
+        self._lost = 0  # samples missing before the next block
         self._encoded = 0
+
+    @property
+    def bad(self) -> int:
+        """Number of rejected messages and of implausible samples."""
+        return self._rejected + self._builder.bad
+
+    @property
+    def hint(self) -> str:
+        """Reason for the last rejected message, while it is recent."""
+        return self._hint.text
 
     def reset(self) -> None:
         """Start the count of lost samples again. There are no incomplete messages."""
         self._received = None
         self._lost = 0
-        self._rows.reset()
+        self._builder.reset()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples of each message. ``t_ns`` are the Unix times of the message."""
         found: list[SampleBlock] = []
         for chunk in chunks:
             try:
-                found += self._message(chunk.data)
-                self._messages_since_reject += 1
+                found += self._decode_message(chunk.data)
+                self._hint.count_good()
             except DecodeError as error:
                 self._rejected += 1
-                self.hint = str(error)
-                self._messages_since_reject = 0
-        if self._messages_since_reject >= HINT_FRAMES:
-            self.hint = ""
-        self.bad = self._rejected + self._rows.bad
+                self._hint.note_rejected(str(error))
         return found
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
@@ -68,20 +70,18 @@ class SamplesDecoder:
         self._encoded += len(samples)
         return [Chunk(encode_samples("encoded", self._encoded, samples), int(samples.t_ns[-1]))]
 
-    def _message(self, data: bytes) -> list[SampleBlock]:
+    def _decode_message(self, data: bytes) -> list[SampleBlock]:
         """Return the samples of one message, with the losses before it."""
         batch = decode_samples(data)
         rows = batch.block
-        self._lost = min(self._lost + rows.lost + self._skipped(batch.samples, len(rows)), MAX_GAP_SAMPLES)
-        blocks = self._rows.blocks(
-            rows.t_ns, rows.values, rows.temperature_c, rows.ticks, np.zeros(len(rows), np.int64)
-        )
+        self._lost = min(self._lost + rows.lost + self._count_skipped(batch.samples, len(rows)), MAX_GAP_SAMPLES)
+        blocks = self._builder.build_blocks(rows.t_ns, rows.values, rows.temperature_c, rows.ticks)
         if blocks and self._lost:
             blocks[0] = replace(blocks[0], lost=blocks[0].lost + self._lost)
             self._lost = 0
         return blocks
 
-    def _skipped(self, received: int, rows: int) -> int:
+    def _count_skipped(self, received: int, rows: int) -> int:
         """Return the number of samples in messages that did not arrive."""
         before, self._received = self._received, received
         missing = 0 if before is None else received - rows - before

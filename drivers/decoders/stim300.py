@@ -18,20 +18,22 @@ is the mean of the three sensors of the gyro. It is not measured if their status
 """
 
 import zlib
-from collections.abc import Iterator, Sequence
-from typing import Annotated, ClassVar, Final, Literal
+from collections.abc import Iterator
+from typing import Annotated, Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
-    BlockBuilder,
+    Bytes,
     Decoder,
     DecoderSettings,
     FrameBuffer,
+    Frames,
+    FrameStreamDecoder,
     chunk_per_sample,
+    group_indices,
     quantize,
 )
 from drivers.errors import ConfigError
@@ -50,14 +52,15 @@ IDENTIFIERS: Final = {
 """Bit mask of the parts in addition to the gyro, by identifier."""
 
 
-def datagram_size(parts: int) -> int:
+def _datagram_size(parts: int) -> int:
     """Return the length of a datagram with these parts in bytes, with CRC but without CR LF."""
     sensors = 1 + (parts & (ACCEL_PART | INCL_PART)).bit_count()
-    warm = sensors if parts & TEMPERATURE_PART else 0
-    return 1 + 10 * sensors + 7 * warm + (4 if parts & AUX_PART else 0) + 1 + 2 + 4
+    temperatures = sensors if parts & TEMPERATURE_PART else 0
+    return 1 + 10 * sensors + 7 * temperatures + (4 if parts & AUX_PART else 0) + 1 + 2 + 4
 
 
-SIZES: Final = {identifier: datagram_size(parts) for identifier, parts in IDENTIFIERS.items()}
+SIZES: Final = {identifier: _datagram_size(parts) for identifier, parts in IDENTIFIERS.items()}
+"""Length of a datagram in bytes by identifier, with CRC but without CR LF."""
 LONGEST: Final = max(SIZES.values())
 
 ACCEL_BITS: Final = {"2g": 21, "5g": 20, "10g": 19, "30g": 18, "80g": 16}
@@ -92,12 +95,12 @@ class Settings(DecoderSettings, frozen=True):
     """True if ``encode`` ends datagrams with CR LF. Both forms are read."""
 
 
-class Stim300Decoder:
+class Stim300Decoder(FrameStreamDecoder):
     """Decoder and encoder of STIM300 datagrams."""
 
-    carrier: ClassVar[str] = "bytes"
-
     def __init__(self, settings: Settings) -> None:
+        wanted = b"" if settings.identifier == "auto" else bytes([settings.identifier])
+        super().__init__(FrameBuffer(wanted, self._match_datagram, LONGEST))
         self._settings = settings
         self.timing: Timing = CounterTiming(256, 1.0 / 2000.0)
         rate = settings.rate or 1.0
@@ -105,15 +108,7 @@ class Stim300Decoder:
         bits = ACCEL_BITS[settings.accelerometer_range]
         increment = settings.accelerometer_output == "increment"
         self._accel_step = rate / 2 ** (bits + 3) if increment else G0 / 2**bits
-        wanted = b"" if settings.identifier == "auto" else bytes([settings.identifier])
-        self._buffer = FrameBuffer(wanted, self._match, LONGEST)
-        self._rows = BlockBuilder()
         self._status = 0
-
-    @property
-    def bad(self) -> int:
-        """Number of datagrams with a wrong CRC, and of samples with an error status or implausible values."""
-        return self._rows.bad
 
     @property
     def hint(self) -> str:
@@ -122,49 +117,39 @@ class Stim300Decoder:
             return "the sensor is starting up"
         if self._status:
             return f"the sensor reports an error: status 0x{self._status:02X}"
-        return self._buffer.hint
+        return super().hint
 
-    def reset(self) -> None:
-        """Forget an incomplete datagram, and with auto the identifier."""
-        self._buffer.reset()
-        self._rows.reset()
-
-    def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the samples of the datagrams that these chunks complete."""
-        frames = self._buffer.feed(chunks)
+    def _decode(self, frames: Frames) -> list[SampleBlock]:
+        """Return the samples of these datagrams. The sensor may have switched to another identifier among them."""
         n = len(frames.data)
-        if not n:
-            return []
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
         ticks = np.empty(n, np.int64)
-        identifiers = [frame[0] for frame in frames.data]
-        for identifier in dict.fromkeys(identifiers):  # the sensor may have been set to another datagram
-            at = [i for i, one in enumerate(identifiers) if one == identifier]
-            data = np.frombuffer(b"".join([frames.data[i] for i in at]), np.uint8).reshape(len(at), -1)
-            values[at], temperature_c[at] = self._read(data, IDENTIFIERS[identifier])
-            ticks[at] = data[:, -7]
-        return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
+        for identifier, rows in group_indices([frame[0] for frame in frames.data]):
+            data = frames.stack_bytes(rows)
+            values[rows], temperature_c[rows] = self._read_measurements(data, IDENTIFIERS[identifier])
+            ticks[rows] = data[:, -7]
+        return self._builder.build_blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
 
-    def _read(self, data: NDArray[np.uint8], parts: int) -> tuple[Floats, Floats]:
+    def _read_measurements(self, data: Bytes, parts: int) -> tuple[Floats, Floats]:
         """Return values [n, 6], infinite where the status byte shows an error, and temperatures [n] in °C."""
         values = np.full((len(data), 6), np.nan)
-        values[:, :3] = read_int24(data, 1) * self._gyro_step
+        values[:, :3] = _read_int24(data, 1) * self._gyro_step
         status = data[:, 10]
         if parts & ACCEL_PART:
-            values[:, 3:] = read_int24(data, 11) * self._accel_step
+            values[:, 3:] = _read_int24(data, 11) * self._accel_step
             status = status | data[:, 20]
         values[status & ERROR_BITS != 0] = np.inf
         self._status = int(status[-1]) & ERROR_BITS
         temperature_c = np.full(len(data), np.nan)
         if parts & TEMPERATURE_PART:
-            at = _temperature_at(parts)
+            at = _temperature_offset(parts)
             mean = np.ascontiguousarray(data[:, at : at + 6]).view(">i2").mean(axis=1) / 2**8
             temperature_c = np.where(data[:, at + 6] & ERROR_BITS, np.nan, mean)
         return values, temperature_c
 
-    def _match(self, buffer: bytes, at: int) -> int:
-        """Return the length of a datagram at this offset (see ``drivers.decoders.base.Match``)."""
+    def _match_datagram(self, buffer: bytes, at: int) -> int:
+        """Return the length of a datagram (see ``drivers.decoders.base.FrameMatcher``)."""
         if at >= len(buffer):
             return NEED_MORE
         length = SIZES.get(buffer[at])
@@ -189,11 +174,11 @@ class Stim300Decoder:
         parts = IDENTIFIERS[identifier]
         data = np.zeros((len(samples), SIZES[identifier] - 4), np.uint8)
         data[:, 0] = identifier
-        _put(data, 1, samples.values[:, :3], self._gyro_step)
+        _write_int24(data, 1, samples.values[:, :3], self._gyro_step)
         if parts & ACCEL_PART:
-            _put(data, 11, samples.values[:, 3:], self._accel_step)
+            _write_int24(data, 11, samples.values[:, 3:], self._accel_step)
         if parts & TEMPERATURE_PART:
-            at = _temperature_at(parts)
+            at = _temperature_offset(parts)
             raw = quantize(samples.temperature_c, 2**-8, 16).astype(">i2")
             data[:, at : at + 6] = np.repeat(raw[:, None], 3, axis=1).view(np.uint8)
             data[:, at + 6] = np.where(np.isnan(samples.temperature_c), CHANNEL_ERROR, 0)
@@ -202,29 +187,21 @@ class Stim300Decoder:
         return chunk_per_sample([row + datagram_crc(row) + tail for row in map(bytes, data)], samples.t_ns)
 
 
-def _temperature_at(parts: int) -> int:
+def _temperature_offset(parts: int) -> int:
     """Return the offset of the temperatures of the gyro."""
     return 1 + 10 * (1 + (parts & (ACCEL_PART | INCL_PART)).bit_count())
 
 
-def read_int24(data: NDArray[np.uint8], at: int) -> Ints:
-    """Return signed 24-bit big-endian integers [n, 3].
-
-    Parameters
-    ----------
-    data
-        [n, length] uint8, one datagram per row.
-    at
-        Offset of the first integer in each row.
-    """
+def _read_int24(data: Bytes, at: int) -> Ints:
+    """Return three signed 24-bit big-endian integers [n, 3] of each datagram, beginning at the offset ``at``."""
     wide = np.zeros((len(data), 3, 4), np.uint8)
     wide[:, :, :3] = data[:, at : at + 9].reshape(-1, 3, 3)
     raised: Ints = wide.view(">i4")[:, :, 0].astype(np.int64) >> 8
     return raised
 
 
-def _put(data: NDArray[np.uint8], at: int, values: Floats, step: float) -> None:
-    """Write values and their status at an offset of each row."""
+def _write_int24(data: Bytes, at: int, values: Floats, step: float) -> None:
+    """Write three values and their status byte at the offset ``at`` of each datagram."""
     raw = quantize(values, step, 24).astype(">i4").reshape(-1, 3, 1).view(np.uint8)
     data[:, at : at + 9] = raw[:, :, 1:].reshape(-1, 9)
     data[:, at + 9] = np.where(np.isnan(values).any(axis=1), CHANNEL_ERROR, 0)
@@ -232,19 +209,14 @@ def _put(data: NDArray[np.uint8], at: int, values: Floats, step: float) -> None:
 
 def datagram_crc(body: bytes) -> bytes:
     """Return the four CRC bytes of a datagram."""
+    # reversed zeros are zeros, so the padding can be appended afterwards
     mirrored = zlib.crc32(bytes(-len(body) % 4), zlib.crc32(body.translate(BIT_REVERSAL))) ^ 0xFFFFFFFF
     return mirrored.to_bytes(4, "little").translate(BIT_REVERSAL)
 
 
 def has_valid_crc(frame: bytes) -> bool:
     """Return True if the CRC of a complete datagram is correct."""
-    mirrored = frame.translate(BIT_REVERSAL)
-    stated = int.from_bytes(mirrored[-4:], "little")
-    # reversed zeros are zeros, so the padding can be appended afterwards
-    return zlib.crc32(PADDING[-len(frame) % 4], zlib.crc32(mirrored[:-4])) ^ 0xFFFFFFFF == stated
-
-
-PADDING: Final = (b"", b"\0", b"\0\0", b"\0\0\0")
+    return datagram_crc(frame[:-4]) == frame[-4:]
 
 
 def build(settings: Settings) -> Decoder:

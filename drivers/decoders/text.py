@@ -20,17 +20,17 @@ import numpy as np
 
 from drivers import units
 from drivers.decoders.base import (
-    HINT_FRAMES,
     BlockBuilder,
     Decoder,
     DecoderSettings,
+    RejectionHint,
     chunk_per_sample,
     xor_checksum,
 )
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError
 from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE, describe_range_errors
-from drivers.sample import AXES, NO_TICK, ArrivalTiming, Chunk, CounterTiming, Floats, SampleBlock, Timing
+from drivers.sample import AXES, ArrivalTiming, Chunk, CounterTiming, Floats, Ints, SampleBlock, Timing
 
 MAX_LINE_BYTES: Final = 4096
 """Maximum length of a line in bytes. A longer text without a line end is noise and is dropped."""
@@ -83,51 +83,49 @@ class TextDecoder:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._at = {name: i for i, name in enumerate(settings.columns) if name != SKIP}
-        self._wanted = frozenset(self._at.values())
+        self._column = {name: i for i, name in enumerate(settings.columns) if name != SKIP}
+        self._wanted = frozenset(self._column.values())
         self._width = len(settings.columns)
         self._factor, self._offset = _scales(settings)
-        self._tick = round(units.time_factor(settings.time_unit) / TICK_S)
-        self.timing: Timing = _timing(settings, self._tick)
+        self.timing: Timing = _timing(settings)
         self._comment = settings.comment.encode()
         self._delimiter = settings.delimiter.encode()
-        self._rows = BlockBuilder()
-        self._last_error = ""
-        self._lines_since_bad = HINT_FRAMES  # number of good lines since the last bad one
+        self._builder = BlockBuilder()
+        self._hint = RejectionHint()
         self.reset()
 
     @property
     def bad(self) -> int:
         """Number of unreadable lines and implausible samples."""
-        return self._rows.bad
+        return self._builder.bad
 
     @property
     def hint(self) -> str:
         """Description of the last bad line, while it is recent."""
-        return self._last_error if self._lines_since_bad < HINT_FRAMES else ""
+        return self._hint.text
 
     def reset(self) -> None:
-        """Forget an incomplete line. The next line is a first line again."""
+        """Discard an incomplete line. The next line is a first line again."""
         self._rest = b""
         self._overlong = False
         self._first_line_ended = False  # True if the end of the first line has arrived
         self._lines_seen = 0  # lines since the link was opened
-        self._rows.reset()
+        self._builder.reset()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples of the lines that these chunks complete."""
         lines: list[bytes] = []
         t_ns: list[int] = []
         for chunk in chunks:
-            new = self._lines(chunk.data)
+            new = self._split_lines(chunk.data)
             lines += new
             t_ns += [chunk.t_ns] * len(new)
         if not lines:
             return []
-        table, counted = self._table(lines)
-        return self._blocks(table, np.array(t_ns, np.int64)[counted])
+        table, counted = self._parse_data_lines(lines)
+        return self._build_blocks(table, np.array(t_ns, np.int64)[counted])
 
-    def _lines(self, data: bytes) -> list[bytes]:
+    def _split_lines(self, data: bytes) -> list[bytes]:
         """Return the lines that these bytes complete, stripped of line ends and blanks. Empty lines are left out."""
         *lines, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
         if lines and self._overlong:
@@ -138,7 +136,7 @@ class TextDecoder:
             lines[0] = lines[0] if self._first_is_whole(lines[0]) else b""
         if len(rest) > MAX_LINE_BYTES:
             rest, self._overlong = b"", True
-            self._note_bad_line(OVERLONG_HINT)
+            self._hint.note_rejected(OVERLONG_HINT)
         self._rest = rest
         return [line for line in lines if line]
 
@@ -150,7 +148,7 @@ class TextDecoder:
             return _nmea_body(line) is not None
         return self._settings.first_line == "keep" and self._parse_line(line)[0] is not None
 
-    def _table(self, lines: list[bytes]) -> tuple[Floats, list[int]]:
+    def _parse_data_lines(self, lines: list[bytes]) -> tuple[Floats, list[int]]:
         """Return an array [n, columns] of all lines that are not skipped, and their indices. A bad line is infinite."""
         bodies: list[bytes | None] = []  # None: the checksum is wrong
         counted: list[int] = []
@@ -166,34 +164,36 @@ class TextDecoder:
         return self._parse_lines(bodies), counted
 
     def _parse_lines(self, bodies: list[bytes | None]) -> Floats:
-        """Return an array [n, columns]. Regular lines are parsed together, otherwise line by line."""
-        alike = [self._comma_separated(body) for body in bodies if body is not None]
-        commas = self._width - 1
-        joined = b",".join(alike)
-        if len(alike) == len(bodies) and b"_" not in joined and all(a.count(b",") == commas for a in alike):
-            fields = joined.split(b",")
-            table = np.zeros((len(bodies), self._width))
-            try:
-                for at in self._at.values() if bodies else ():
-                    table[:, at] = list(map(float, fields[at :: self._width]))
-            except ValueError:
-                pass  # a field is empty or not a number: parse line by line
-            else:
-                self._lines_since_bad += len(bodies)
-                return table
+        """Return an array [n, columns]. Regular lines are parsed together. Other lines are parsed one by one."""
+        table = self._parse_regular_lines(bodies)
+        if table is not None:
+            self._hint.count_good(len(bodies))
+            return table
         rows = []
         for body in bodies:
-            row, complaint = (None, "a line fails its checksum") if body is None else self._parse_line(body)
+            row, error = (None, "a line fails its checksum") if body is None else self._parse_line(body)
             rows.append(row or [np.inf] * self._width)
-            if complaint:
-                self._note_bad_line(complaint)
+            if error:
+                self._hint.note_rejected(error)
             else:
-                self._lines_since_bad += 1
+                self._hint.count_good()
         return np.array(rows).reshape(-1, self._width)
 
-    def _note_bad_line(self, complaint: str) -> None:
-        """Keep the description of a bad line for the hint."""
-        self._last_error, self._lines_since_bad = complaint, 0
+    def _parse_regular_lines(self, bodies: list[bytes | None]) -> Floats | None:
+        """Return an array [n, columns] if every line has all its fields and all are numbers, otherwise None."""
+        separated = [self._comma_separated(body) for body in bodies if body is not None]
+        joined = b",".join(separated)
+        regular = all(body.count(b",") == self._width - 1 for body in separated)
+        if len(separated) < len(bodies) or b"_" in joined or not regular:
+            return None
+        fields = joined.split(b",")
+        table = np.zeros((len(bodies), self._width))
+        try:
+            for at in self._wanted if bodies else ():
+                table[:, at] = list(map(float, fields[at :: self._width]))
+        except ValueError:
+            return None
+        return table
 
     def _comma_separated(self, body: bytes) -> bytes:
         """Return the line with commas between the fields."""
@@ -210,13 +210,13 @@ class TextDecoder:
             return None, OVERLONG_HINT
         fields = self._comma_separated(body).split(b",")
         if len(fields) != self._width:
-            return None, f"a line has {len(fields)} columns, expected are {self._width}: {body[:60]!r}"
+            return None, f"a line has {len(fields)} columns, expected {self._width}: {body[:60]!r}"
         try:
-            return [_number(f) if at in self._wanted else 0.0 for at, f in enumerate(fields)], ""
+            return [_parse_number(f) if at in self._wanted else 0.0 for at, f in enumerate(fields)], ""
         except ValueError:
-            return None, f"a field is no number: {body[:60]!r}"
+            return None, f"a field is not a number: {body[:60]!r}"
 
-    def _blocks(self, table: Floats, t_ns: np.ndarray[tuple[int, ...], np.dtype[np.int64]]) -> list[SampleBlock]:
+    def _build_blocks(self, table: Floats, t_ns: Ints) -> list[SampleBlock]:
         """Convert a table of numbers to blocks of samples in SI units."""
         n = len(table)
         bad = np.isinf(table).any(axis=1)
@@ -224,22 +224,22 @@ class TextDecoder:
             scaled = table * self._factor + self._offset
         values = np.full((n, 6), np.nan)
         for axis, name in enumerate(AXES):
-            if name in self._at:
-                values[:, axis] = scaled[:, self._at[name]]
-        temperature_c = scaled[:, self._at["temperature"]] if "temperature" in self._at else np.full(n, np.nan)
-        ticks = np.full(n, NO_TICK, np.int64)
+            if name in self._column:
+                values[:, axis] = scaled[:, self._column[name]]
+        temperature_c = scaled[:, self._column["temperature"]] if "temperature" in self._column else None
+        ticks = None
         if isinstance(self.timing, CounterTiming):
-            counts = scaled[:, self._at["t" if "t" in self._at else "counter"]]
+            counts = scaled[:, self._column["t" if "t" in self._column else "counter"]]
             bad |= ~(np.abs(counts) < float(UNWRAPPED_TICKS))  # missing or implausible clock value
             ticks = np.rint(np.where(bad, 0.0, counts)).astype(np.int64) % self.timing.modulus
         values[bad] = np.inf
-        return self._rows.blocks(t_ns, values, temperature_c, ticks, np.zeros(n, np.int64))
+        return self._builder.build_blocks(t_ns, values, temperature_c, ticks)
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return one line per sample in the configured columns and units, with full precision."""
         n = len(samples)
         table = np.zeros((n, self._width))
-        for name, at in self._at.items():
+        for name, at in self._column.items():
             if name in AXES:
                 table[:, at] = samples.values[:, AXES.index(name)]
             elif name == "temperature":
@@ -248,7 +248,7 @@ class TextDecoder:
                 table[:, at] = samples.ticks
         table = (table - self._offset) / self._factor
         between = {"auto": ","}.get(self._settings.delimiter, self._settings.delimiter)
-        whole = {at for name, at in self._at.items() if name == "counter"}
+        whole = {at for name, at in self._column.items() if name == "counter"}
         bodies = [
             between.join(f"{x:.0f}" if at in whole else repr(x) for at, x in enumerate(row)).encode()
             for row in table.tolist()
@@ -259,7 +259,7 @@ class TextDecoder:
         return chunk_per_sample([b"\r\n" + lines[0], *lines[1:]], samples.t_ns)
 
 
-def _number(field: bytes) -> float:
+def _parse_number(field: bytes) -> float:
     """Return a number, or NaN for an empty field. Raise ValueError for text."""
     field = field.strip()
     if b"_" in field:  # Python accepts underscores in numbers, but no device sends them
@@ -294,11 +294,12 @@ def _scales(settings: Settings) -> tuple[Floats, Floats]:
     return factors, offsets
 
 
-def _timing(settings: Settings, tick: int) -> Timing:
+def _timing(settings: Settings) -> Timing:
     """Return the timing according to the columns."""
     if "t" in settings.columns:
+        unit_ticks = round(units.time_factor(settings.time_unit) / TICK_S)
         wraps = settings.time_unit in ("ms", "us")
-        return CounterTiming(DEVICE_WRAP * tick if wraps else UNWRAPPED_TICKS, TICK_S)
+        return CounterTiming(DEVICE_WRAP * unit_ticks if wraps else UNWRAPPED_TICKS, TICK_S)
     return CounterTiming(settings.counter_modulus) if "counter" in settings.columns else ArrivalTiming()
 
 

@@ -14,19 +14,18 @@ rad/s, so quantization is visible in the Allan deviation. The binary messages do
 """
 
 import binascii
-from collections.abc import Sequence
-from typing import ClassVar, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
-    BlockBuilder,
     Decoder,
     DecoderSettings,
     FrameBuffer,
-    Unmeasured,
+    Frames,
+    FrameStreamDecoder,
     chunk_per_sample,
     nan_to_infinity,
     xor_checksum,
@@ -36,11 +35,13 @@ from drivers.sample import ArrivalTiming, Chunk, Floats, SampleBlock, Timing
 LONGEST: Final = 256
 """Maximum length of a sentence in bytes. The longest sentence of the manual is under 200."""
 
-# columns of gx gy gz ax ay az among the numbers of the sentence, number of numbers, column of the temperature
 COLUMNS: Final = {
     b"$VNIMU,": ((6, 7, 8, 3, 4, 5), 11, 9),
     b"$VNYMR,": ((9, 10, 11, 6, 7, 8), 12, None),
 }
+"""Columns of gx gy gz ax ay az in each sentence, number of columns, and column of the temperature."""
+MAX_UNWANTED_SENTENCES: Final = 100
+"""Number of consecutive unwanted sentences after which a hint is given."""
 GYRO: Final = "{:+010.6f}"  # rad/s
 ACCEL: Final = "{:+07.3f}"  # m/s²
 
@@ -52,54 +53,41 @@ class Settings(DecoderSettings, frozen=True):
     """Sentence to read. With auto, the first of the two that arrives is read."""
 
 
-class VectornavAsciiDecoder:
+class VectornavAsciiDecoder(FrameStreamDecoder):
     """Decoder and encoder of VectorNav sentences."""
 
-    carrier: ClassVar[str] = "bytes"
-
     def __init__(self, settings: Settings) -> None:
+        super().__init__(FrameBuffer(b"$VN", _match_sentence, LONGEST))
         self.timing: Timing = ArrivalTiming()
         self._wanted = b"" if settings.sentence == "auto" else f"${settings.sentence},".encode()
         self._sentence = self._wanted
-        self._buffer = FrameBuffer(b"$VN", match, LONGEST)
-        self._rows = BlockBuilder()
         self._unwanted_sentences = 0  # number of sentences since the last wanted one
-
-    @property
-    def bad(self) -> int:
-        """Number of sentences with a wrong checksum, and of implausible samples."""
-        return self._rows.bad
 
     @property
     def hint(self) -> str:
         """Reason for missing samples or rejected sentences."""
-        if self._unwanted_sentences > 100:
-            return "sentences come, but none of those wanted: set the sensor's async output to VNIMU"
-        return self._buffer.hint
+        if self._unwanted_sentences > MAX_UNWANTED_SENTENCES:
+            return "sentences arrive, but none of the wanted kind: set the sensor's async output to VNIMU"
+        return super().hint
 
     def reset(self) -> None:
-        """Forget an incomplete sentence, and with auto the selected sentence."""
-        self._buffer.reset()
-        self._rows.reset()
+        """Discard an incomplete sentence, and with auto the selected sentence."""
+        super().reset()
         self._sentence = self._wanted
 
-    def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the samples of the sentences that these chunks complete."""
-        frames = self._buffer.feed(chunks)
+    def _decode(self, frames: Frames) -> list[SampleBlock]:
+        """Return the samples of the sentences of the wanted kind."""
         if not self._sentence:
             self._sentence = next((f[:7] for f in frames.data if f[:7] in COLUMNS), b"")
         wanted = self._sentence or b"none yet"
         rows = [i for i, f in enumerate(frames.data) if f.startswith(wanted)]
         self._unwanted_sentences = 0 if rows else self._unwanted_sentences + len(frames.data)
-        frames, bad_after = frames.keep(rows)
-        if not rows and not bad_after:
-            return []
-        axes, width, warm = COLUMNS.get(self._sentence, COLUMNS[b"$VNIMU,"])
-        table = numbers([f[7 : f.rindex(b"*")] for f in frames.data], width)
-        temperature_c = Unmeasured.temperature(len(rows)) if warm is None else table[:, warm].copy()
+        frames, bad_after = frames.select_frames(rows)
+        axes, width, temperature = COLUMNS.get(self._sentence, COLUMNS[b"$VNIMU,"])
+        table = _parse_numbers([f[7 : f.rindex(b"*")] for f in frames.data], width)
+        temperature_c = None if temperature is None else table[:, temperature]
         values = nan_to_infinity(table[:, axes])
-        ticks = Unmeasured.ticks(len(rows))
-        return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before, bad_after)
+        return self._builder.build_blocks(frames.t_ns, values, temperature_c, None, frames.bad_before, bad_after)
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return sentences as the device prints them: VNYMR if it is configured, otherwise VNIMU.
@@ -121,30 +109,17 @@ class VectornavAsciiDecoder:
         return chunk_per_sample(frames, samples.t_ns)
 
 
-def numbers(bodies: list[bytes], width: int) -> Floats:
-    """Return the numbers of several sentences.
-
-    Parameters
-    ----------
-    bodies
-        Fields of each sentence, separated by commas.
-    width
-        Number of fields to read from each sentence.
-
-    Returns
-    -------
-    ndarray
-        [n, width] float64. A row that contains other text is infinite.
-    """
+def _parse_numbers(bodies: list[bytes], width: int) -> Floats:
+    """Return the first ``width`` numbers of each sentence as an array. A sentence with other text gives infinities."""
     split = [body.split(b",", width)[:width] for body in bodies]
     try:
         return np.array([[float(field) for field in fields] for fields in split]).reshape(len(bodies), width)
     except ValueError:
-        return np.array([_row(fields, width) for fields in split])
+        return np.array([_parse_fields(fields, width) for fields in split])
 
 
-def _row(fields: list[bytes], width: int) -> list[float]:
-    """Return the numbers of one row; infinity if it contains other text or has another length."""
+def _parse_fields(fields: list[bytes], width: int) -> list[float]:
+    """Return the numbers of one sentence; infinities if a field is other text or the number of fields is wrong."""
     try:
         row = [float(field) for field in fields]
     except ValueError:
@@ -152,21 +127,8 @@ def _row(fields: list[bytes], width: int) -> list[float]:
     return row if len(row) == width else [np.inf] * width
 
 
-def match(buffer: bytes, at: int) -> int:
-    """Return the length of a sentence.
-
-    Parameters
-    ----------
-    buffer
-        Received bytes.
-    at
-        Offset of a candidate.
-
-    Returns
-    -------
-    int
-        Length in bytes, NEED_MORE, or REJECT.
-    """
+def _match_sentence(buffer: bytes, at: int) -> int:
+    """Return the length of a sentence (see ``drivers.decoders.base.FrameMatcher``)."""
     end = buffer.find(b"\n", at, at + LONGEST) + 1
     if not end:
         return NEED_MORE

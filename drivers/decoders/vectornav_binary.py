@@ -15,10 +15,8 @@ points down and reads -9.8 at rest.
 
 import binascii
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import lru_cache
-from typing import ClassVar, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,12 +24,13 @@ from numpy.typing import NDArray
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
-    BlockBuilder,
     Decoder,
     DecoderSettings,
     FrameBuffer,
     Frames,
+    FrameStreamDecoder,
     chunk_per_sample,
+    group_indices,
     nan_to_infinity,
 )
 from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, Floats, SampleBlock, Timing
@@ -69,29 +68,8 @@ class Settings(DecoderSettings, frozen=True):
     """Source of the sample times: TimeStartup (ns, by the device), or arrival times if messages do not contain it."""
 
 
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Positions of the fields for one combination of masks.
-
-    ``row`` contains time, gyro, accel and temperature if present.
-    """
-
-    row: np.dtype[np.void]
-    names: tuple[str, ...]
-
-    @property
-    def length(self) -> int:
-        """Length of the complete message in bytes."""
-        return self.row.itemsize
-
-    @property
-    def inertial(self) -> bool:
-        """True if a message of this layout is a sample."""
-        return "gyro" in self.names or "accel" in self.names
-
-
 @lru_cache(maxsize=256)
-def layout(header: bytes, compensated: bool) -> Layout | None:
+def find_layout(header: bytes, compensated: bool) -> np.dtype[np.void] | None:
     """Return the layout of the messages with this header.
 
     Parameters
@@ -103,12 +81,13 @@ def layout(header: bytes, compensated: bool) -> Layout | None:
 
     Returns
     -------
-    Layout or None
-        None if the header contains unknown groups or fields.
+    dtype or None
+        Type of a complete message, with the fields time, gyro, accel and temperature if the message contains them. None
+        if the header contains unknown groups or fields.
     """
     groups = [g for g in range(1, 9) if header[0] >> (g - 1) & 1]
     masks = struct.unpack(f"<{len(groups)}H", header[1:])
-    at: dict[tuple[int, int], int] = {}
+    offsets: dict[tuple[int, int], int] = {}
     end = 1 + len(header)
     for group, mask in zip(groups, masks, strict=True):
         sizes = FIELD_SIZES.get(group, ())
@@ -116,31 +95,30 @@ def layout(header: bytes, compensated: bool) -> Layout | None:
             return None
         for bit, size in enumerate(sizes):
             if mask >> bit & 1:
-                at[group, bit] = end
+                offsets[group, bit] = end
                 end += size
-    return _rows(at, end + 2, compensated)
+    return _build_layout(offsets, end + 2, compensated)
 
 
-def _rows(at: dict[tuple[int, int], int], length: int, compensated: bool) -> Layout:
-    """Return the layout for fields at these offsets."""
+def _build_layout(offsets: dict[tuple[int, int], int], length: int, compensated: bool) -> np.dtype[np.void]:
+    """Return the layout of messages with fields (group, bit) at these offsets."""
     order = -1 if compensated else 1
     gyro = (UNCOMPENSATED_GYRO, COMPENSATED_GYRO)[::order]
     accel = (UNCOMPENSATED_ACCEL, COMPENSATED_ACCEL)[::order]
-    wanted = (
+    sources = (
         ("time", "<u8", TIME),
         ("gyro", "<3f4", gyro[0] + gyro[1]),
         ("accel", "<3f4", accel[0] + accel[1]),
         ("temperature", "<f4", TEMPERATURE),
     )
-    names, formats, offsets = [], [], []
-    for name, form, places in wanted:
-        found = [at[group, bit] + inside for group, bit, inside in places if (group, bit) in at]
+    names, formats, starts = [], [], []
+    for name, number_format, source in sources:
+        found = [offsets[group, bit] + inside for group, bit, inside in source if (group, bit) in offsets]
         if found:
             names.append(name)
-            formats.append(form)
-            offsets.append(found[0])
-    row = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": length})
-    return Layout(row, tuple(names))
+            formats.append(number_format)
+            starts.append(found[0])
+    return np.dtype({"names": names, "formats": formats, "offsets": starts, "itemsize": length})
 
 
 def _header_end(groups: int) -> int:
@@ -149,80 +127,52 @@ def _header_end(groups: int) -> int:
 
 
 HEADER_END: Final = tuple(map(_header_end, range(256)))
+"""Offset after the masks for each group byte."""
 
 
-class VectornavBinaryDecoder:
+class VectornavBinaryDecoder(FrameStreamDecoder):
     """Decoder and encoder of VectorNav binary messages."""
 
-    carrier: ClassVar[str] = "bytes"
-
     def __init__(self, settings: Settings) -> None:
+        super().__init__(FrameBuffer(b"\xfa", self._match_message, LONGEST))
         self._compensated = settings.compensated
-        self._counts = settings.clock == "time_startup"
-        self.timing: Timing = CounterTiming(TICKS, 1e-9) if self._counts else ArrivalTiming()
-        self._buffer = FrameBuffer(b"\xfa", self._match, LONGEST)
-        self._rows = BlockBuilder()
+        self._uses_device_time = settings.clock == "time_startup"
+        self.timing: Timing = CounterTiming(TICKS, 1e-9) if self._uses_device_time else ArrivalTiming()
         self._time_missing = False
-
-    @property
-    def bad(self) -> int:
-        """Number of messages with a wrong CRC, and of implausible samples."""
-        return self._rows.bad
 
     @property
     def hint(self) -> str:
         """Remedy for messages that are rejected or contain no time."""
         if self._time_missing:
-            return 'messages hold no TimeStartup: switch it on in the sensor, or set clock = "arrival"'
-        return self._buffer.hint
+            return 'messages contain no TimeStartup: enable it in the sensor, or set clock = "arrival"'
+        return super().hint
 
-    def reset(self) -> None:
-        """Forget an incomplete message."""
-        self._buffer.reset()
-        self._rows.reset()
-
-    def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the samples of the messages that these chunks complete."""
-        frames = self._buffer.feed(chunks)
-        if not frames.data:
-            return []
-        headers = [f[1 : HEADER_END[f[1]]] for f in frames.data]
-        layouts = {header: self._layout(header) for header in dict.fromkeys(headers)}
-        rows = [i for i, header in enumerate(headers) if layouts[header].inertial]
-        groups: dict[bytes, list[int]] = {}
-        for at, i in enumerate(rows):
-            groups.setdefault(headers[i], []).append(at)
-        kept, bad_after = frames.keep(rows)
-        return self._decode(kept, [(layouts[h], at) for h, at in groups.items()], bad_after)
-
-    def _layout(self, header: bytes) -> Layout:
-        """Return the layout of a message that the buffer has accepted."""
-        found = layout(header, self._compensated)
-        assert found is not None, "the buffer lets through only messages that have one"
-        return found
-
-    def _decode(self, frames: Frames, groups: list[tuple[Layout, list[int]]], bad_after: int) -> list[SampleBlock]:
-        """Return the samples of messages, grouped by layout."""
+    def _decode(self, frames: Frames) -> list[SampleBlock]:
+        """Return the samples of the messages with rates or accelerations."""
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
-        for form, at in groups:
-            got = np.frombuffer(b"".join([frames.data[i] for i in at]), form.row)
-            if "gyro" in form.names:
-                values[at, :3] = nan_to_infinity(_as_float64(got["gyro"]))
-            if "accel" in form.names:
-                values[at, 3:] = nan_to_infinity(_as_float64(got["accel"]))
-            if "temperature" in form.names:
-                temperature_c[at] = _as_float64(got["temperature"])
-            if "time" in form.names and self._counts:
-                ticks[at] = got["time"] & np.uint64(TICKS - 1)
-        if n:
-            self._time_missing = self._counts and int(ticks[-1]) == NO_TICK
-        return self._rows.blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before, bad_after)
+        for header, rows in group_indices([f[1 : HEADER_END[f[1]]] for f in frames.data]):
+            layout = find_layout(header, self._compensated)
+            assert layout is not None, "the buffer accepts only messages with a known layout"
+            messages = frames.stack_bytes(rows).view(layout)[:, 0]
+            fields = layout.names or ()
+            if "gyro" in fields:
+                values[rows, :3] = nan_to_infinity(_as_float64(messages["gyro"]))
+            if "accel" in fields:
+                values[rows, 3:] = nan_to_infinity(_as_float64(messages["accel"]))
+            if "temperature" in fields:
+                temperature_c[rows] = _as_float64(messages["temperature"])
+            if "time" in fields and self._uses_device_time:
+                ticks[rows] = messages["time"] & np.uint64(TICKS - 1)
+        blocks, last = self._build_measured_blocks(frames, values, temperature_c, ticks)
+        if last is not None:
+            self._time_missing = self._uses_device_time and int(ticks[last]) == NO_TICK
+        return blocks
 
-    def _match(self, buffer: bytes, at: int) -> int:
-        """Return the length of a message at this offset (see ``drivers.decoders.base.Match``)."""
+    def _match_message(self, buffer: bytes, at: int) -> int:
+        """Return the length of a message (see ``drivers.decoders.base.FrameMatcher``)."""
         if len(buffer) < at + 2:
             return NEED_MORE
         header_end = HEADER_END[buffer[at + 1]]
@@ -230,24 +180,24 @@ class VectornavBinaryDecoder:
             return REJECT
         if len(buffer) < at + header_end:
             return NEED_MORE
-        found = layout(buffer[at + 1 : at + header_end], self._compensated)
-        if found is None:
+        layout = find_layout(buffer[at + 1 : at + header_end], self._compensated)
+        if layout is None:
             return REJECT
-        length = found.length
+        length = layout.itemsize
         if len(buffer) < at + length:
             return NEED_MORE
         return REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return messages with TimeStartup and Imu of group 1, and with MagPres if the block has temperatures."""
-        warm = bool(np.isfinite(samples.temperature_c).any())
-        header = bytes.fromhex("01 01 06" if warm else "01 01 02")
-        form = layout(header, compensated=False)
-        assert form is not None, "this header is in the tables"
-        rows = np.zeros(len(samples), form.row)
+        has_temperature = bool(np.isfinite(samples.temperature_c).any())
+        header = bytes.fromhex("01 01 06" if has_temperature else "01 01 02")
+        layout = find_layout(header, compensated=False)
+        assert layout is not None, "this header is in the tables"
+        rows = np.zeros(len(samples), layout)
         rows["time"] = samples.ticks & (TICKS - 1)
         rows["gyro"], rows["accel"] = samples.values[:, :3], samples.values[:, 3:]
-        if warm:
+        if has_temperature:
             rows["temperature"] = samples.temperature_c
         inner = [header + row.tobytes()[1 + len(header) : -2] for row in rows]
         frames = [b"\xfa" + part + binascii.crc_hqx(part, 0).to_bytes(2, "big") for part in inner]

@@ -13,20 +13,19 @@ Bluetooth packets have 20 bytes without a checksum: ``55 61 | a xyz | w xyz | an
 the header of the next packet follows it. Samples are therefore delayed by one packet.
 """
 
-from collections.abc import Sequence
-from typing import Annotated, ClassVar, Final, Literal
+from typing import Annotated, Final, Literal
 
 import numpy as np
 
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
-    BlockBuilder,
+    Bytes,
     Decoder,
     DecoderSettings,
     FrameBuffer,
     Frames,
-    Unmeasured,
+    FrameStreamDecoder,
     chunk_per_sample,
     quantize,
 )
@@ -47,9 +46,13 @@ CYCLE_SAMPLES: Final = 8
 
 The sample with the fewest packets counts, since packets of other types are sent only occasionally.
 """
-
-# °C = raw * step + offset, by family (WT901 data sheet v20-0702; BWT61CL v20-0630)
+MAX_UNPAIRED_PACKETS: Final = 100
+"""Number of consecutive packets without a pair after which a hint is given."""
 TEMPERATURE: Final = {"wt901": (1.0 / 100.0, 0.0), "jy61": (1.0 / 340.0, 36.53)}
+"""Step and offset of the temperature by model family: °C = raw · step + offset.
+
+Sources: WT901 data sheet v20-0702, BWT61CL data sheet v20-0630.
+"""
 
 
 class Settings(DecoderSettings, frozen=True):
@@ -65,70 +68,60 @@ class Settings(DecoderSettings, frozen=True):
     """Full scale of the gyroscope in °/s."""
 
 
-class WitmotionDecoder:
+class WitmotionDecoder(FrameStreamDecoder):
     """Decoder and encoder of WitMotion packets."""
-
-    carrier: ClassVar[str] = "bytes"
 
     def __init__(self, settings: Settings) -> None:
         self._bluetooth = settings.packet == "bluetooth"
+        if self._bluetooth:
+            super().__init__(FrameBuffer(b"\x55", _match_bluetooth, BLUETOOTH_LENGTH + 2))
+        else:
+            super().__init__(FrameBuffer(b"\x55", _match_uart, UART_LENGTH))
         self.timing: Timing = ArrivalTiming()
         self._accel_step = settings.accelerometer_range * G0 / 2**15
         self._gyro_step = settings.gyro_range * DEGREE / 2**15
         self._temperature_step, self._temperature_offset = TEMPERATURE[settings.temperature]
-        if self._bluetooth:
-            self._buffer = FrameBuffer(b"\x55", match_bluetooth, BLUETOOTH_LENGTH + 2)
-        else:
-            self._buffer = FrameBuffer(b"\x55", match_uart, UART_LENGTH)
-        self._rows = BlockBuilder()
         self._harmless_rejects = 0  # number of rejected packets that cost no sample
-        self._pairs = Pairs()
+        self._pairs = PairFinder()
 
     @property
     def bad(self) -> int:
         """Number of packets that failed their check, and of implausible samples."""
-        return self._rows.bad + self._harmless_rejects
+        return super().bad + self._harmless_rejects
 
     @property
     def hint(self) -> str:
         """Reason for missing samples or rejected packets."""
-        if self._pairs.unpaired > 100:
-            return "packets come, but not 0x51 and 0x52 in a row: switch both outputs on in the sensor"
-        return self._buffer.hint
+        if self._pairs.unpaired > MAX_UNPAIRED_PACKETS:
+            return "packets arrive, but no 0x51 directly followed by 0x52: enable both outputs in the sensor"
+        return super().hint
 
     def reset(self) -> None:
-        """Forget an incomplete packet or pair."""
-        self._buffer.reset()
-        self._rows.reset()
-        self._pairs = Pairs()
+        """Discard an incomplete packet or pair."""
+        super().reset()
+        self._pairs = PairFinder()
 
-    def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the samples of the packets that these chunks complete."""
-        frames = self._buffer.feed(chunks)
-        if not frames.data:
-            return []
-        return self._combined(frames) if self._bluetooth else self._paired(frames)
+    def _decode(self, frames: Frames) -> list[SampleBlock]:
+        """Return the samples of these packets."""
+        return self._decode_bluetooth(frames) if self._bluetooth else self._decode_uart(frames)
 
-    def _combined(self, frames: Frames) -> list[SampleBlock]:
+    def _decode_bluetooth(self, frames: Frames) -> list[SampleBlock]:
         """Return the samples of Bluetooth packets."""
-        kept, bad_after = frames.keep([i for i, f in enumerate(frames.data) if f[1] == HEADERS[0][1]])
-        n = len(kept.data)
-        words = np.frombuffer(b"".join(kept.data), "<i2").reshape(n, 10)
-        values = self._values(words[:, 4:7], words[:, 1:4])
-        nothing = Unmeasured.temperature(n), Unmeasured.ticks(n)
-        return self._rows.blocks(kept.t_ns, values, *nothing, kept.bad_before, bad_after)
+        kept, bad_after = frames.select_frames([i for i, f in enumerate(frames.data) if f[1] == HEADERS[0][1]])
+        words = np.frombuffer(b"".join(kept.data), "<i2").reshape(-1, BLUETOOTH_LENGTH // 2)
+        values = self._to_si(words[:, 4:7], words[:, 1:4])
+        return self._builder.build_blocks(kept.t_ns, values, None, None, kept.bad_before, bad_after)
 
-    def _paired(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples of UART packets."""
-        at, packets, missing, harmless = self._pairs.find(frames)
+    def _decode_uart(self, frames: Frames) -> list[SampleBlock]:
+        """Return the samples of pairs of UART packets."""
+        at, packets, missing, harmless = self._pairs.find_pairs(frames)
         self._harmless_rejects += harmless
         words = np.ascontiguousarray(packets[:, :, 2:10]).view("<i2")  # [n, 0x51 and 0x52, 4]
-        values = self._values(words[:, 1, :3], words[:, 0, :3])
+        values = self._to_si(words[:, 1, :3], words[:, 0, :3])
         temperature_c = words[:, 0, 3] * self._temperature_step + self._temperature_offset
-        ticks = Unmeasured.ticks(at.size)
-        return self._rows.blocks(frames.t_ns[at], values, temperature_c, ticks, missing)
+        return self._builder.build_blocks(frames.t_ns[at], values, temperature_c, None, missing)
 
-    def _values(self, gyro: Ints, accel: Ints) -> Floats:
+    def _to_si(self, gyro: Ints, accel: Ints) -> Floats:
         """Convert raw words to rad/s and m/s² [n, 6]."""
         return np.hstack([gyro * self._gyro_step, accel * self._accel_step])
 
@@ -144,11 +137,11 @@ class WitmotionDecoder:
             words = np.hstack([accel, gyro, np.zeros((n, 3), np.int64)]).astype("<i2")
             return chunk_per_sample([HEADERS[0] + row.tobytes() for row in words], samples.t_ns)
         excess = samples.temperature_c - self._temperature_offset
-        warm = quantize(np.nan_to_num(excess), self._temperature_step, 16)[:, None]
+        temperature = quantize(excess, self._temperature_step, 16)[:, None]
         frames = [
             encode_packet(ACCEL, first.tobytes()) + encode_packet(RATE, second.tobytes())
             for first, second in zip(
-                np.hstack([accel, warm]).astype("<i2"),
+                np.hstack([accel, temperature]).astype("<i2"),
                 np.hstack([gyro, np.zeros((n, 1), np.int64)]).astype("<i2"),
                 strict=True,
             )
@@ -156,54 +149,47 @@ class WitmotionDecoder:
         return chunk_per_sample(frames, samples.t_ns)
 
 
-class Pairs:
+class PairFinder:
     """Finder of pairs of 0x51 and 0x52 packets, which also counts the samples lost in each gap."""
 
     def __init__(self) -> None:
         self.unpaired = 0  # number of packets since the last pair
         self._last = bytes(UART_LENGTH)  # last packet of the previous call
-        self._elapsed = 0  # packets since the end of the last pair, including rejected ones
-        self._rejected = 0  # number of these packets that were rejected, and of separated pairs
+        self._elapsed = 0  # packets since the end of the last pair, including rejected packets
+        self._rejected = 0  # number of rejected packets since the end of the last pair, and of separated pairs
         self._recent_cycles: list[int] = []  # packets per sample of the last samples without a rejected packet
         self._first = True
 
-    def find(self, frames: Frames) -> tuple[Ints, np.ndarray[tuple[int, ...], np.dtype[np.uint8]], Ints, int]:
-        """Find the pairs in a list of packets.
-
-        Parameters
-        ----------
-        frames
-            Packets in order of arrival.
-
-        Returns
-        -------
-        tuple
-            Index of the 0x52 packet of each pair [n], packets [n, 2, 11] as uint8, samples missing before each pair
-            [n], and number of rejected packets that cost no sample.
+    def find_pairs(self, frames: Frames) -> tuple[Ints, Bytes, Ints, int]:
+        """Return the index of the 0x52 packet of each pair [n], the packets of each pair [n, 2, 11], the number of
+        samples missing before each pair [n], and the number of rejected packets that cost no sample.
         """
         joined = np.frombuffer(self._last + b"".join(frames.data), np.uint8).reshape(-1, UART_LENGTH)
         self._last = frames.data[-1]
         kinds = joined[:, 1]
-        fits = (kinds[:-1] == ACCEL) & (kinds[1:] == RATE)
-        at = np.flatnonzero(fits & frames.at_once)
+        in_order = (kinds[:-1] == ACCEL) & (kinds[1:] == RATE)
+        at = np.flatnonzero(in_order & frames.adjacent)
         # a few stray bytes may remain of many packets, so both packets need not belong to one sample
-        torn = fits & ~frames.at_once & (frames.bad_before == 0)
+        separated = in_order & ~frames.adjacent & (frames.bad_before == 0)
         elapsed = self._elapsed + np.cumsum(1 + frames.bad_before)
-        rejected = self._rejected + np.cumsum(frames.bad_before + torn)
+        rejected = self._rejected + np.cumsum(frames.bad_before + separated)
         steps = np.diff(elapsed[at], prepend=0)
         holes = np.diff(rejected[at], prepend=0)
-        missing, harmless = self._count(steps, holes)
+        missing, harmless = self._count_missing(steps, holes)
         self._elapsed = int(elapsed[-1] - (elapsed[at[-1]] if at.size else 0))
         self._rejected = int(rejected[-1] - (rejected[at[-1]] if at.size else 0))
         self.unpaired = self._elapsed
         return at, np.stack([joined[at], joined[at + 1]], axis=1), missing, harmless
 
-    def _count(self, steps: Ints, holes: Ints) -> tuple[Ints, int]:
-        """Return the samples missing before each pair [n], and the number of rejected packets that cost no sample."""
+    def _count_missing(self, steps: Ints, holes: Ints) -> tuple[Ints, int]:
+        """Return the samples missing before each pair [n], and the number of rejected packets that cost no sample.
+
+        ``steps`` are the packets since the previous pair [n], ``holes`` the rejected packets among them [n].
+        """
         if not steps.size:
             return steps, 0
         whole = holes == 0
-        whole[0] &= not self._first  # it depends on when reading began, not on the packets per sample
+        whole[0] &= not self._first  # the first count depends on when reading began, not on the packets per sample
         usual = [*self._recent_cycles, *steps[whole].tolist()]
         known = len(self._recent_cycles) + np.cumsum(whole)
         missing = np.zeros(steps.size, np.int64)
@@ -229,21 +215,8 @@ def encode_packet(kind: int, data: bytes) -> bytes:
     return body + bytes([sum(body) & 0xFF])
 
 
-def match_uart(buffer: bytes, at: int) -> int:
-    """Return the length of a UART packet.
-
-    Parameters
-    ----------
-    buffer
-        Received bytes.
-    at
-        Offset of a candidate.
-
-    Returns
-    -------
-    int
-        Length in bytes, NEED_MORE, or REJECT.
-    """
+def _match_uart(buffer: bytes, at: int) -> int:
+    """Return the length of a UART packet (see ``drivers.decoders.base.FrameMatcher``)."""
     if len(buffer) < at + UART_LENGTH:
         return NEED_MORE
     if buffer[at + 1] not in TYPES or sum(buffer[at : at + 10]) & 0xFF != buffer[at + 10]:
@@ -251,21 +224,8 @@ def match_uart(buffer: bytes, at: int) -> int:
     return UART_LENGTH
 
 
-def match_bluetooth(buffer: bytes, at: int) -> int:
-    """Return the length of a Bluetooth packet if another header follows it.
-
-    Parameters
-    ----------
-    buffer
-        Received bytes.
-    at
-        Offset of a candidate.
-
-    Returns
-    -------
-    int
-        Length in bytes, NEED_MORE, or REJECT.
-    """
+def _match_bluetooth(buffer: bytes, at: int) -> int:
+    """Return the length of a Bluetooth packet that is followed by another header."""
     if len(buffer) < at + BLUETOOTH_LENGTH + 2:
         return NEED_MORE
     following = buffer[at + BLUETOOTH_LENGTH : at + BLUETOOTH_LENGTH + 2]

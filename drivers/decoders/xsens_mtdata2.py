@@ -15,25 +15,27 @@ next one, or until the link is opened again.
 """
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import ClassVar, Final, Literal
+from typing import Final, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.decoders.base import (
     NEED_MORE,
     REJECT,
-    BlockBuilder,
+    Bytes,
     Decoder,
     DecoderSettings,
     FrameBuffer,
     Frames,
+    FrameStreamDecoder,
     chunk_per_sample,
+    group_indices,
     nan_to_infinity,
+    quantize,
 )
-from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, Floats, Ints, SampleBlock, Timing
+from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, Floats, SampleBlock, Timing
 
 SYNC: Final = b"\xfa\xff\x36"
 MAX_PAYLOAD: Final = 2048
@@ -69,60 +71,59 @@ class Layout:
     """Positions of the items of a packet: (DID, offset of the data, size)."""
 
     items: tuple[tuple[int, int, int], ...]
-    skeleton: tuple[int, ...]  # offsets of the DID and size bytes of all items
+    header_offsets: tuple[int, ...]  # offsets of the DID and size bytes of all items
 
-    def find(self, kind: int, numbers: int) -> tuple[int, int] | None:
-        """Find the first item of a kind that holds a number of values.
+    def find_numbers(self, did: int, count: int) -> tuple[int, int] | None:
+        """Find the first item that consists of a number of values.
 
         Parameters
         ----------
-        kind
+        did
             DID without its low nibble.
-        numbers
+        count
             Number of values in the item.
 
         Returns
         -------
         tuple of int, or None
-            Offset of the data, and the DID.
+            Offset of the data, and index of the number format in FORMATS.
         """
-        for did, at, size in self.items:
-            if did & 0xFFF0 == kind and size == numbers * SIZES[did & 3]:
-                return at, did
+        for found, at, size in self.items:
+            if found & 0xFFF0 == did and size == count * SIZES[found & 3]:
+                return at, found & 3
         return None
 
-    def find_integer(self, kind: int, size: int) -> int:
+    def find_integer(self, did: int, size: int) -> int:
         """Return the offset of an unsigned integer item; 0 if there is none.
 
         Parameters
         ----------
-        kind
+        did
             DID without its low nibble.
         size
             Size of the integer in bytes.
         """
-        return next((at for did, at, n in self.items if did & 0xFFF0 == kind and n == size), 0)
+        return next((at for found, at, n in self.items if found & 0xFFF0 == did and n == size), 0)
 
 
-def layout(frame: bytes) -> Layout | None:
+def _parse_layout(frame: bytes) -> Layout | None:
     """Return the layout of a packet with a correct checksum; None if its items do not fill it exactly."""
     at = 6 if frame[3] == 0xFF else 4
     end = len(frame) - 1
-    items, skeleton = [], []
+    items: list[tuple[int, int, int]] = []
     while at + 3 <= end:
-        skeleton += [at, at + 1, at + 2]
         size = frame[at + 2]
         items.append((frame[at] << 8 | frame[at + 1], at + 3, size))
         at += 3 + size
-    return Layout(tuple(items), tuple(skeleton)) if at == end else None
+    headers = tuple(start - back for _, start, _ in items for back in (3, 2, 1))
+    return Layout(tuple(items), headers) if at == end else None
 
 
-class XsensMtdata2Decoder:
+class XsensMtdata2Decoder(FrameStreamDecoder):
     """Decoder and encoder of MTData2 packets."""
 
-    carrier: ClassVar[str] = "bytes"
-
     def __init__(self, settings: Settings) -> None:
+        super().__init__(FrameBuffer(SYNC, match_message, LONGEST))
         self._settings = settings
         # (timing, DID, size of the counter in bytes)
         clocks: dict[str, tuple[Timing, int, int]] = {
@@ -132,84 +133,55 @@ class XsensMtdata2Decoder:
         }
         self.timing, self._clock, self._clock_size = clocks[settings.clock]
         self._accel, self._gyro = (ACCEL_HR, GYRO_HR) if settings.high_rate else (ACCEL, GYRO)
-        self._buffer = FrameBuffer(SYNC, match, LONGEST)
-        self._rows = BlockBuilder()
         self._temperature_c = np.nan
         self._clock_missing = False
-
-    @property
-    def bad(self) -> int:
-        """Number of packets that failed their check, and of implausible samples."""
-        return self._rows.bad
 
     @property
     def hint(self) -> str:
         """Remedy for packets that are rejected or contain no clock."""
         if self._clock_missing:
-            return f'packets hold no {self._settings.clock}: switch it on in the device, or set "clock"'
-        return self._buffer.hint
+            return f'packets contain no {self._settings.clock}: enable it in the device, or set "clock"'
+        return super().hint
 
     def reset(self) -> None:
-        """Forget an incomplete packet and the last temperature."""
-        self._buffer.reset()
-        self._rows.reset()
+        """Discard an incomplete packet and the last temperature."""
+        super().reset()
         self._temperature_c = np.nan
 
-    def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the samples of the packets that these chunks complete."""
-        frames = self._buffer.feed(chunks)
+    def _decode(self, frames: Frames) -> list[SampleBlock]:
+        """Return the samples of the packets with rates or accelerations. A packet with an invalid layout is bad."""
         n = len(frames.data)
-        if not n:
-            return []
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
-        for form, at, packets in group_by_layout(frames.data):
-            if form is None:
-                values[at] = np.inf
-            else:
-                self._read(form, packets, at, values, temperature_c, ticks)
-        temperature_c = self._fill_temperatures(temperature_c)
-        return self._blocks(frames, values, temperature_c, ticks)
-
-    def _blocks(self, frames: Frames, values: Floats, temperature_c: Floats, ticks: Ints) -> list[SampleBlock]:
-        """Return the samples of all packets with at least one axis."""
-        rows = np.flatnonzero(~np.isnan(values).all(axis=1))
-        kept, bad_after = frames.keep(rows.tolist())
-        if rows.size:
-            self._clock_missing = self._clock != 0 and int(ticks[rows[-1]]) == NO_TICK
-        return self._rows.blocks(kept.t_ns, values[rows], temperature_c[rows], ticks[rows], kept.bad_before, bad_after)
-
-    def _read(
-        self,
-        form: Layout,
-        packets: NDArray[np.uint8],
-        at: NDArray[np.intp],
-        values: Floats,
-        temperature_c: Floats,
-        ticks: Ints,
-    ) -> None:
-        """Read values, temperatures and ticks of the packets of one layout into the rows ``at``."""
-        for kind, axes in ((self._gyro, slice(0, 3)), (self._accel, slice(3, 6))):
-            if found := form.find(kind, 3):
-                values[at, axes] = nan_to_infinity(numbers(packets, *found, 3))
-        if found := form.find(TEMPERATURE, 1):
-            temperature_c[at] = numbers(packets, *found, 1)[:, 0]
-        if self._clock and (offset := form.find_integer(self._clock, self._clock_size)):
-            weights = 256 ** np.arange(self._clock_size - 1, -1, -1)
-            ticks[at] = packets[:, offset : offset + self._clock_size].astype(np.int64) @ weights
+        for layout, rows, packets in _group_by_layout(frames):
+            if layout is None:
+                values[rows] = np.inf
+                continue
+            for did, axes in ((self._gyro, slice(0, 3)), (self._accel, slice(3, 6))):
+                if found := layout.find_numbers(did, 3):
+                    values[rows, axes] = nan_to_infinity(_read_numbers(packets, *found, 3))
+            if found := layout.find_numbers(TEMPERATURE, 1):
+                temperature_c[rows] = _read_numbers(packets, *found, 1)[:, 0]
+            if self._clock and (at := layout.find_integer(self._clock, self._clock_size)):
+                weights = 256 ** np.arange(self._clock_size - 1, -1, -1)
+                ticks[rows] = packets[:, at : at + self._clock_size].astype(np.int64) @ weights
+        blocks, last = self._build_measured_blocks(frames, values, self._fill_temperatures(temperature_c), ticks)
+        if last is not None:
+            self._clock_missing = self._clock != 0 and int(ticks[last]) == NO_TICK
+        return blocks
 
     def _fill_temperatures(self, temperature_c: Floats) -> Floats:
-        """Return the temperature of each packet, or the last known one."""
+        """Return the temperature of each packet, or the last known temperature."""
         known = np.concatenate([[self._temperature_c], temperature_c])
         last = np.maximum.accumulate(np.where(np.isnan(known), 0, np.arange(known.size)))
-        held: Floats = known[last][1:]
-        self._temperature_c = float(held[-1])
-        return held
+        filled: Floats = known[last][1:]
+        self._temperature_c = float(filled[-1])
+        return filled
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return one packet per sample with both clocks, the temperature if there is one, and the measured axes."""
-        kind = FORMATS.index(self._settings.format)
+        number_format = FORMATS.index(self._settings.format)
         frames = []
         rows = zip(samples.values, samples.temperature_c.tolist(), samples.ticks.tolist(), strict=True)
         for row, temperature_c, tick in rows:
@@ -219,79 +191,51 @@ class XsensMtdata2Decoder:
                 payload += struct.pack(">HBf", TEMPERATURE, 4, temperature_c)
             for did, triple in ((self._accel, row[3:]), (self._gyro, row[:3])):
                 if not np.isnan(triple).all():
-                    payload += struct.pack(">HB", did | kind, 3 * SIZES[kind]) + encode_numbers(triple, kind)
+                    payload += struct.pack(">HB", did | number_format, 3 * SIZES[number_format])
+                    payload += _encode_numbers(triple, number_format)
             frames.append(encode_message(payload))
         return chunk_per_sample(frames, samples.t_ns)
 
 
-def group_by_layout(frames: list[bytes]) -> list[tuple[Layout | None, NDArray[np.intp], NDArray[np.uint8]]]:
-    """Group frames by layout. Most often there is one group.
-
-    Returns
-    -------
-    list of tuple
-        For each group: the layout (None if invalid), the indices of its frames [k], and their bytes [k, length] as
-        uint8.
+def _group_by_layout(frames: Frames) -> Iterator[tuple[Layout | None, list[int], Bytes]]:
+    """Yield each layout (None if invalid), the indices of its packets, and their bytes [k, length]. Most often there is
+    one layout.
     """
-    lengths = np.fromiter(map(len, frames), np.intp, len(frames))
-    result = []
-    for length in dict.fromkeys(lengths.tolist()):
-        at = np.flatnonzero(lengths == length)
-        packets = np.frombuffer(b"".join([frames[i] for i in at]), np.uint8).reshape(-1, length)
+    for _, rows in group_indices([len(packet) for packet in frames.data]):
+        packets = frames.stack_bytes(rows)
+        at = np.array(rows)
         while at.size:
-            form = layout(frames[at[0]])
-            fixed = list(form.skeleton) if form else slice(None)
-            same = (packets[:, fixed] == packets[0, fixed]).all(axis=1)
-            result.append((form, at[same], packets[same]))
+            layout = _parse_layout(packets[0].tobytes())
+            compared = list(layout.header_offsets) if layout else slice(None)
+            same = (packets[:, compared] == packets[0, compared]).all(axis=1)
+            yield layout, at[same].tolist(), packets[same]
             at, packets = at[~same], packets[~same]
-    return result
 
 
-def numbers(packets: NDArray[np.uint8], at: int, did: int, count: int) -> Floats:
-    """Return numbers [k, count] at an offset of each packet.
-
-    Parameters
-    ----------
-    packets
-        [k, length] uint8.
-    at
-        Offset of the first number.
-    did
-        DID whose low bits state the number format.
-    count
-        Number of values.
-    """
-    kind = did & 3
-    data = np.ascontiguousarray(packets[:, at : at + count * SIZES[kind]])
-    if kind == 0:
+def _read_numbers(packets: Bytes, at: int, number_format: int, count: int) -> Floats:
+    """Return ``count`` numbers of each packet, which begin at the offset ``at``, as an array [k, count]."""
+    data = np.ascontiguousarray(packets[:, at : at + count * SIZES[number_format]])
+    if number_format == 0:
         with np.errstate(invalid="ignore"):  # a signalling NaN is treated as NaN
             return data.view(">f4").astype(np.float64)
-    if kind == 1:
+    if number_format == 1:
         return data.view(">i4") / 2.0**20
-    if kind == 2:
+    if number_format == 2:
         parts = data.view(np.dtype([("fraction", ">u4"), ("integer", ">i2")]))
         both: Floats = parts["integer"] + parts["fraction"] / 2.0**32
         return both
     return data.view(">f8").astype(np.float64)
 
 
-def encode_numbers(triple: Floats, kind: int) -> bytes:
-    """Encode three numbers, clipped to the range of the format.
-
-    Parameters
-    ----------
-    triple
-        [3] float64.
-    kind
-        Index of the format in FORMATS.
-    """
-    if kind == 0:
+def _encode_numbers(triple: Floats, number_format: int) -> bytes:
+    """Encode three numbers, clipped to the range of the format."""
+    if number_format == 0:
         return triple.astype(">f4").tobytes()
-    if kind == 3:
+    if number_format == 3:
         return triple.astype(">f8").tobytes()
     triple = np.nan_to_num(triple)  # fixed-point numbers have no value for not measured
-    if kind == 1:
-        return np.clip(np.rint(triple * 2.0**20), -(2**31), 2**31 - 1).astype(">i4").tobytes()
+    if number_format == 1:
+        return quantize(triple, 2.0**-20, 32).astype(">i4").tobytes()
     whole = [min(max(round(x * 2**32), -(2**47)), 2**47 - 1) for x in triple.tolist()]
     return b"".join(struct.pack(">Ih", x & 0xFFFFFFFF, x >> 32) for x in whole)
 
@@ -304,20 +248,15 @@ def encode_message(payload: bytes) -> bytes:
     return b"\xfa" + body + bytes([-sum(body) & 0xFF])
 
 
-def match(buffer: bytes, at: int) -> int:
-    """Return the length of a message.
+def match_message(buffer: bytes, at: int) -> int:
+    """Return the length of a message at an offset of the buffer (see ``drivers.decoders.base.FrameMatcher``).
 
     Parameters
     ----------
     buffer
         Received bytes.
     at
-        Offset of a candidate.
-
-    Returns
-    -------
-    int
-        Length in bytes, NEED_MORE, or REJECT.
+        Offset of the sync pattern.
     """
     have = len(buffer) - at
     if have < 6:

@@ -7,11 +7,15 @@ called. ``build`` raises one ``ConfigError`` with a line for each mistake in the
 "speed: ...". Every key is listed in ``config/defaults.toml``.
 """
 
+import threading
+import time
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Annotated, Literal, Protocol, runtime_checkable
 
 import msgspec
 
+from drivers.errors import LinkLost
 from drivers.quantities import SILENCE_S
 from drivers.sample import Chunk
 
@@ -33,7 +37,7 @@ class Link(Protocol):
 
     carrier: Carrier
     epoch: Literal["monotonic", "unix"]  # clock of Chunk.t_ns
-    name: str  # for messages: "/dev/ttyUSB0 at 460800 baud"
+    name: str  # for messages, such as "/dev/ttyUSB0 at 460800 baud"
 
     def open(self) -> None:
         """Open the link. If it is already open, do nothing.
@@ -41,22 +45,80 @@ class Link(Protocol):
         Raises
         ------
         LinkUnavailable
-            The link cannot be opened. The text says what to do.
+            If the link cannot be opened. The text says what to do.
         """
 
     def read(self, timeout_s: float) -> list[Chunk] | None:
-        """Return the received chunks, after waiting up to ``timeout_s`` seconds for the first; None if nothing arrived.
+        """Return the received chunks, after waiting up to ``timeout_s`` seconds for the first chunk.
+
+        Return None if nothing arrived.
 
         Raises
         ------
         LinkLost
-            The other side is gone, or the link was closed.
+            If the connection was lost, or the link was closed.
         LinkEnded
-            A replay has reached its end.
+            If a replay has reached its end.
         """
 
     def close(self) -> None:
         """Close the link and end a waiting ``read``. If it is already closed, do nothing."""
+
+
+class PolledLink(ABC):
+    """Common part of links whose source is polled. A lock is held while the source is read, opened or closed.
+
+    Parameters
+    ----------
+    name
+        Name of the link for messages.
+    """
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self._closing = threading.Event()
+        self._in_use = threading.Lock()
+
+    def open(self) -> None:
+        """Open the source unless it is open. Raise ``LinkUnavailable`` with the reason and the remedy if this fails."""
+        with self._in_use:
+            if not self._is_open():
+                self._open_source()
+                self._closing.clear()
+
+    def read(self, timeout_s: float) -> list[Chunk] | None:
+        """Return the received chunks, after waiting up to ``timeout_s`` seconds for the first chunk."""
+        deadline = time.monotonic() + timeout_s
+        with self._in_use:
+            while self._is_open() and not self._closing.is_set():
+                chunks = self._poll_source(deadline)
+                if chunks:
+                    return chunks
+                if time.monotonic() >= deadline:
+                    return None
+        raise LinkLost(f"{self.name}: the link is closed")
+
+    def close(self) -> None:
+        """Close the source after a waiting ``read`` has ended."""
+        self._closing.set()
+        with self._in_use:
+            self._close_source()
+
+    @abstractmethod
+    def _is_open(self) -> bool:
+        """Return True if the source is open."""
+
+    @abstractmethod
+    def _open_source(self) -> None:
+        """Open the source."""
+
+    @abstractmethod
+    def _poll_source(self, deadline: float) -> list[Chunk]:
+        """Return the chunks that arrive soon, at the latest at the monotonic time ``deadline`` in s."""
+
+    @abstractmethod
+    def _close_source(self) -> None:
+        """Close the source if it is open."""
 
 
 @runtime_checkable
@@ -64,4 +126,4 @@ class AddressFilteringLink(Protocol):
     """Interface of a link that can filter by address."""
 
     def accept(self, addresses: Sequence[int]) -> None:
-        """Receive only chunks of these addresses. This is called before ``open``."""
+        """Receive only chunks of these addresses. The method is called before ``open``."""

@@ -20,7 +20,6 @@ import importlib.util
 import logging
 import math
 import socket
-import threading
 import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
@@ -28,9 +27,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 import msgspec
 
 from drivers.discovery import format_choices
-from drivers.errors import ConfigError, LinkLost, LinkUnavailable
+from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.extras import check_extra
-from drivers.links.base import Carrier, Link, LinkSettings
+from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.quantities import BIT_RATE, check_settings
 from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
 
@@ -90,19 +89,17 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
     """Additional keys of python-can's Bus for this interface."""
 
 
-class CanLink:
+class CanLink(PolledLink):
     """Link to one CAN bus."""
 
     carrier: Carrier = "frames"
     epoch: Literal["monotonic", "unix"] = "monotonic"
 
     def __init__(self, settings: Settings) -> None:
+        super().__init__(f"CAN {settings.interface} {settings.channel}")
         self._settings = settings
         self._filters: list[dict[str, Any]] | None = None
         self._bus: can.BusABC | None = None
-        self._closing = threading.Event()
-        self._in_use = threading.Lock()  # held while the bus is read, opened or closed
-        self.name = f"CAN {settings.interface} {settings.channel}"
         self.error_frames = 0
         self.garbled = 0  # answers of the adapter that were not frames
 
@@ -112,64 +109,34 @@ class CanLink:
         ``EXTENDED_ID`` marks 29-bit identifiers. With ``ANY_SOURCE``, only the J1939 parameter group of the identifier
         has to match.
         """
-        self._filters = [_filter(address) for address in addresses] or None
+        self._filters = [_filter_for_address(address) for address in addresses] or None
 
-    def open(self) -> None:
-        """Open the bus. Raise ``LinkUnavailable`` with the reason and the remedy if it cannot be opened."""
+    def _is_open(self) -> bool:
+        return self._bus is not None
+
+    def _open_source(self) -> None:
         import can
 
         # python-can reports missing vendor libraries as warnings
         logging.getLogger("can").setLevel(logging.ERROR)
-        with self._in_use:
-            if self._bus is not None:
-                return
-            s = self._settings
-            if missing := missing_package(s.interface):
-                raise LinkUnavailable(missing)
-            try:
-                _probe(s)
-                self._bus = can.Bus(
-                    channel=s.channel,
-                    interface=s.interface,
-                    can_filters=self._filters,
-                    ignore_config=True,
-                    **self._keys(),
-                )
-            except (
-                can.CanError,
-                OSError,
-                ImportError,
-                # exceptions of python-can's modules if a vendor library or a key is missing
-                NameError,
-                AttributeError,
-                TypeError,
-                ValueError,
-                ArithmeticError,
-                NotImplementedError,
-            ) as error:
-                raise LinkUnavailable(_why_not_open(s, error)) from error
-            self._closing.clear()
+        s = self._settings
+        if missing := missing_package(s.interface):
+            raise LinkUnavailable(missing)
+        # exceptions of python-can's modules if a vendor library or a key is missing
+        wrong_set_up = (NameError, AttributeError, TypeError, ValueError, ArithmeticError, NotImplementedError)
+        try:
+            _probe_server(s)
+            self._bus = can.Bus(
+                channel=s.channel,
+                interface=s.interface,
+                can_filters=self._filters,
+                ignore_config=True,
+                **self._bus_arguments(),
+            )
+        except (can.CanError, OSError, ImportError, *wrong_set_up) as error:
+            raise LinkUnavailable(f"{self.name}: {_why_not_open(s, error)}") from error
 
-    def read(self, timeout_s: float) -> list[Chunk] | None:
-        """Return the received frames, after waiting up to ``timeout_s`` seconds for the first."""
-        deadline = time.monotonic() + timeout_s
-        with self._in_use:
-            while self._bus is not None and not self._closing.is_set():
-                left = deadline - time.monotonic()
-                chunks = self._drain(min(max(left, 0.0), MAX_WAIT_S))
-                if chunks:
-                    return chunks
-                if time.monotonic() >= deadline:
-                    return None
-        raise LinkLost(f"{self.name}: the link is closed")
-
-    def close(self) -> None:
-        """Close the bus after a waiting ``read`` has ended (within 0.1 s)."""
-        self._closing.set()
-        with self._in_use:
-            self._shut_down()
-
-    def _keys(self) -> dict[str, Any]:
+    def _bus_arguments(self) -> dict[str, Any]:
         """Return the arguments for python-can's Bus."""
         s = self._settings
         keys: dict[str, Any] = {"receive_own_messages": s.receive_own_messages}
@@ -181,25 +148,25 @@ class CanLink:
             keys["data_bitrate"] = s.data_bitrate
         return keys | s.options
 
-    def _drain(self, wait_s: float) -> list[Chunk]:
-        """Return all received frames, after waiting up to ``wait_s`` seconds for the first."""
+    def _poll_source(self, deadline: float) -> list[Chunk]:
+        wait_s = min(max(deadline - time.monotonic(), 0.0), MAX_WAIT_S)
         chunks: list[Chunk] = []
         until = math.inf
         for _ in range(MAX_FRAMES):
-            message = self._receive(NEXT_FRAME_WAIT_S if chunks else wait_s)
+            message = self._receive_frame(NEXT_FRAME_WAIT_S if chunks else wait_s)
             if message is None:
                 break
             if message.is_error_frame:
-                self._note_error(message)
+                self._count_error_frame(message)
             elif not message.is_remote_frame:
-                chunks.append(self._chunk(message))
+                chunks.append(self._to_chunk(message))
             now = time.monotonic()
             until = min(until, now + MAX_READ_S)
             if now >= until:
                 break
         return chunks
 
-    def _receive(self, wait_s: float) -> "can.Message | None":
+    def _receive_frame(self, wait_s: float) -> "can.Message | None":
         """Receive one frame; None if there is none. Raise LinkLost if the bus is gone."""
         import can
 
@@ -219,13 +186,13 @@ class CanLink:
                     flush()
                 return None
         except (can.CanError, OSError) as error:
-            self._shut_down()
+            self._close_source()
             reason = error.__cause__ if isinstance(error.__cause__, Exception) else error
             raise LinkLost(
-                f"{self.name}: the bus is gone (interface down or adapter unplugged): {_one_line(reason)}"
+                f"{self.name}: the bus is gone (interface down or adapter unplugged): {describe_error(reason)}"
             ) from error
 
-    def _chunk(self, message: "can.Message") -> Chunk:
+    def _to_chunk(self, message: "can.Message") -> Chunk:
         """Return a frame as a chunk."""
         address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
         return Chunk(bytes(message.data), self._arrival_ns(message), address)
@@ -240,15 +207,14 @@ class CanLink:
         age_ns = now_ns + _unix_minus_monotonic_ns() - round(message.timestamp * 1e9)
         return now_ns - age_ns if 0 <= age_ns <= MAX_FRAME_AGE_S * 1e9 else now_ns
 
-    def _note_error(self, message: "can.Message") -> None:
+    def _count_error_frame(self, message: "can.Message") -> None:
         """Count an error frame. Raise LinkLost if it reports bus-off."""
         self.error_frames += 1
         if self._settings.interface in BUS_OFF_INTERFACES and message.arbitration_id & BUS_OFF:
-            self._shut_down()
+            self._close_source()
             raise LinkLost(f"{self.name}: bus off; check the bit rate, the wiring and the terminators")
 
-    def _shut_down(self) -> None:
-        """Close the bus if it is open."""
+    def _close_source(self) -> None:
         import can
 
         bus, self._bus = self._bus, None
@@ -280,14 +246,14 @@ def _unix_minus_monotonic_ns() -> int:
     return min(pairs)[1]
 
 
-def _probe(s: Settings) -> None:
+def _probe_server(s: Settings) -> None:
     """Check that a socketcand server answers. python-can would try to reach a missing one for 10 s."""
     if s.interface == "socketcand":
         host, port = str(s.options.get("host", "127.0.0.1")), int(s.options.get("port", 29536))
         socket.create_connection((host, port), timeout=PROBE_TIMEOUT_S).close()
 
 
-def _filter(address: int) -> dict[str, Any]:
+def _filter_for_address(address: int) -> dict[str, Any]:
     """Return the python-can filter for an address."""
     extended = bool(address & EXTENDED_ID)
     mask = ID_MASK if extended else 0x7FF
@@ -299,29 +265,23 @@ def _filter(address: int) -> dict[str, Any]:
 
 
 def _why_not_open(s: Settings, error: Exception) -> str:
-    """Return one line with the reason why a bus cannot be opened, and the remedy."""
+    """Return the reason why a bus cannot be opened, and the remedy."""
     import can
 
-    name = f"CAN {s.interface} {s.channel}"
     number = getattr(error, "errno", None)
     if number == errno.EAFNOSUPPORT:
-        return f"{name}: this kernel has no CAN (AF_CAN); sudo modprobe can_raw, or use slcan"
+        return "this kernel has no CAN (AF_CAN); sudo modprobe can_raw, or use slcan"
     if number == errno.ENODEV:
-        return f"{name}: no such network interface; see: ip -brief link show type can"
+        return "no such network interface; see: ip -brief link show type can"
     if number == errno.ENETDOWN:
-        return f"{name}: the interface is down; sudo ip link set {s.channel} up type can bitrate 500000"
+        return f"the interface is down; sudo ip link set {s.channel} up type can bitrate 500000"
     if number in (errno.EACCES, errno.EPERM):
-        return f"{name}: no permission; for a serial adapter, add the user to the group dialout"
+        return "no permission; for a serial adapter, add the user to the group dialout"
     if isinstance(error, ImportError | NameError | can.CanInterfaceNotImplementedError):
-        return f"{name}: the vendor's library or driver is not installed: {_one_line(error)}"
+        return f"the vendor's library or driver is not installed: {describe_error(error)}"
     if isinstance(error, TypeError | ValueError | ArithmeticError):
-        return f"{name}: python-can refuses these settings: {_one_line(error)}"
-    return f"{name}: cannot be opened: {_one_line(error)}"
-
-
-def _one_line(error: Exception) -> str:
-    """Return the text of an error in one line."""
-    return " ".join(str(error).split())
+        return f"python-can refuses these settings: {describe_error(error)}"
+    return f"cannot be opened: {describe_error(error)}"
 
 
 def build(settings: Settings) -> Link:

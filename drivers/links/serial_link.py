@@ -17,15 +17,14 @@ import contextlib
 import errno
 import importlib.util
 import os
-import threading
 import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from drivers.credential_masking import mask_secrets
 from drivers.discovery import format_choices
-from drivers.errors import ConfigError, LinkLost, LinkUnavailable
-from drivers.links.base import Carrier, Link, LinkSettings
+from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
+from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
 from drivers.quantities import BIT_RATE, READ_TIMEOUT_S, describe_range_errors
 from drivers.sample import Chunk
 
@@ -57,72 +56,60 @@ class Settings(LinkSettings, frozen=True, kw_only=True):
     """Time in s that bytes may wait for more bytes; at most 0.1."""
 
 
-class SerialLink:
+class SerialLink(PolledLink):
     """Link to one serial port."""
 
     carrier: Carrier = "bytes"
     epoch: Literal["monotonic", "unix"] = "monotonic"
 
     def __init__(self, settings: Settings) -> None:
+        self._shown_port = mask_secrets(settings.port)
+        super().__init__(f"{self._shown_port} at {settings.baudrate} baud")
         self._settings = settings
         self._port: serial.SerialBase | None = None
         self._buffer_filling = False  # True if the last read was so large that the next one must not wait
-        self._closing = threading.Event()
-        self._in_use = threading.Lock()  # held while the port is read, opened or closed
-        self.name = f"{mask_secrets(settings.port)} at {settings.baudrate} baud"
-
-    def open(self) -> None:
-        """Open the port. Raise ``LinkUnavailable`` with the reason and the remedy if it cannot be opened."""
-        import serial
-
-        with self._in_use:
-            if self._port is not None:
-                return
-            s = self._settings
-            try:
-                self._port = serial.serial_for_url(
-                    s.port,
-                    baudrate=s.baudrate,
-                    bytesize=s.bytesize,
-                    parity=s.parity,
-                    stopbits=s.stopbits,
-                    rtscts=s.rtscts,
-                    xonxoff=s.xonxoff,
-                    timeout=s.read_timeout,
-                    # URL handlers without a lock ignore this key
-                    **({"exclusive": True} if s.exclusive else {}),
-                )
-            except (OSError, ValueError, NotImplementedError) as error:
-                raise LinkUnavailable(mask_secrets(_why_not_open(s.port, error))) from error
-            self._closing.clear()
-
-    def read(self, timeout_s: float) -> list[Chunk] | None:
-        """Return the received bytes as one chunk; None if none arrive within ``timeout_s`` seconds."""
-        deadline = time.monotonic() + timeout_s
-        with self._in_use:
-            port = self._port
-            while port is not None and not self._closing.is_set():
-                data = self._read_some(port)
-                if data:
-                    return [Chunk(data, time.monotonic_ns())]
-                if time.monotonic() >= deadline:
-                    return None
-        raise LinkLost(f"{mask_secrets(self._settings.port)}: the link is closed")
 
     def close(self) -> None:
         """Close the port after a waiting ``read`` has ended."""
         self._closing.set()
-        port = self._port
-        cancel = getattr(port, "cancel_read", None)  # not every URL handler has it
+        cancel = getattr(self._port, "cancel_read", None)  # not every URL handler has it
         if cancel is not None:
-            # it fails if the reader has just closed the port; then no read is waiting
+            # cancelling fails if the reader has just closed the port; then no read is waiting
             with contextlib.suppress(OSError, TypeError):
                 cancel()
-        with self._in_use:
-            self._drop_port()
+        super().close()
 
-    def _read_some(self, port: "serial.SerialBase") -> bytes:
+    def _is_open(self) -> bool:
+        return self._port is not None
+
+    def _open_source(self) -> None:
+        import serial
+
+        s = self._settings
+        try:
+            self._port = serial.serial_for_url(
+                s.port,
+                baudrate=s.baudrate,
+                bytesize=s.bytesize,
+                parity=s.parity,
+                stopbits=s.stopbits,
+                rtscts=s.rtscts,
+                xonxoff=s.xonxoff,
+                timeout=s.read_timeout,
+                # URL handlers without a lock ignore this key
+                **({"exclusive": True} if s.exclusive else {}),
+            )
+        except (OSError, ValueError, NotImplementedError) as error:
+            raise LinkUnavailable(mask_secrets(_why_not_open(s.port, error))) from error
+
+    def _poll_source(self, deadline: float) -> list[Chunk]:
+        data = self._read_available()
+        return [Chunk(data, time.monotonic_ns())] if data else []
+
+    def _read_available(self) -> bytes:
         """Read the bytes that arrive within the read timeout. Raise LinkLost if the device is gone."""
+        port = self._port
+        assert port is not None
         try:
             if not _has_file_number(port):
                 data: bytes = port.read(READ_BYTES)
@@ -136,15 +123,14 @@ class SerialLink:
                     data += os.read(port.fileno(), READ_BYTES)
             self._buffer_filling = len(data) > READ_BYTES // 2
         except OSError as error:
-            self._drop_port()
+            self._close_source()
             raise LinkLost(
-                f"{mask_secrets(self._settings.port)}: the device is gone (unplugged, switched off, or read by "
-                f"another program): {_one_line(error)}"
+                f"{self._shown_port}: the device is gone (unplugged, switched off, or read by another program): "
+                f"{describe_error(error)}"
             ) from error
         return data
 
-    def _drop_port(self) -> None:
-        """Close the port if it is open."""
+    def _close_source(self) -> None:
         port, self._port = self._port, None
         if port is not None:
             port.close()
@@ -161,29 +147,24 @@ def _why_not_open(port: str, error: Exception) -> str:
     """Return one line with the reason why a port cannot be opened, and the remedy."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
-        return f"{port}: no such port; {_ports()}"
+        return f"{port}: no such port; {_list_ports()}"
     if number in (errno.EACCES, errno.EPERM):
         return f"{port}: no permission; add the user to the group dialout (sudo usermod -aG dialout $USER)"
     if number in (errno.EAGAIN, errno.EBUSY):
-        return f"{port}: held by another program; close it, or see who it is with: fuser {port}"
+        return f"{port}: held by another program; close the program, which this command finds: fuser {port}"
     if number in (errno.ENODEV, errno.ENXIO, errno.EIO):
-        return f"{port}: no device behind this port; is it plugged in and switched on? {_ports()}"
+        return f"{port}: no device behind this port; is it plugged in and switched on? {_list_ports()}"
     if number in (errno.ENOTTY, errno.EINVAL, errno.EISDIR):
-        return f"{port}: not a serial port; {_ports()}"
-    return f"{port}: cannot be opened: {_one_line(error)}"
+        return f"{port}: not a serial port; {_list_ports()}"
+    return f"{port}: cannot be opened: {describe_error(error)}"
 
 
-def _ports() -> str:
+def _list_ports() -> str:
     """Return a list of the existing ports for a message."""
     from serial.tools import list_ports
 
     found = sorted(info.device for info in list_ports.comports())
-    return f"ports here: {', '.join(found)}" if found else "this computer shows no serial port"
-
-
-def _one_line(error: Exception) -> str:
-    """Return the text of an error in one line."""
-    return " ".join(str(error).split())
+    return f"ports here: {', '.join(found)}" if found else "this computer has no serial port"
 
 
 def build(settings: Settings) -> Link:

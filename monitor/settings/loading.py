@@ -452,7 +452,7 @@ class _Reader:
         link_name = keys.pop("link", None)
         decoder_name = keys.pop("decoder", "")
         options = keys.pop("decoder_options", {})
-        known = sorted({*discovery.list_modules(drivers.links, "_link"), "virtual"} - {"loopback"})
+        known = sorted({*discovery.list_modules(drivers.links, "_link"), "virtual"})
         if link_name not in known:
             said = "missing" if link_name is None else shown(link_name)
             self.wrong.append(f"{at}.link: {said}{discovery.format_choices(str(link_name or ''), known)}")

@@ -1,22 +1,18 @@
 """Decoder for CAN sensors that a DBC file describes. The settings map axes to signals.
 
 ``build`` reads the DBC with cantools and checks the map. After that, no file is opened and cantools is not used. The
-frames of one message are stacked to bytes [n, size], and each signal is extracted from all frames at once (the tests
-compare ``drivers.decoders.dbc`` with cantools).
+frames of one message are stacked to an array [n, size], and each signal is extracted from all frames at once. The tests
+compare the extracted values with those of cantools.
 
-One sample may be spread over several messages. Its frames are joined in order of arrival. A frame starts the next
-sample if the open sample already contains a frame of the same message. With ``join = "counter"`` the counter decides: a
-frame with another count starts the next sample. If the counter has a message of its own, the arrival of that message
-does. A sample with a frame that is missing, too short or not ``valid`` is bad and leaves its place empty. With
-``partial = true``, missing frames only leave their axes unmeasured. A sample with all its frames, some of them after
-``window``, is late. It also leaves its place empty, and is counted in ``late`` instead of ``bad``.
-``drivers.decoders.dbc.join`` describes how a late frame is distinguished from a frame of the next sample. Frames before
-the first complete sample are not counted. A message that contains only temperature may be slower than the others. Its
-newest value is used.
+One sample may be spread over several messages, whose frames are joined in order of arrival
+(``drivers.decoders.dbc.join``). A sample with a frame that is missing, too short or not ``valid`` is bad and counts as
+missing. With ``partial = true``, missing frames only leave their axes unmeasured. A sample with a frame that arrived
+after ``window`` also counts as missing. It is counted in ``late`` instead of ``bad``. A message that contains only the
+temperature may be sent less often than the other messages. Its newest value is used.
 
-J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by their parameter group, whatever the
-priority and the sender. The first sender received is used, unless ``source`` names another. A raw value in the top
-2/256 of its range is "error" or "not available" (SAE J1939-71: 0xFE00 to 0xFFFF of 16 bits) and not measured.
+J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by their parameter group. Priority and
+sender are ignored. The first sender received is used, unless ``source`` names another sender. A raw value in the top
+2/256 of its range means "error" or "not available" (SAE J1939-71: 0xFE00 to 0xFFFF of 16 bits) and is not measured.
 ``not_available = true`` applies this rule to other messages, too.
 """
 
@@ -26,8 +22,7 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Decoder, Timing
-from drivers.decoders.dbc.bits import Bytes
+from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Bytes, Decoder, Timing
 from drivers.decoders.dbc.database import Database
 from drivers.decoders.dbc.join import COLUMNS, Message, Sample, SampleAssembler
 from drivers.decoders.dbc.settings import Settings, SignalSettings
@@ -67,22 +62,22 @@ class DbcDecoder:
         self.hint = ""
         self._two_senders_hint = ""  # hint that two senders are on the bus
         self._samples_since_reject = 0  # number of good samples since the last rejected one
-        self._rows = BlockBuilder()
-        self._join = SampleAssembler(self._messages, settings)
-        self._known = {m.address: i for i, m in self._numbered() if not m.j1939}
-        self._groups = {_group(m.frame_id): i for i, m in self._numbered() if m.j1939}
+        self._builder = BlockBuilder()
+        self._assembler = SampleAssembler(self._messages, settings)
+        self._known = {m.address: i for i, m in self._numbered_messages() if not m.j1939}
+        self._groups = {_parameter_group(m.frame_id): i for i, m in self._numbered_messages() if m.j1939}
         self._cache: dict[int, int | None] = {}
         self._source = settings.source
 
     @property
     def addresses(self) -> tuple[int, ...]:
         """Addresses to receive from the bus. ``ANY_SOURCE`` marks J1939 parameter groups."""
-        return tuple(m.address | (ANY_SOURCE if m.j1939 else 0) for _, m in self._numbered())
+        return tuple(m.address | (ANY_SOURCE if m.j1939 else 0) for _, m in self._numbered_messages())
 
     def reset(self) -> None:
-        """Forget an open sample, the newest temperature and the selected sender."""
-        self._join.reset()
-        self._rows.reset()
+        """Discard an open sample, the newest temperature and the selected sender."""
+        self._assembler.reset()
+        self._builder.reset()
         self._source = self._settings.source
         self._two_senders_hint = ""
         self._cache.clear()
@@ -104,19 +99,20 @@ class DbcDecoder:
             if len(chunk.data) < size:
                 message = self._messages[which].name
                 self.hint = f"{message}: frames of {len(chunk.data)} bytes, but its signals need {size}"
-            self._join.put(which, chunk.data[:size] if len(chunk.data) >= size else b"", chunk.t_ns, done)
-        blocks = self._decode(done)
-        self._samples_since_reject = self._samples_since_reject + len(done) if self._rows.bad == self._left_out else 0
+            self._assembler.add_frame(which, chunk.data[:size] if len(chunk.data) >= size else b"", chunk.t_ns, done)
+        blocks = self._decode_samples(done)
+        rejected = self._builder.bad != self._left_out
+        self._samples_since_reject = 0 if rejected else self._samples_since_reject + len(done)
         if self._samples_since_reject >= HINT_FRAMES:
             self.hint = self.late_hint = ""
-        if delay_ns := self._join.take_delay_ns():
+        if delay_ns := self._assembler.take_delay_ns():
             self._samples_since_reject = 0
             self.hint = self.late_hint = (
                 f"frames of one sample arrive {delay_ns * 1e-6:.3g} ms apart, more than "
                 f"window = {self._settings.window:g} s: increase `window` in decoder_options"
             )
         self.hint = self._two_senders_hint or self.hint
-        self._left_out, self.late = self._rows.bad, self._join.late
+        self._left_out, self.late = self._builder.bad, self._assembler.late
         self.bad = self._left_out - self.late
         return blocks
 
@@ -126,14 +122,14 @@ class DbcDecoder:
         table = np.column_stack((samples.values, samples.temperature_c))
         sent: list[tuple[Message, Bytes]] = []
         # the temperature is sent first, since it applies to the samples after it
-        for _, message in sorted(self._numbered()):
+        for _, message in sorted(self._numbered_messages()):
             frames = np.full((n, message.length), 0xFF if message.j1939 else 0, np.uint8)
             for column in message.columns:
-                column.bits.put(frames, (table[:, column.place] - column.offset) / column.factor)
+                column.bits.insert_values(frames, (table[:, column.index] - column.offset) / column.factor)
             if message.valid is not None:
-                message.valid.put_raw(frames, np.ones(n, np.uint64))
+                message.valid.insert_raw(frames, np.ones(n, np.uint64))
             if message.counter is not None:
-                message.counter.put_raw(frames, samples.ticks.view(np.uint64) & message.counter.mask)
+                message.counter.insert_raw(frames, samples.ticks.view(np.uint64))
             sent.append((message, frames))
         return [
             Chunk(frames[row].tobytes(), int(samples.t_ns[row]), message.address)
@@ -142,7 +138,7 @@ class DbcDecoder:
             if message is not self._slow or not np.isnan(samples.temperature_c[row])
         ]
 
-    def _numbered(self) -> list[tuple[int, Message]]:
+    def _numbered_messages(self) -> list[tuple[int, Message]]:
         """Return the messages with their index in a sample.
 
         The index -1 is the message that contains only the temperature.
@@ -159,12 +155,12 @@ class DbcDecoder:
         if address not in self._cache:
             if len(self._cache) >= MAX_CACHED_IDS:
                 self._cache.clear()
-            self._cache[address] = self._group_of(address)
+            self._cache[address] = self._find_j1939_message(address)
         return self._cache[address]
 
-    def _group_of(self, address: int) -> int | None:
+    def _find_j1939_message(self, address: int) -> int | None:
         """Return the index of the J1939 message with this address; None for an unused message or another sender."""
-        which = self._groups.get(_group(address))
+        which = self._groups.get(_parameter_group(address))
         if which is None:
             return None
         source = address & 0xFF
@@ -183,39 +179,39 @@ class DbcDecoder:
         """Keep the newest frame of the message that contains only the temperature."""
         assert self._slow is not None
         if len(data) >= self._slow.size:
-            self._join.temperature = data[: self._slow.size]
+            self._assembler.temperature = data[: self._slow.size]
 
-    def _decode(self, done: Sequence[Sample]) -> list[SampleBlock]:
+    def _decode_samples(self, done: Sequence[Sample]) -> list[SampleBlock]:
         """Return joined samples as blocks. Each signal is extracted from all of them at once."""
         n = len(done)
         table = np.full((n, len(COLUMNS)), np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
         valid = np.ones(n, bool)
-        for which, message in self._numbered():
-            frames, there = _stack(done, which, message.size)
+        for which, message in self._numbered_messages():
+            frames, there = _stack_frames(done, which, message.size)
             for column in message.columns:
-                physical = column.bits.physical(frames) * column.factor + column.offset
-                table[there, column.place] = physical[there]
+                physical = column.bits.extract_values(frames) * column.factor + column.offset
+                table[there, column.index] = physical[there]
             if message.valid is not None:
-                valid &= ~there | (message.valid.raw(frames) == 1)
+                valid &= ~there | (message.valid.extract_raw(frames) == 1)
             if message.counter is not None:
-                raw: Ints = message.counter.raw(frames).astype(np.int64)
+                raw: Ints = message.counter.extract_raw(frames).astype(np.int64)
                 ticks[there] = raw[there]
-        # a row without any value is rejected by ``Rows``, and its place stays empty
+        # ``BlockBuilder`` rejects a sample without any value and counts it as missing
         table[~valid] = np.nan
         if not valid.all():
-            self.hint = f"{self._settings.valid} is not 1: the sensor says that its values do not hold"
-        return self._rows.blocks(
+            self.hint = f"{self._settings.valid} is not 1: the sensor reports that its values are invalid"
+        return self._builder.build_blocks(
             np.array([s.t_ns for s in done], np.int64),
             np.ascontiguousarray(table[:, : len(AXES)]),
             table[:, len(AXES)].copy(),
             ticks,
             np.array([s.missing_before for s in done], np.int64),
-            self._join.take_missing(),
+            self._assembler.take_missing_samples(),
         )
 
 
-def _stack(done: Sequence[Sample], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
+def _stack_frames(done: Sequence[Sample], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
     """Return the frames [n, size] of one message, and a mask [n] of those that exist."""
     frames = [s.temperature if which < 0 else s.frames[which] for s in done]
     empty = bytes(size)
@@ -223,7 +219,7 @@ def _stack(done: Sequence[Sample], which: int, size: int) -> tuple[Bytes, NDArra
     return data.reshape(len(frames), size), np.array([bool(f) for f in frames], bool)
 
 
-def _group(frame_id: int) -> int:
+def _parameter_group(frame_id: int) -> int:
     """Return the J1939 parameter group number of a 29-bit identifier (SAE J1939-21 5.1.2)."""
     group = frame_id >> 8 & 0x3_FFFF
     return group if group >> 8 & 0xFF >= 240 else group & 0x3_FF00

@@ -1,31 +1,31 @@
 """Bit field of one CAN signal: extraction from, and insertion into, many frames at once.
 
-Frames are bytes [n, size], physical values are [n]. Intel and Motorola byte order are handled alike: the bytes that a
-signal touches (its span, at most nine) are put in order of significance and shifted.
+Frames are bytes [n, size], physical values are [n]. Bits are numbered in the order in which the byte order of the
+signal counts them. Intel signals count from the least significant bit of each byte, Motorola signals from the most
+significant bit.
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.decoders.base import Bytes
 from drivers.sample import Floats
 
 FIRST_INDICATOR: Final = 0xFE
 """Smallest top byte of a value that is an indicator and not a measurement (SAE J1939-71)."""
+ALL_ONES: Final = np.uint64((1 << 64) - 1)
 
-Bytes = NDArray[np.uint8]
-Raw = NDArray[np.uint64]
+RawNumbers = NDArray[np.uint64]
 
 
 @dataclass(frozen=True, slots=True)
-class Bits:
+class SignalBits:
     """Position of a signal in its frame, and the conversion of its raw number to a physical value."""
 
-    first: int  # first byte of its span
-    span: int  # bytes
-    shift: int  # position of the least significant bit, from the least significant end of the span
+    first: int  # number of the first bit
     length: int
     big_endian: bool
     signed: bool
@@ -34,29 +34,33 @@ class Bits:
     offset: float
     indicators: bool  # True if values in the top 2/256 of the range are not measured
 
-    def raw(self, frames: Bytes) -> Raw:
-        """Return raw numbers [n] of frames [n, size]."""
-        span = frames[:, self.first : self.first + self.span]
-        if self.big_endian:
-            span = span[:, ::-1]
-        low = np.zeros((len(frames), 8), np.uint8)
-        low[:, : min(self.span, 8)] = span[:, :8]
-        words = low.view("<u8")[:, 0].astype(np.uint64) >> np.uint64(self.shift)
-        if self.span > 8:  # shift of 1 to 7: the remaining bits are in the ninth byte
-            words |= span[:, 8].astype(np.uint64) << np.uint64(64 - self.shift)
-        result: Raw = words & self.mask
-        return result
+    @property
+    def end_byte(self) -> int:
+        """Number of bytes from the start of the frame to the end of the signal."""
+        return (self.first + self.length - 1) // 8 + 1
 
-    def physical(self, frames: Bytes) -> Floats:
-        """Return values [n] in the unit of the DBC; NaN for indicators."""
-        raw = self.raw(frames)
-        values = self._number(raw) * self.scale + self.offset
+    @property
+    def _bit_order(self) -> Literal["big", "little"]:
+        """Order of the bits of a byte, as NumPy calls it."""
+        return "big" if self.big_endian else "little"
+
+    def extract_raw(self, frames: Bytes) -> RawNumbers:
+        """Return the raw numbers [n] of frames [n, size]."""
+        bits = np.unpackbits(frames, axis=1, bitorder=self._bit_order)[:, self.first : self.first + self.length]
+        padded = np.zeros((len(frames), 64), np.uint8)
+        padded[:, : self.length] = bits[:, ::-1] if self.big_endian else bits
+        return np.packbits(padded, axis=1, bitorder="little").view("<u8")[:, 0].astype(np.uint64)
+
+    def extract_values(self, frames: Bytes) -> Floats:
+        """Return the values [n] of frames [n, size] in the unit of the DBC; NaN for indicators."""
+        raw = self.extract_raw(frames)
+        values = self._to_float(raw) * self.scale + self.offset
         if self.indicators:
             # right shift to the top byte; shorter fields have no indicators
             values = np.where(raw >> np.uint64(self.length - 8) >= FIRST_INDICATOR, np.nan, values)
         return values
 
-    def put(self, frames: Bytes, values: Floats) -> None:
+    def insert_values(self, frames: Bytes, values: Floats) -> None:
         """Write values into frames, rounded to the nearest step and clipped to the range.
 
         Parameters
@@ -67,13 +71,13 @@ class Bits:
             [n] float64 in the unit of the DBC. NaN becomes the indicator for not available if the signal has one.
         """
         with np.errstate(over="ignore"):
-            raw = self._raw_of((values - self.offset) / self.scale)
+            raw = self._from_float((values - self.offset) / self.scale)
         if self.indicators:
-            raw = np.where(np.isnan(values), self.mask, raw)
-        self.put_raw(frames, raw)
+            raw = np.where(np.isnan(values), ALL_ONES, raw)
+        self.insert_raw(frames, raw)
 
-    def put_raw(self, frames: Bytes, raw: Raw) -> None:
-        """Write raw numbers into frames.
+    def insert_raw(self, frames: Bytes, raw: RawNumbers) -> None:
+        """Write the low bits of raw numbers into frames.
 
         Parameters
         ----------
@@ -82,24 +86,12 @@ class Bits:
         raw
             [n] uint64.
         """
-        span = np.zeros((len(frames), max(self.span, 8)), np.uint8)
-        used = np.zeros_like(span)
-        mask = np.full(len(frames), self.mask)
-        for target, number in ((span, raw), (used, mask)):
-            target[:, :8] = (number << np.uint64(self.shift)).astype("<u8")[:, None].view(np.uint8)
-            if self.span > 8:
-                target[:, 8] = number >> np.uint64(64 - self.shift)
-        order = slice(None, None, -1) if self.big_endian else slice(None)
-        span, used = span[:, : self.span][:, order], used[:, : self.span][:, order]
-        place = frames[:, self.first : self.first + self.span]
-        place[:] = (place & ~used) | span
+        number = np.unpackbits(raw.astype("<u8")[:, None].view(np.uint8), axis=1, bitorder="little")[:, : self.length]
+        bits = np.unpackbits(frames, axis=1, bitorder=self._bit_order)
+        bits[:, self.first : self.first + self.length] = number[:, ::-1] if self.big_endian else number
+        frames[:] = np.packbits(bits, axis=1, bitorder=self._bit_order)
 
-    @property
-    def mask(self) -> np.uint64:
-        """Mask with ones at the bits of the raw number."""
-        return np.uint64((1 << self.length) - 1)
-
-    def _number(self, raw: Raw) -> Floats:
+    def _to_float(self, raw: RawNumbers) -> Floats:
         """Return raw numbers as float64 according to their type."""
         if self.is_float:
             bits = raw.astype(f"<u{self.length // 8}")
@@ -111,10 +103,10 @@ class Bits:
             return signed.astype(np.float64)
         return raw.astype(np.float64)
 
-    def _raw_of(self, numbers: Floats) -> Raw:
-        """Return numbers as raw numbers, rounded and clipped to the range."""
+    def _from_float(self, numbers: Floats) -> RawNumbers:
+        """Return numbers as raw numbers, rounded and clipped to the range. Bits above ``length`` are undefined."""
         if self.is_float:
-            bits: Raw = numbers.astype(f"<f{self.length // 8}").view(f"<u{self.length // 8}").astype(np.uint64)
+            bits: RawNumbers = numbers.astype(f"<f{self.length // 8}").view(f"<u{self.length // 8}").astype(np.uint64)
             return bits
         low = -(1 << self.length - 1) if self.signed else 0
         high = low + (1 << self.length) - 1
@@ -123,5 +115,4 @@ class Bits:
         # the largest float64 within the range, since 2⁶³ - 1 is not a float64
         top = float(high) if int(float(high)) <= high else np.nextafter(float(high), 0.0)
         whole = np.rint(np.clip(np.nan_to_num(numbers), low, top))
-        result: Raw = whole.astype(np.int64).view(np.uint64) if self.signed else whole.astype(np.uint64)
-        return result & self.mask
+        return whole.astype(np.int64).view(np.uint64) if self.signed else whole.astype(np.uint64)

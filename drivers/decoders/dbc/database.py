@@ -13,7 +13,7 @@ from typing import Any, Final
 import drivers
 from drivers import file_access, units
 from drivers.decoders.base import ArrivalTiming, CounterTiming, Timing
-from drivers.decoders.dbc.bits import Bits
+from drivers.decoders.dbc.bits import SignalBits
 from drivers.decoders.dbc.join import COLUMNS, Column, Message
 from drivers.decoders.dbc.settings import Settings, SignalSettings
 from drivers.discovery import format_choices, format_suggestion
@@ -51,7 +51,7 @@ class Database:
         with self._collecting():
             self._path = _locate(settings.file)
             self._messages: dict[str, Any] = {m.name: m for m in _load(self._path).messages}
-            self._look_up()
+            self._find_configured_signals()
         if self._errors:
             raise ConfigError(*self._errors)
 
@@ -71,50 +71,53 @@ class Database:
         except ConfigError as error:
             self._errors += error.lines
 
-    def _look_up(self) -> None:
-        """Look up all signals of the settings."""
+    def _find_configured_signals(self) -> None:
+        """Find all signals of the settings."""
         s = self._settings
         for axis, entry in s.signals.items():
             with self._collecting():
                 self._add_axis(axis, _signal_settings(axis, entry))
         if s.valid:
             with self._collecting():
-                message, signal = self._find("valid", s.valid)
-                self._use(message, signal).valid = self._bits(message, signal)
+                message, signal = self._find_signal("valid", s.valid)
+                bits = self._signal_bits(message, signal)
+                self._register_message(message, bits).valid = bits
         if s.counter:
             with self._collecting():
                 self._add_counter()
 
     def _add_counter(self) -> None:
-        """Look up the counter and derive the timing."""
+        """Find the counter and derive the timing."""
         s = self._settings
-        for message, signal in self._counters():
+        for message, signal in self._find_counters():
             if signal.is_float or signal.length > MAX_COUNTER_BITS:
                 raise ConfigError(
                     f'counter: "{s.counter}"; a counter is a whole number of at most {MAX_COUNTER_BITS} bits'
                 )
-            self._use(message, signal).counter = self._bits(message, signal)
+            bits = self._signal_bits(message, signal)
+            self._register_message(message, bits).counter = bits
             self._timing = CounterTiming(1 << int(signal.length), s.tick)
 
-    def _counters(self) -> list[tuple[Any, Any]]:
+    def _find_counters(self) -> list[tuple[Any, Any]]:
         """Return message and signal of each counter."""
         name = self._settings.counter
         if "." in name or self._settings.join == "time":
-            return [self._find("counter", name)]
-        # messages with nothing but temperature need no counter
+            return [self._find_signal("counter", name)]
+        # a message with only the temperature needs no counter
         inertial = [m.name for m in self._used.values() if not m.only_temperature]
-        return [self._find("counter", f"{message}.{name}") for message in inertial]
+        return [self._find_signal("counter", f"{message}.{name}") for message in inertial]
 
     def _add_axis(self, axis: str, entry: SignalSettings) -> None:
-        """Look up the signal of an axis."""
+        """Find the signal of an axis."""
         if axis not in COLUMNS:
             raise ConfigError(f"signals.{axis}: unknown axis{format_choices(axis, COLUMNS)}")
-        message, signal = self._find(f"signals.{axis}", entry.signal)
-        factor, offset = self._to_si(axis, entry, signal)
-        column = Column(COLUMNS.index(axis), self._bits(message, signal), factor, offset)
-        self._use(message, signal).columns.append(column)
+        message, signal = self._find_signal(f"signals.{axis}", entry.signal)
+        factor, offset = self._conversion_to_si(axis, entry, signal)
+        bits = self._signal_bits(message, signal)
+        column = Column(COLUMNS.index(axis), bits, factor, offset)
+        self._register_message(message, bits).columns.append(column)
 
-    def _to_si(self, axis: str, entry: SignalSettings, signal: Any) -> tuple[float, float]:
+    def _conversion_to_si(self, axis: str, entry: SignalSettings, signal: Any) -> tuple[float, float]:
         """Return factor and offset from the unit of a signal to SI."""
         unit = entry.unit or signal.unit or ""
         try:
@@ -131,7 +134,7 @@ class Database:
             ) from error
         return factor * entry.factor, offset * entry.factor
 
-    def _find(self, key: str, name: str) -> tuple[Any, Any]:
+    def _find_signal(self, key: str, name: str) -> tuple[Any, Any]:
         """Return message and signal of the DBC for a name "Message.Signal"."""
         message_name, dot, signal_name = name.partition(".")
         if not dot:
@@ -141,7 +144,7 @@ class Database:
         if message is None:
             known = format_suggestion(message_name, tuple(self._messages))
             raise ConfigError(f'{key}: {self._path.name} has no message "{message_name}"{known}')
-        signals = {s.name: s for s in message.signals}
+        signals = {one.name: one for one in message.signals}
         signal = signals.get(signal_name)
         if signal is None:
             known = format_suggestion(signal_name, tuple(signals))
@@ -150,21 +153,12 @@ class Database:
             raise ConfigError(f"{key}: {name} is multiplexed; such signals are not supported")
         return message, signal
 
-    def _use(self, message: Any, signal: Any) -> Message:
+    def _register_message(self, message: Any, bits: SignalBits) -> Message:
         """Return the entry of a used message, after extending its size to contain the signal."""
-        entry = self._used.get(message.name)
-        if entry is None:
-            entry = self._used[message.name] = Message(
-                message.name,
-                message.frame_id,
-                bool(message.is_extended_frame),
-                self._is_j1939(message),
-                0,
-                message.length,
-                [],
-            )
-        bits = self._bits(message, signal)
-        entry.size = max(entry.size, bits.first + bits.span)
+        extended, j1939 = bool(message.is_extended_frame), self._is_j1939(message)
+        new = Message(message.name, message.frame_id, extended, j1939, size=0, length=message.length, columns=[])
+        entry = self._used.setdefault(message.name, new)
+        entry.size = max(entry.size, bits.end_byte)
         return entry
 
     def _is_j1939(self, message: Any) -> bool:
@@ -172,41 +166,34 @@ class Database:
         s = self._settings
         return bool(message.protocol == "j1939" if s.j1939 is None else s.j1939)
 
-    def _bits(self, message: Any, signal: Any) -> Bits:
+    def _signal_bits(self, message: Any, signal: Any) -> SignalBits:
         """Return the bit field of a signal. Raise ConfigError if it is not supported."""
         s = self._settings
         big_endian = signal.byte_order == "big_endian"
-        first, last = _bit_range(signal.start, signal.length, big_endian)
-        if first < 0 or last // 8 >= message.length or not 0 < signal.length <= 64:
+        # a DBC numbers the most significant bit of Motorola signals, 7 … 0 within each byte
+        first = 8 * (signal.start // 8) + 7 - signal.start % 8 if big_endian else signal.start
+        if first < 0 or first + signal.length > 8 * message.length or not 0 < signal.length <= 64:
             raise ConfigError(f"{self._path.name}: {signal.name} does not fit in {message.name}")
         if signal.is_float and signal.length not in (16, 32, 64):
-            raise ConfigError(f"{self._path.name}: {signal.name} is a float of {signal.length} bits; 16, 32, 64 can be")
+            raise ConfigError(
+                f"{self._path.name}: {signal.name} is a float of {signal.length} bits; expected 16, 32 or 64"
+            )
         if not (isfinite(signal.scale) and isfinite(signal.offset) and signal.scale):
             raise ConfigError(
-                f"{self._path.name}: {signal.name} has factor {signal.scale:g} and offset {signal.offset:g}; finite "
-                f"numbers are needed, the factor other than 0"
+                f"{self._path.name}: {signal.name} has factor {signal.scale:g} and offset {signal.offset:g}; both must "
+                f"be finite, and the factor must not be 0"
             )
-        # Motorola counts from the most significant bit, so the least significant bit is the last one
-        shift = 7 - last % 8 if big_endian else first % 8
-        rule = self._is_j1939(message) if s.not_available is None else s.not_available
-        return Bits(
-            first // 8,
-            last // 8 - first // 8 + 1,
-            shift,
+        not_available = self._is_j1939(message) if s.not_available is None else s.not_available
+        return SignalBits(
+            first,
             signal.length,
             big_endian,
             bool(signal.is_signed),
             bool(signal.is_float),
             float(signal.scale),
             float(signal.offset),
-            rule and signal.length >= 8 and not signal.is_signed and not signal.is_float,
+            indicators=not_available and signal.length >= 8 and not signal.is_signed and not signal.is_float,
         )
-
-
-def _bit_range(start: int, length: int, big_endian: bool) -> tuple[int, int]:
-    """Return the first and last bit in order of transmission. A DBC numbers Motorola starts 7 … 0, 15 … 8, …"""
-    first = 8 * (start // 8) + 7 - start % 8 if big_endian else start
-    return first, first + length - 1
 
 
 def _problems(settings: Settings) -> Iterator[str]:

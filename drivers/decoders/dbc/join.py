@@ -1,17 +1,17 @@
-"""Joining of frames of several messages to samples, and detection of incomplete samples.
+"""Joining of the frames of several messages to samples, and detection of incomplete samples.
 
 A frame starts the next sample if the open sample already contains a frame of the same message. A message that contains
-only the counter also starts the next sample. With ``join = "counter"``, so does a frame with another count. A sample is
-complete when every message has arrived. A sample that ends earlier is bad, unless ``partial`` is True. Frames before
-the first complete sample are not counted, since the link may have been opened in the middle of a sample.
+only the counter also starts the next sample. With ``join = "counter"``, a frame with another count starts it as well. A
+sample is complete when every message has arrived. A sample that ends earlier is bad, unless ``partial`` is True. Frames
+before the first complete sample are not counted, since the link may have been opened in the middle of a sample.
 
-A frame that arrives more than ``window`` after the first frame of the open sample has two possible causes. It is a late
-frame of this sample, or it starts the next sample because earlier frames were lost. If there are counts, equal counts
-decide. Otherwise the order of the messages decides. Samples start with the message before which the pause is longest,
-so a frame of that message starts the next sample. A frame of another message is late, unless a complete sample period
-has passed. Pauses are medians over the last frames. A frame that arrives before the order is known waits until it is
-known. A sample with all its frames, some of them late, counts as late and not as bad. Its values are left out and its
-place stays empty.
+A frame that arrives more than ``window`` after the first frame of the open sample has two possible causes. The frame is
+a late frame of the open sample, or it starts the next sample because earlier frames were lost. If the frames contain
+counts, a frame with the same count is late. Otherwise the order of the messages decides. A sample starts with the
+message before which the pause is longest, so a frame of this message starts the next sample. A frame of another message
+is late, unless a complete sample period has passed. Pauses are medians over the last frames. A frame waits while the
+order of the messages is unknown. A sample with all its frames, some of them late, counts as late and not as bad. The
+values of a late sample are left out, and the sample counts as missing.
 """
 
 from collections import deque
@@ -22,7 +22,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.decoders.dbc.bits import Bits
+from drivers.decoders.dbc.bits import SignalBits
 from drivers.decoders.dbc.settings import Settings
 from drivers.sample import AXES, EXTENDED_ID, NO_TICK
 
@@ -42,15 +42,15 @@ After that, the order of the received frames is used.
 class Column:
     """Signal of one axis, and its conversion to SI."""
 
-    place: int  # index in COLUMNS
-    bits: Bits
+    index: int  # in COLUMNS
+    bits: SignalBits
     factor: float
     offset: float
 
 
 @dataclass(slots=True)
 class Message:
-    """Message that contains a part of a sample."""
+    """CAN message that contains a part of a sample."""
 
     name: str
     frame_id: int
@@ -59,12 +59,12 @@ class Message:
     size: int  # bytes that contain the used signals
     length: int  # bytes of the complete message
     columns: list[Column]
-    valid: Bits | None = None
-    counter: Bits | None = None
+    valid: SignalBits | None = None
+    counter: SignalBits | None = None
 
     @property
     def address(self) -> int:
-        """Address in the form of ``Chunk.address``."""
+        """Address of the frames, encoded as in ``Chunk.address``."""
         return self.frame_id | (EXTENDED_ID if self.extended else 0)
 
     @property
@@ -74,9 +74,9 @@ class Message:
 
     @property
     def only_temperature(self) -> bool:
-        """True if the message contains only the temperature. It may then be slower than the samples."""
-        places = {c.place for c in self.columns}
-        return places == {len(AXES)} and self.valid is None and self.counter is None
+        """True if the message contains only the temperature. Such a message may be sent less often than samples."""
+        indices = {column.index for column in self.columns}
+        return indices == {len(AXES)} and self.valid is None and self.counter is None
 
 
 @dataclass(slots=True)
@@ -121,7 +121,7 @@ class SampleAssembler:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the open sample, the order of the messages and the synchronization."""
+        """Discard the open sample, the order of the messages and the synchronization."""
         self._open: Sample | None = None
         self._synchronized = False
         self._missing = 0
@@ -131,21 +131,21 @@ class SampleAssembler:
         self._undecided: deque[tuple[int, bytes, int]] = deque()
         self.temperature: bytes | None = None
 
-    def take_missing(self) -> int:
-        """Return the number of samples left out since the last good one (bad or late), and reset it."""
+    def take_missing_samples(self) -> int:
+        """Return the number of bad and late samples since the last good sample, and reset the number."""
         missing, self._missing = self._missing, 0
         return missing
 
     def take_delay_ns(self) -> int:
         """Return the delay of the newest late frame after the first frame of its sample.
 
-        It is 0 if no frame has been late since the last call.
+        The delay is 0 if no frame has been late since the last call.
         """
         delay_ns, self._delay_ns = self._delay_ns, 0
         return delay_ns
 
-    def put(self, which: int, data: bytes, t_ns: int, done: list[Sample]) -> None:
-        """Add one frame.
+    def add_frame(self, which: int, data: bytes, t_ns: int, done: list[Sample]) -> None:
+        """Add one frame to the sample to which it belongs.
 
         Parameters
         ----------
@@ -161,15 +161,15 @@ class SampleAssembler:
         if self._newest_ns is not None:
             self._pauses[which].append(t_ns - self._newest_ns)
         self._newest_ns = t_ns
-        if not self._undecided and self._assign(which, data, t_ns, done):
+        if not self._undecided and self._assign_frame(which, data, t_ns, done):
             return
         self._undecided.append((which, data, t_ns))
-        while self._undecided and self._assign(*self._undecided[0], done):
+        while self._undecided and self._assign_frame(*self._undecided[0], done):
             self._undecided.popleft()
 
-    def _assign(self, which: int, data: bytes, t_ns: int, done: list[Sample]) -> bool:
-        """Put a frame into its sample. Return False if it is not known yet which sample that is."""
-        count = self._count(which, data)
+    def _assign_frame(self, which: int, data: bytes, t_ns: int, done: list[Sample]) -> bool:
+        """Add a frame to its sample. Return False if the sample is not known yet."""
+        count = self._read_count(which, data)
         sample = self._open
         if sample is not None:
             delay_ns = t_ns - sample.start_ns
@@ -178,7 +178,7 @@ class SampleAssembler:
                 return False
             if next_one:
                 if NO_TICK != count == self._count_before:
-                    return True  # a frame of the previous sample, which is already finished and counted
+                    return True  # this frame belongs to the previous sample, which is already finished and counted
                 self._finish(sample, done)
                 sample = None
             elif delay_ns > self._window_ns:
@@ -206,12 +206,12 @@ class SampleAssembler:
             self._finish(sample, done)
             self._open = None
 
-    def _count(self, which: int, data: bytes) -> int:
+    def _read_count(self, which: int, data: bytes) -> int:
         """Return the count in a frame; NO_TICK if there is none."""
         bits = self._counters[which]
         if bits is None or not data or not self._by_count:
             return NO_TICK
-        return int(bits.raw(np.frombuffer(data, np.uint8)[None, :])[0])
+        return int(bits.extract_raw(np.frombuffer(data, np.uint8)[None, :])[0])
 
     def _begins_next(self, sample: Sample, which: int, count: int, delay_ns: int) -> bool | None:
         """Return True if a frame starts the next sample; None if the order of the messages must be known first."""
@@ -224,7 +224,7 @@ class SampleAssembler:
         fewest = min(map(len, self._pauses))
         if fewest < MIN_PAUSES and len(self._undecided) < MAX_UNDECIDED_PER_MESSAGE * self._n:
             return None
-        pauses = [median(last) if last else 0 for last in self._pauses]
+        pauses = [median(newest) if newest else 0 for newest in self._pauses]
         first = pauses.index(max(pauses)) if self._counter_message is None else self._counter_message
         # the sum of the pauses before all messages is the sample period
         return which == first or delay_ns >= sum(pauses)
@@ -234,7 +234,7 @@ class SampleAssembler:
         self._count_before = sample.count
         whole = sample.complete and b"" not in sample.frames
         if whole or (self._partial and any(sample.frames)):
-            sample.missing_before = self.take_missing()
+            sample.missing_before = self.take_missing_samples()
             sample.temperature = self.temperature
             self._synchronized = True
             done.append(sample)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from drivers.decoders import dbc
 from drivers.decoders.base import ArrivalTiming, CounterTiming
-from drivers.decoders.dbc.bits import Bits
+from drivers.decoders.dbc.bits import SignalBits
 from drivers.decoders.dbc.database import SHIPPED
 from drivers.errors import ConfigError, LinkEnded
 from drivers.links import replay_link
@@ -159,13 +159,13 @@ def test_any_signal_decodes_as_cantools_says(
     bits = build(path, {"ax": "M.S"})._messages[0].columns[0].bits
     stacked = np.frombuffer(b"".join(frames), np.uint8).reshape(-1, 8)
     expected = [message.decode(f)["S"] for f in frames]
-    np.testing.assert_allclose(bits.physical(stacked), expected, rtol=1e-15)
+    np.testing.assert_allclose(bits.extract_values(stacked), expected, rtol=1e-15)
     # writing the raw numbers into other frames touches these bits and no other
     there = np.full_like(stacked, 0xA5)
-    bits.put_raw(there, bits.raw(stacked))
-    np.testing.assert_array_equal(bits.raw(there), bits.raw(stacked))
+    bits.insert_raw(there, bits.extract_raw(stacked))
+    np.testing.assert_array_equal(bits.extract_raw(there), bits.extract_raw(stacked))
     mask = np.zeros_like(stacked)
-    bits.put_raw(mask, np.full(len(mask), (1 << length) - 1, np.uint64))
+    bits.insert_raw(mask, np.full(len(mask), (1 << length) - 1, np.uint64))
     np.testing.assert_array_equal(there & ~mask, np.full_like(there, 0xA5) & ~mask)
 
 
@@ -185,13 +185,13 @@ def test_floats_on_the_wire(tmp_path: Path, length: int, kind: int, code: str, b
 
 @given(st.integers(1, 64), st.booleans(), st.floats(-1e30, 1e30))
 def test_what_does_not_fit_is_limited(length: int, signed: bool, value: float) -> None:
-    bits = Bits(0, 8, 0, length, False, signed, False, 1.0, 0.0, False)
+    bits = SignalBits(0, length, False, signed, False, 1.0, 0.0, False)
     frames = np.zeros((1, 8), np.uint8)
-    bits.put(frames, np.array([value]))
+    bits.insert_values(frames, np.array([value]))
     low = -(2 ** (length - 1)) if signed else 0
     high = low + 2**length - 1
     limited = min(max(value, low), high)
-    assert bits.physical(frames)[0] == pytest.approx(limited, rel=1e-15, abs=0.5)
+    assert bits.extract_values(frames)[0] == pytest.approx(limited, rel=1e-15, abs=0.5)
 
 
 # --- there and back ------------------------------------------------------------------------------

@@ -95,9 +95,9 @@ def test_a_line_that_cannot_be_read_is_bad_and_leaves_a_place(line: bytes) -> No
 def test_the_hint_says_what_is_wrong_and_goes_away() -> None:
     decoder = build(Settings(columns=SIX))
     decoder.feed([Chunk(b"\n1,2,3\n", 0)])
-    assert "3 columns, expected are 6" in decoder.hint
+    assert "3 columns, expected 6" in decoder.hint
     decoder.feed([Chunk(b"1,2,3,4,5,gyro\n", 0)])
-    assert "no number" in decoder.hint
+    assert "not a number" in decoder.hint
     decoder.feed([Chunk(LINE * 1000, 0)])
     assert decoder.hint == ""
 

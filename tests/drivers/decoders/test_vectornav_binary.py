@@ -6,7 +6,7 @@ import struct
 import numpy as np
 import pytest
 
-from drivers.decoders.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, layout
+from drivers.decoders.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, find_layout
 from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, SampleBlock, concatenate_blocks, make_block
 
 EXAMPLE_1 = bytes.fromhex("FA 01 08 00 93 50 2E 42 83 3E F1 3F 48 B5 04 BB 92 88")
@@ -33,10 +33,10 @@ def vector(*numbers: float) -> bytes:
 def test_the_manuals_first_example_is_a_message_but_no_sample() -> None:
     decoder = build(Settings())
     assert decoder.feed([Chunk(EXAMPLE_1, 0)]) == []
-    form = layout(EXAMPLE_1[1:4], False)
+    form = find_layout(EXAMPLE_1[1:4], False)
     assert form is not None
-    assert form.length == len(EXAMPLE_1)
-    assert not form.inertial
+    assert form.itemsize == len(EXAMPLE_1)
+    assert not {"gyro", "accel"} & {*(form.names or ())}
     np.testing.assert_allclose(np.frombuffer(EXAMPLE_1, "<f4", 3, 4), [43.578686, 1.8847202, -0.0020249654], rtol=1e-7)
     assert decoder.bad == 0
 

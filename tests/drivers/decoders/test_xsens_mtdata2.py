@@ -5,7 +5,7 @@ import struct
 import numpy as np
 import pytest
 
-from drivers.decoders.xsens_mtdata2 import MAX_PAYLOAD, Settings, build, encode_message, match
+from drivers.decoders.xsens_mtdata2 import MAX_PAYLOAD, Settings, build, encode_message, match_message
 from drivers.sample import NO_TICK, Chunk, CounterTiming, SampleBlock, concatenate_blocks
 
 DOCUMENTED = bytes.fromhex(
@@ -165,4 +165,4 @@ def test_extended_length() -> None:
     assert got is not None
     assert got.values[0, 3:].tolist() == [1, 2, 3]
     too_long = b"\xfa\xff\x36\xff" + (MAX_PAYLOAD + 1).to_bytes(2, "big")
-    assert match(too_long, 0) == -1
+    assert match_message(too_long, 0) == -1

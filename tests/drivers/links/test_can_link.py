@@ -112,7 +112,7 @@ def test_an_interruption_between_two_clocks_moves_no_stamp(monkeypatch: pytest.M
         "time",
         SimpleNamespace(monotonic_ns=lambda: now_ns[0], time_ns=time_ns, time=lambda: time_ns() / 1e9),
     )
-    chunk = link._chunk(message(1, timestamp=(unix_ns + 10**12 - 10_000_000) / 1e9))
+    chunk = link._to_chunk(message(1, timestamp=(unix_ns + 10**12 - 10_000_000) / 1e9))
     assert chunk.t_ns == pytest.approx(10**12 - 10_000_000, abs=1000)
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from drivers.decoders import samples
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable
-from drivers.links import replay_link
+from drivers.links import base, replay_link
 from drivers.links.base import Link
 from drivers.recordings import load_samples
 from drivers.sample import EXTENDED_ID, Chunk, concatenate_blocks
@@ -43,6 +43,7 @@ class Clock:
     def __init__(self, link: Link, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now_s = 0.0
         monkeypatch.setattr(replay_link, "time", self)
+        monkeypatch.setattr(base, "time", self)
         monkeypatch.setattr(link._closing, "wait", self._wait)  # type: ignore[attr-defined]
 
     def monotonic(self) -> float:

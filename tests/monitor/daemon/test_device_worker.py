@@ -12,7 +12,6 @@ from drivers.decoders import dbc, samples, text, vectornav_binary
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
 from drivers.links import replay_link
-from drivers.links.loopback_link import LoopbackLink
 from drivers.sample import concatenate_blocks, make_block
 from monitor.daemon import device_worker
 from monitor.daemon.device_worker import DeviceWorker
@@ -20,6 +19,7 @@ from monitor.daemon.pipeline import KernelReadiness
 from monitor.estimation.fit.coefficients import Status
 from monitor.settings import loading as settings
 from monitor.settings.loading import Device
+from tests.support.loopback_link import LoopbackLink
 from tests.support.waiting import PATIENCE_S, wait_for
 
 RATE = 100.0

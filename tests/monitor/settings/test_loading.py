@@ -612,7 +612,7 @@ TABLES = {
     "metrics": (MetricsTable, ()),
     "log": (LogTable, ()),
 }
-LINKS = sorted({*discovery.list_modules(drivers.links, "_link"), "virtual"} - {"loopback"})
+LINKS = sorted({*discovery.list_modules(drivers.links, "_link"), "virtual"})
 WITH_KEYS = [
     name
     for name in discovery.list_modules(drivers.decoders)
@@ -704,7 +704,7 @@ def test_the_printed_defaults_pass_the_check():
 
 
 def test_every_link_can_be_named():
-    known = {*discovery.list_modules(drivers.links, "_link")} - {"loopback"}
+    known = {*discovery.list_modules(drivers.links, "_link")}
     for name in known:
         module = discovery.import_module(drivers.links, name, "_link")
         assert module.DEFAULT_DECODER in ("", *discovery.list_modules(drivers.decoders))

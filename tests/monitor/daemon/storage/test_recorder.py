@@ -15,7 +15,6 @@ import pytest
 
 from drivers.decoders import text
 from drivers.driver import AxisMap
-from drivers.links.loopback_link import LoopbackLink
 from drivers.recordings import load_samples, segment
 from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentWriter
 from drivers.sample import Chunk, SampleBlock, concatenate_blocks, make_block
@@ -24,6 +23,7 @@ from monitor.daemon.pipeline import KernelReadiness
 from monitor.daemon.storage import recorder as room
 from monitor.daemon.storage.recorder import Recorder, origin
 from monitor.settings.loading import Device, Storage
+from tests.support.loopback_link import LoopbackLink
 from tests.support.waiting import PATIENCE_S, wait_for
 
 pytest.importorskip("pyarrow", reason="recording needs the extra arrow")

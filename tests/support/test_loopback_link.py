@@ -3,9 +3,8 @@
 import pytest
 
 from drivers.errors import LinkEnded, LinkLost, LinkUnavailable
-from drivers.links import loopback_link
-from drivers.links.loopback_link import LoopbackLink
 from drivers.sample import Chunk
+from tests.support.loopback_link import LoopbackLink
 
 
 def test_what_was_written_before_opening_waits() -> None:
@@ -47,8 +46,3 @@ def test_absent() -> None:
     link.absent = False
     link.open()
     assert link.read(0.0) is None
-
-
-def test_built_from_settings() -> None:
-    link = loopback_link.build(loopback_link.Settings(carrier="messages"))
-    assert link.carrier == "messages"

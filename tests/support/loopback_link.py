@@ -1,4 +1,4 @@
-"""Loopback link: an in-memory link for tests. A test writes data into it, and a driver reads them from it.
+"""Loopback link: an in-memory link. A test writes data into the link, and a driver reads the data from the link.
 
 It behaves like a real link (bytes, None after a timeout, ``LinkLost``, ``LinkEnded``, ``LinkUnavailable``) without
 hardware. The writer can cause each of these from any thread with ``write``, ``drop``, ``end`` and the flag ``absent``.
@@ -8,19 +8,11 @@ Data written before ``open`` wait in a buffer, like in the kernel.
 import threading
 import time
 from collections import deque
-from typing import Final, Literal
+from typing import Literal
 
 from drivers.errors import LinkEnded, LinkLost, LinkUnavailable
-from drivers.links.base import Carrier, Link, LinkSettings
+from drivers.links.base import Carrier
 from drivers.sample import Chunk
-
-DEFAULT_DECODER: Final = ""
-
-
-class Settings(LinkSettings, frozen=True, kw_only=True):
-    """Keys of the loopback link."""
-
-    carrier: Carrier = "bytes"
 
 
 class LoopbackLink:
@@ -70,7 +62,7 @@ class LoopbackLink:
     def read(self, timeout_s: float) -> list[Chunk] | None:
         """Return all chunks written since the last call, after waiting up to ``timeout_s`` seconds for the first."""
         with self._changed:
-            self._changed.wait_for(self._something, timeout_s)
+            self._changed.wait_for(self._can_return, timeout_s)
             if not self._open:
                 raise LinkLost("loopback: the link is closed")
             if self._dropped:
@@ -90,11 +82,6 @@ class LoopbackLink:
             self._open = False
             self._changed.notify_all()
 
-    def _something(self) -> bool:
+    def _can_return(self) -> bool:
         """Return True if ``read`` has a reason to return."""
         return bool(self._waiting) or self._dropped or self._ended or not self._open
-
-
-def build(settings: Settings) -> Link:
-    """Return a loopback link. Its writer needs this object, so the link is of no use in a configuration file."""
-    return LoopbackLink(settings.carrier)
