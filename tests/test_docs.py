@@ -23,7 +23,7 @@ from monitor.cli import app
 from monitor.common import topics
 from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
-from monitor.publishing.messages import encoding
+from monitor.publishing.messages.results import CoefficientsMessage
 from monitor.publishing.rerun.sinks import server_url
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings import loading
@@ -262,7 +262,7 @@ def test_a_subscriber_as_printed_prints_what_is_published(page: Path, word: str)
     assert PRINTED_BY in program
     rows = make_block(np.arange(2) * 10_000_000, np.tile([0.1, 0.2, 0.3, 0.0, 0.0, 9.81], (2, 1)))
     results = [
-        (topics.COEFFICIENTS, encoding.encode_coefficients("bench-1", 1.76e9, estimate())),
+        (topics.COEFFICIENTS, CoefficientsMessage.of("bench-1", 1.76e9, 0, estimate()).encode()),
         (topics.SAMPLES, encode_samples("bench-1", 2, rows)),
     ]
     zenoh = ZenohPublisher(ZenohTable(listen=(endpoint,)), ["bench-1"])

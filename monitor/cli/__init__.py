@@ -149,7 +149,7 @@ def watch(
 
     from rich.console import Console
 
-    from monitor.publishing.terminal.live_table import watch as show
+    from monitor.publishing.terminal.watch import watch as show
 
     stop = threading.Event()
     terminal_session.on_signals(stop.set)
@@ -190,7 +190,7 @@ def analyze(
 ) -> None:
     """Allan deviation of a recording, with Q, N, B, K, R and their intervals; motion and changes in it."""
     from monitor.commands import analyze as offline
-    from monitor.publishing.messages import encoding
+    from monitor.publishing.messages.analysis import AnalysisMessage, FailedAnalysisMessage
 
     if plot is not None and plot.suffix not in (".png", ".html"):
         raise ConfigError(f"--plot: {plot}: a name ending in .png or .html is needed")
@@ -203,13 +203,13 @@ def analyze(
             results = offline.run_analysis(wanted, tell)
     except offline.TooFewSamples as error:
         if json is not None:
-            output.write("--json", json, encoding.encode_failed_analysis(str(error), error.samples) + b"\n")
+            output.write("--json", json, FailedAnalysisMessage(error.samples, [str(error)]).encode() + b"\n")
         raise
     if json is not None:
-        payload = encoding.encode_analysis(
+        message = AnalysisMessage.of(
             results.analysis, results.total, results.hadamard, results.dynamic, results.without_temperature
         )
-        output.write("--json", json, payload + b"\n")
+        output.write("--json", json, message.encode() + b"\n")
     if plot is not None:
         offline.draw_plots(results, plot, recording.name)
     if json != Path("-"):

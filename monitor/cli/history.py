@@ -96,13 +96,13 @@ def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) 
 
 def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: Path | None, plot: Path | None) -> None:
     """Write the results to the requested files."""
-    from monitor.publishing.messages import history as history_message
+    from monitor.publishing.messages.history import HistoryMessage
     from monitor.publishing.reports import history_file
 
     if json is not None:
         newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
-        payload = history_message.encode_history(past, asked, newest_s, int(past.counts[:, 0].sum()))
-        output.write("--json", json, payload + b"\n")
+        message = HistoryMessage.reply(past, asked, newest_s, int(past.counts[:, 0].sum()))
+        output.write("--json", json, message.encode() + b"\n")
     if out is not None:
         history_file.save(past, out)
     if plot is not None:

@@ -93,7 +93,7 @@ def print_analysis(result: "Analysis") -> None:
     """Print the number of samples, the coefficients and the notes of an analysis."""
     from rich.console import Console
 
-    from monitor.publishing.terminal.live_table import analysis_table
+    from monitor.publishing.terminal.coefficient_tables import analysis_table
 
     console = Console()
     estimate = result.estimate

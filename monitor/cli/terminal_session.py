@@ -56,7 +56,8 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     from monitor.daemon.operations.systemd import SystemdNotifier
     from monitor.daemon.outputs import LogOutput, TableOutput
     from monitor.daemon.service import STATUS_INTERVAL_S, Service
-    from monitor.publishing.terminal.live_table import DeviceStates, LiveTable
+    from monitor.publishing.remote_devices import DeviceStates
+    from monitor.publishing.terminal.live_table import LiveTable
     from monitor.publishing.terminal.queued_writer import QueuedWriter
 
     unit = SystemdNotifier.from_environment(os.environ)
@@ -84,7 +85,7 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
 
             # in a terminal, SIGHUP means that the terminal has been closed
             on_signals(stop, stop if terminal else service.reload)
-            table.board = board
+            table.states = board
             service.run(seconds)
         finally:
             unread = not screen.close()

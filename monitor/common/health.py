@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from monitor.common.units import format_count
+
 MAX_PROBLEMS: Final = 3
 """Largest number of problems in the sentence."""
 
@@ -50,11 +52,11 @@ def format_service_status(healths: Mapping[str, Health], outputs: Mapping[str, s
     '0 devices; all well'
     """
     states = Counter(one.state for one in healths.values())
-    count = f"{len(healths)} device{'' if len(healths) == 1 else 's'}"
     said = [f"{n} {state}" for state, n in states.items()]
     troubles = [f"{name}: {one.text}" for name, one in healths.items() if one.text]
     troubles += [f"{name}: beyond its limit: {', '.join(one.crossed)}" for name, one in healths.items() if one.crossed]
     troubles += [f"{name}: its reader is stuck" for name in stuck]
     troubles += [f"{name}: {state}" for name, state in outputs.items() if state not in ("ok", "off")]
     more = f"; and {len(troubles) - MAX_PROBLEMS} more" if len(troubles) > MAX_PROBLEMS else ""
-    return f"{', '.join([count, *said])}; {'; '.join(troubles[:MAX_PROBLEMS]) or 'all well'}{more}"
+    head = ", ".join([format_count(len(healths), "device"), *said])
+    return f"{head}; {'; '.join(troubles[:MAX_PROBLEMS]) or 'all well'}{more}"

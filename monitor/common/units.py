@@ -1,13 +1,16 @@
-"""Conversion from SI units to the units of the field, for viewer, terminal, plots and events.
+"""Units of inertial navigation, and the formatting of quantities, durations and counts as text.
 
-The functions take a number in SI units (rad, m, s) and return it in the field's unit, or as a short text with the unit.
-No other module converts, and nothing is computed in field units. The factors follow from 1 rad = 180/π °, 1 h = 3600 s
-(√h = 60 √s) and 1 g = 9.80665 m/s² (standard gravity, CGPM 1901).
+The program computes in SI units (rad, m, s). Only text for people has other units, and only this module converts to
+them. The factors follow from 1 rad = 180/π °, 1 h = 3600 s (√h = 60 √s) and 1 g = 9.80665 m/s² (standard gravity, CGPM
+1901).
 """
 
 import math
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from typing import Final, Literal
+
+import numpy as np
 
 from drivers.sample import AXES
 
@@ -18,7 +21,13 @@ KIND_NAMES: Final = {"gyro": "Gyroscopes", "accel": "Accelerometers"}
 DEGREE: Final = 180.0 / math.pi  # degrees per radian
 HOUR: Final = 3600.0  # seconds per hour
 ROOT_HOUR: Final = 60.0  # √s per √h
+MILLI_G: Final = 9.80665e-3
+"""One thousandth of standard gravity [m/s²]."""
 MICRO_G: Final = 1e6 / 9.80665  # µg per m/s²
+NO_VALUE: Final = "—"
+"""Text for a missing value in tables."""
+DURATION_UNITS: Final = ((86_400, "d"), (3600, "h"), (60, "min"), (1, "s"))
+"""Units of durations [s], the largest first."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +139,7 @@ def format_number(value: float, digits: int = 3) -> str:
     ('0.516', '1230', '2.40e-6', '—')
     """
     if not math.isfinite(value):
-        return "—" if math.isnan(value) else ("∞" if value > 0 else "−∞")
+        return NO_VALUE if math.isnan(value) else ("∞" if value > 0 else "−∞")
     if value == 0.0:
         return "0"
     rounded = float(f"{value:.{digits - 1}e}")
@@ -139,3 +148,131 @@ def format_number(value: float, digits: int = 3) -> str:
         mantissa, power = f"{value:.{digits - 1}e}".split("e")
         return f"{mantissa}e{int(power)}"
     return f"{rounded:.{max(0, digits - 1 - exponent)}f}"
+
+
+def format_two_digits(value: float, sign: bool = False) -> str:
+    """Format a number with two significant digits and without an exponent.
+
+    Parameters
+    ----------
+    value : float
+        Number to format.
+    sign : bool, optional
+        True if positive values get a sign.
+    """
+    return np.format_float_positional(float(f"{value:.1e}"), trim="-", sign=sign)
+
+
+def format_rate(axis: str, si: float, sign: bool = False) -> str:
+    """Format an angular rate in °/s, or an acceleration in mg or m/s², with two significant digits.
+
+    Parameters
+    ----------
+    axis : str
+        Axis of ``AXES``.
+    si : float
+        Rate in rad/s or m/s².
+    sign : bool, optional
+        True if positive values get a sign, as for a difference.
+
+    Examples
+    --------
+    >>> format_rate("gz", 2.79), format_rate("ax", -0.0324, sign=True), format_rate("az", 27.0), format_rate("gx", 1e-6)
+    ('160 °/s', '-3.3 mg', '27 m/s²', '0.000057 °/s')
+    """
+    if axis.startswith("g"):
+        return f"{format_two_digits(math.degrees(si), sign)} °/s"
+    if abs(si) < 1000.0 * MILLI_G:
+        return f"{format_two_digits(si / MILLI_G, sign)} mg"
+    return f"{format_two_digits(si, sign)} m/s²"
+
+
+def format_sample_rate(rate_hz: float | None) -> str:
+    """Format a sample rate with two decimals."""
+    return NO_VALUE if rate_hz is None else f"{rate_hz:.2f} Hz"
+
+
+def format_duration(seconds: float) -> str:
+    """Format a duration with the two largest units.
+
+    >>> format_duration(3725.0), format_duration(0.5), format_duration(90.0)
+    ('1 h 02 min', '0.500 s', '1 min 30 s')
+    """
+    if seconds < 60:
+        return f"{format_number(seconds)} s" if seconds < 10 else f"{seconds:.0f} s"
+    whole = round(seconds)
+    days, hours, minutes = whole // 86400, whole // 3600 % 24, whole // 60 % 60
+    if days:
+        return f"{days} d {hours:02d} h"
+    if hours:
+        return f"{hours} h {minutes:02d} min"
+    return f"{minutes} min {whole % 60:02d} s"
+
+
+def format_age(seconds: float) -> str:
+    """Format an age with one unit.
+
+    >>> format_age(0.44), format_age(75.0), format_age(600.0), format_age(90_000.0)
+    ('0.4 s', '75 s', '10 min', '25 h')
+    """
+    if seconds < 10:
+        return f"{max(seconds, 0.0):.1f} s"
+    if seconds < 120:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
+
+
+def format_whole_duration(seconds: int) -> str:
+    """Format a duration with the largest unit of which it is a multiple.
+
+    >>> format_whole_duration(300), format_whole_duration(21_600), format_whole_duration(604_800)
+    ('5 min', '6 h', '7 d')
+    """
+    unit_s, unit = next((unit_s, unit) for unit_s, unit in DURATION_UNITS if seconds % unit_s == 0)
+    return f"{seconds // unit_s} {unit}"
+
+
+def format_milliseconds(seconds: float | None) -> str:
+    """Format a duration in milliseconds."""
+    return NO_VALUE if seconds is None else f"{format_number(seconds * 1e3)} ms"
+
+
+def format_utc(t_s: float) -> str:
+    """Format a Unix time [s] as date and time in UTC.
+
+    >>> format_utc(90.0)
+    '1970-01-01 00:01:30'
+    """
+    try:
+        return datetime.fromtimestamp(t_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
+    except (OverflowError, ValueError, OSError):
+        return f"{t_s:g} s"
+
+
+def format_count(count: int, noun: str) -> str:
+    """Format a count with its noun in singular or plural.
+
+    >>> format_count(1, "frame"), format_count(2000, "frame")
+    ('1 frame', '2,000 frames')
+
+    Parameters
+    ----------
+    count : int
+        Number of objects.
+    noun : str
+        Singular of the noun.
+    """
+    return f"{count:,} {noun}{'' if count == 1 else 's'}"
+
+
+def format_short_count(count: int) -> str:
+    """Format a count with at most five characters.
+
+    >>> format_short_count(9_999), format_short_count(123_456), format_short_count(999_999)
+    ('9999', '123k', '1M')
+    """
+    if count < 10_000:
+        return str(count)
+    count = int(float(f"{count:.2e}"))  # rounded first, so that 999 999 becomes 1M
+    power = min((len(str(count)) - 1) // 3, 4)
+    return f"{count / 1000**power:.3g}{'kMGT'[power - 1]}"

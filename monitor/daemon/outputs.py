@@ -22,8 +22,18 @@ from monitor.estimation.estimate import Estimate
 from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.sqlite_store import StoredEvent
 from monitor.history.writer import HistoryWriter
-from monitor.publishing.messages import encoding
-from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.messages.results import (
+    AllanMessage,
+    CoefficientsMessage,
+    EventMessage,
+    GapMessage,
+    SlowStatistics,
+    StatusMessage,
+    ThermalMessage,
+    TotalMessage,
+    event_start_s,
+)
+from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 
 if TYPE_CHECKING:
@@ -46,16 +56,18 @@ class ZenohOutput(Output):
 
     def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
         """Publish the Allan curve and the coefficients."""
-        self._zenoh.put(topics.ALLAN, device, encoding.encode_allan(device, unix_s, estimate))
-        self._zenoh.put(topics.COEFFICIENTS, device, encoding.encode_coefficients(device, unix_s, estimate))
+        self._zenoh.put(topics.ALLAN, device, AllanMessage.of(device, unix_s, 0, estimate).encode())
+        self._zenoh.put(topics.COEFFICIENTS, device, CoefficientsMessage.of(device, unix_s, 0, estimate).encode())
 
     def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
         """Publish the comparison of the window with the model in force."""
-        self._zenoh.put(topics.GAP, device, encoding.encode_gap(device, unix_s, gap))
+        self._zenoh.put(topics.GAP, device, GapMessage.of(device, unix_s, 0, gap).encode())
 
     def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
         """Publish the total and Hadamard deviations."""
-        self._zenoh.put(topics.TOTAL, device, encoding.encode_total(device, unix_s, received, total, hadamard))
+        self._zenoh.put(
+            topics.TOTAL, device, TotalMessage.of(device, unix_s, received, SlowStatistics(total, hadamard)).encode()
+        )
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Publish a block of compensated samples as one msgpack batch."""
@@ -64,16 +76,16 @@ class ZenohOutput(Output):
 
     def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
         """Publish the mean of an interval and its prediction from temperature."""
-        self._zenoh.put(topics.THERMAL, device, encoding.encode_thermal(device, unix_s, received, look))
+        self._zenoh.put(topics.THERMAL, device, ThermalMessage.of(device, unix_s, received, look).encode())
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Publish an event."""
-        payload = encoding.encode_event(device, unix_s, received, event, encoding.event_start_s(unix_s, event))
+        payload = EventMessage.of(device, unix_s, received, event).encode()
         self._zenoh.put(topics.EVENT, device, payload)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Publish the status."""
-        self._zenoh.put(topics.STATUS, device, encoding.encode_status(device, unix_s, health))
+        self._zenoh.put(topics.STATUS, device, StatusMessage.of(device, unix_s, 0, health).encode())
 
 
 class ViewerOutput(Output):
@@ -141,7 +153,7 @@ class HistoryOutput(Output):
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Store an event."""
-        since_s = None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
+        since_s = event_start_s(unix_s, event)
         # SQLite does not accept NumPy scalars, so they are converted to plain numbers
         what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.values.items()}
         sigma = None if event.sigma is None else float(event.sigma)
@@ -227,20 +239,23 @@ class TableOutput(Output):
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Add an event to the lines below the table."""
         self.board.process_message(
-            topics.EVENT.key(PREFIX, device), encoding.encode_event(device, unix_s, received, event, None)
+            topics.EVENT.key(PREFIX, device), EventMessage.of(device, unix_s, received, event).encode()
         )
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Update the row of a device."""
-        self.board.process_message(topics.STATUS.key(PREFIX, device), encoding.encode_status(device, unix_s, health))
+        self.board.process_message(
+            topics.STATUS.key(PREFIX, device), StatusMessage.of(device, unix_s, 0, health).encode()
+        )
         if device in self._latest:
             at_s, estimate = self._latest.pop(device)
             self.board.process_message(
-                topics.COEFFICIENTS.key(PREFIX, device), encoding.encode_coefficients(device, at_s, estimate)
+                topics.COEFFICIENTS.key(PREFIX, device), CoefficientsMessage.of(device, at_s, 0, estimate).encode()
             )
         if device in self._gaps:
             self.board.process_message(
-                topics.GAP.key(PREFIX, device), encoding.encode_gap(device, *self._gaps.pop(device))
+                topics.GAP.key(PREFIX, device),
+                GapMessage.of(device, self._gaps[device][0], 0, self._gaps.pop(device)[1]).encode(),
             )
         if self._redraw is not None:
             self._redraw()

@@ -38,7 +38,8 @@ from monitor.history.reading import HistoryTable
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.time_ranges import TimeRange
 from monitor.history.writer import HistoryWriter
-from monitor.publishing.messages import encoding, history
+from monitor.publishing.messages.history import HistoryMessage
+from monitor.publishing.messages.results import ResetMessage
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
@@ -257,7 +258,7 @@ class Service:
         with open_history(self.history.path) as reader:
             found = past.read_history(reader, device, asked.span, asked.selects, asked.step_s)
             newest_s = reader.newest_s(device)
-        return history.encode_history(found, asked, newest_s, self._history_output.received.get(device, 0))
+        return HistoryMessage.reply(found, asked, newest_s, self._history_output.received.get(device, 0)).encode()
 
     def _compile_kernels(self) -> None:
         """Compile the kernels in a thread, so that a first start delays neither samples nor status."""
@@ -435,9 +436,8 @@ class Service:
             case "reset":
                 station.reset()
                 received = station.driver.counts.received
-                command.answer(
-                    encoding.encode_reply(station.name, station.now_unix_s(), received, "the window is empty")
-                )
+                message = ResetMessage.of(station.name, station.now_unix_s(), received, "the window is empty")
+                command.answer(message.encode())
                 _log.info("reset", device=station.name)
             case "reconcile":
                 self._reconcile(command, station)

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import AXES, Floats
-from monitor.common.rates import format_rate, plain
+from monitor.common.units import format_rate, format_two_digits
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.line_detection import OUTLIER_SIGMA, Line, line_share
@@ -295,7 +295,7 @@ def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[i
 
 def _left_out_note(tau_s: Floats, axes: Collection[int], why: str) -> str:
     """Format the note on τ left out of the fit. ``tau_s`` [6] is the longest one of each axis."""
-    upto = ", ".join(dict.fromkeys(plain(float(tau_s[i])) for i in axes))
+    upto = ", ".join(dict.fromkeys(format_two_digits(float(tau_s[i])) for i in axes))
     return (
         f"{', '.join(AXES[i] for i in axes)}: the fit leaves out τ up to {upto} s, which no sum of the five terms "
         f"follows: {why}"
@@ -326,7 +326,7 @@ def _misfit_note(tau_s: Floats, fit: Fit, runs: Mapping[int, Run], why: str, at:
     low, high = (f"{f(fit.misfit[i] for i in runs) ** 0.5:.2g}" for f in (min, max))
     times = low if low == high else f"{low} to {high}"
     first, last = min(run[0] for run in runs.values()), max(run[1] for run in runs.values())
-    since, upto = plain(float(tau_s[first])), plain(float(tau_s[last]))
+    since, upto = format_two_digits(float(tau_s[first])), format_two_digits(float(tau_s[last]))
     where = f"τ = {since} s" if first == last else f"τ from {since} to {upto} s"
     axes = ", ".join(AXES[i] for i in sorted(runs))
     return (

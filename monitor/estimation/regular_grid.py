@@ -22,7 +22,7 @@ from drivers.sample import AXES, Floats, Ints, SampleBlock, SenderTiming
 from drivers.timing.arrival_regression import snap_to_standard_rate
 from drivers.timing.duplicate_rows import NS_PER_S
 from drivers.timing.sample_clock import FORWARD_JUMP_S, JUMP_S, SampleClock
-from monitor.common.rates import format_rate, plain
+from monitor.common.units import format_rate, format_two_digits
 from monitor.estimation.detection.repeated_samples import repeated_share
 from monitor.estimation.detection.resolution import QuantizationStep, find_coarse_axes
 from monitor.estimation.late_rows import count_missing_samples
@@ -226,7 +226,7 @@ def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
     notes = []
     for size, those in alike.items():
         axes = ", ".join(AXES[one.axis] for one in those)
-        low, high = (plain(f(one.step / one.noise for one in those)) for f in (min, max))
+        low, high = (format_two_digits(f(one.step / one.noise for one in those)) for f in (min, max))
         times = low if low == high else f"{low} to {high}"
         notes.append(
             f"values come in steps of {size} ({axes}), {times} times the noise from sample to sample: quantization "

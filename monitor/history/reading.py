@@ -15,6 +15,7 @@ import numpy as np
 
 from drivers.errors import NotReady
 from drivers.sample import Floats, Ints
+from monitor.common.units import format_utc
 from monitor.history.bucket import HistoryRow, Singles, merge_rows, select_columns
 from monitor.history.sqlite_store import HistoryReader, StoredEvent
 from monitor.history.time_ranges import TimeRange
@@ -232,6 +233,5 @@ def _bucket(row: HistoryRow, step_s: int) -> tuple[int, int]:
 
 def _format_range(held: tuple[float, float]) -> str:
     """Format the stored time range for a message."""
-    from monitor.history.time_ranges import format_utc
 
     return f"{format_utc(held[0])} to {format_utc(held[1])} UTC"

@@ -162,18 +162,6 @@ def parse_duration_s(text: str) -> float:
     return seconds
 
 
-def format_utc(t_s: float) -> str:
-    """Format a Unix time [s] as date and time in UTC.
-
-    >>> format_utc(90.0)
-    '1970-01-01 00:01:30'
-    """
-    try:
-        return datetime.fromtimestamp(t_s, UTC).strftime("%Y-%m-%d %H:%M:%S")
-    except (OverflowError, ValueError, OSError):
-        return f"{t_s:g} s"
-
-
 def _zenoh_time(text: str, now_s: float) -> float:
     """Return the Unix time of an RFC 3339 time or of ``now(±duration)``."""
     text = text.strip()

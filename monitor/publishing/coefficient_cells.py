@@ -4,13 +4,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
-
 from drivers.sample import AXES
-from monitor.common.units import (
-    format_number,
-    unit_of,
-)
+from monitor.common.units import NO_VALUE, format_number, unit_of
 from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 
 TEMPERATURE_MARK: Final = "†"
@@ -27,22 +22,22 @@ class CoefficientText:
     unit: str
 
 
-def format_coefficient(coefficients: Coefficients, letter: str, axis: str, digits: int = 3) -> CoefficientText:
+def format_coefficient(coefficients: Coefficients, symbol: str, axis: str, digits: int = 3) -> CoefficientText:
     """Format one coefficient in the unit of the field.
 
     Parameters
     ----------
     coefficients
         Coefficients of all axes, SI.
-    letter
-        Coefficient: Q, N, B, K or R.
+    symbol
+        Symbol of the coefficient: Q, N, B, K or R.
     axis
         Name of the axis.
     digits
         Number of significant digits.
     """
-    at = SYMBOLS.index(letter), AXES.index(axis)
-    unit = unit_of(letter, axis)
+    at = SYMBOLS.index(symbol), AXES.index(axis)
+    unit = unit_of(symbol, axis)
     value, lo, hi = (float(a[at]) * unit.factor for a in (coefficients.value, coefficients.lo, coefficients.hi))
     match Status(int(coefficients.status[at])):
         case Status.ESTIMATED:
@@ -52,7 +47,7 @@ def format_coefficient(coefficients: Coefficients, letter: str, axis: str, digit
         case Status.UPPER_BOUND:
             return CoefficientText(f"≤ {format_number(hi, digits)}", "", unit.name)
         case Status.UNESTIMATED:
-            return CoefficientText("—", "", unit.name)
+            return CoefficientText(NO_VALUE, "", unit.name)
 
 
 def mark_temperature_axis(axis: str, axes_of_temperature: Collection[str]) -> str:
@@ -69,8 +64,3 @@ def mark_temperature_axis(axis: str, axes_of_temperature: Collection[str]) -> st
         Axes on which temperature explains most of the slow variance.
     """
     return f"{axis} {TEMPERATURE_MARK}" if axis in axes_of_temperature else axis
-
-
-def measured_axes(avar: np.ndarray[tuple[int, int], np.dtype[np.float64]]) -> tuple[str, ...]:
-    """Return the axes on which ``avar`` (shape [m, 6]) has at least one finite value."""
-    return tuple(axis for i, axis in enumerate(AXES) if bool(np.isfinite(avar[:, i]).any()))

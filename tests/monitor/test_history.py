@@ -13,15 +13,16 @@ import pytest
 from drivers.recordings import save_samples
 from drivers.sample import Event, SampleBlock
 from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.units import format_utc
 from monitor.daemon.device_worker import Output
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history import reading as past
 from monitor.history.reading import HistoryTable
 from monitor.history.sqlite_store import FILE_NAME, StoredEvent, open_history
-from monitor.history.time_ranges import TimeRange, format_utc
+from monitor.history.time_ranges import TimeRange
 from monitor.noise.catalogue import read_model
-from monitor.publishing.messages import history
+from monitor.publishing.messages.history import decode_history
 from monitor.settings import loading
 from tests.support.ports import free_endpoint
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
@@ -144,7 +145,7 @@ def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None
         if reply.ok is None:
             return json.loads(bytes(reply.err.payload))["error"]
         assert (str(reply.ok.key_expr), str(reply.ok.encoding)) == ("imu/bench-1/history", "application/json")
-        return history.decode_history(bytes(reply.ok.payload))
+        return decode_history(bytes(reply.ok.payload))
 
     whole = answer("step=1m")
     minutes = whole.start_s.tolist()

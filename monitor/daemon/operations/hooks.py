@@ -29,7 +29,7 @@ import structlog
 
 from drivers.sample import Event
 from monitor.daemon.device_worker import Output
-from monitor.publishing.messages import encoding
+from monitor.publishing.messages.results import EventMessage
 from monitor.settings.loading import Hook
 
 THREADS: Final = 4
@@ -103,7 +103,7 @@ class Hooks(Output):
         wanted = [one for one in self.hooks if _matches(one, device, event.kind)]
         if not wanted:
             return
-        payload = encoding.encode_event(device, unix_s, received, event, encoding.event_start_s(unix_s, event))
+        payload = EventMessage.of(device, unix_s, received, event).encode()
         named = {"IMU_MONITOR_DEVICE": device, "IMU_MONITOR_KIND": event.kind, "IMU_MONITOR_AXIS": event.axis or ""}
         for hook in wanted:
             if not self._may_run(hook, event.kind, device):

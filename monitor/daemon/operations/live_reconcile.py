@@ -31,7 +31,7 @@ import numpy as np
 
 from drivers.sample import AXES, Floats
 from monitor.estimation.window_snapshot import WindowSnapshot
-from monitor.publishing.messages import encoding
+from monitor.publishing.messages.results import ReconcileMessage
 from monitor.publishing.zenoh.publisher import Command
 
 PROGRAM: Final = (sys.executable, "-P", str(Path(__file__).resolve().parents[3] / "imu_monitor.py"), "reconcile")
@@ -141,7 +141,8 @@ class Reconciler:
             command.refuse(str(error))
             self._finished.put(Finished(job.device, f"reconcile failed: {error}"))
             return
-        command.answer(encoding.encode_reconciled(job.device, job.unix_s, job.samples, result, status, folder))
+        head = ReconcileMessage(device=job.device, t=job.unix_s, samples=job.samples)
+        command.answer(head.encode_report(result, status, folder))
         self._finished.put(Finished(job.device, format_result(result, status)))
 
     def _reconcile(self, job: Job) -> tuple[dict[str, Any], int, str | None]:

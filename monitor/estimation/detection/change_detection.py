@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
-from monitor.common.rates import format_rate
+from monitor.common.units import format_rate
 from monitor.estimation.detection.change_kernel import (
     AFTER,
     BEFORE,

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import AXES, Floats, Ints, SampleBlock, make_block
-from monitor.common.rates import format_rate
+from monitor.common.units import format_rate
 from monitor.estimation.detection.motion_kernel import (
     AXIS,
     BEGAN,

@@ -1,1 +1,1 @@
-"""Encoding and decoding of the messages that are sent over zenoh."""
+"""Messages that are sent over zenoh and written by commands: one ``msgspec.Struct`` for each."""

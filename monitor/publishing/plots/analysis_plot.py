@@ -12,7 +12,7 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KINDS, Kind, axes_of
+from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KINDS, Kind, axes_of, format_duration
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
@@ -21,11 +21,10 @@ from monitor.publishing.coefficient_cells import (
     TEMPERATURE_MEANS,
     format_coefficient,
     mark_temperature_axis,
-    measured_axes,
 )
+from monitor.publishing.messages.results import measured_axes
 from monitor.publishing.plots.allan_figure import COLOURS, GREY, LEGEND_TEXT, OtherDeviation, allan_panel
 from monitor.publishing.plots.dynamic_figure import ChangeMark, dynamic_panels, height_inches
-from monitor.publishing.rerun.panels import format_duration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -96,7 +95,7 @@ def allan_plot(
 
 def kinds_of(estimate: Estimate) -> list[Kind]:
     """Return the kinds of sensor that are measured; both kinds if none is."""
-    present = set(measured_axes(estimate.curve.avar))
+    present = {axis for _, axis in measured_axes(estimate.curve)}
     return [kind for kind in KINDS if set(axes_of(kind)) & present] or list(KINDS)
 
 

@@ -10,12 +10,11 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.common.units import DEVIATION_UNITS
+from monitor.common.units import DEVIATION_UNITS, format_duration
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.sage_husa import USED
 from monitor.publishing.plots.allan_figure import COLOURS, GREY
 from monitor.publishing.plots.analysis_plot import DPI, MISSING
-from monitor.publishing.rerun.panels import format_duration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -10,13 +10,12 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
-from monitor.common.units import DEVIATION_UNITS, sensor_kind
+from monitor.common.units import DEVIATION_UNITS, format_duration, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_model import Prediction, predict
 from monitor.drift.thermal.thermal_study import ThermalFitReport, ThermalPredictionReport
 from monitor.publishing.plots.allan_figure import COLOURS, GREY
 from monitor.publishing.plots.analysis_plot import DPI, MISSING
-from monitor.publishing.rerun.panels import format_duration
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Final
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.common.units import COEFFICIENT_NAMES, KIND_NAMES, Kind, axes_of, format_number, unit_of
+from monitor.common.units import COEFFICIENT_NAMES, KIND_NAMES, Kind, axes_of, format_duration, format_number, unit_of
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.analysis import Analysis
 from monitor.estimation.estimate import Estimate
@@ -29,7 +29,6 @@ from monitor.publishing.coefficient_cells import (
 from monitor.publishing.plots import analysis_plot
 from monitor.publishing.plots.allan_figure import COLOURS, LEGEND_TEXT, OtherDeviation, allan_panel
 from monitor.publishing.plots.dynamic_figure import ChangeMark, dynamic_panels, height_inches
-from monitor.publishing.rerun.panels import format_duration
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

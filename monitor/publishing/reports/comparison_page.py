@@ -15,13 +15,13 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
+from monitor.common.units import format_duration
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots.allan_figure import COLOURS, DARK
 from monitor.publishing.plots.ruler import Ruler
 from monitor.publishing.reports import comparison_sentences as runs_words
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.reports.reconcile_page import MISSING
-from monitor.publishing.rerun.panels import format_duration
 from monitor.reconcile.result import ParameterInterval, ReconciliationStep
 from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect
 

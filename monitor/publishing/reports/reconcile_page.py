@@ -15,13 +15,13 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
+from monitor.common.units import format_duration
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots.allan_figure import COLOURS, DARK, GREY
 from monitor.publishing.plots.reconcile_chart import BAND, PLACE, chart, near, view_at
 from monitor.publishing.plots.ruler import Ruler
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.reports.reconcile_sentences import Parameter
-from monitor.publishing.rerun.panels import format_duration
 from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation, ReconciliationStep, Score
 
 TEMPLATE: Final = "reconcile.html.j2"

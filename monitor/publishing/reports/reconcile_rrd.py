@@ -19,6 +19,7 @@ import rerun.blueprint as rrb
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
+from monitor.common.units import format_duration
 from monitor.publishing.plots import colours
 from monitor.publishing.plots.reconcile_chart import DOTS, Plot, height_of, plotted
 from monitor.publishing.reports import reconcile_sentences as words
@@ -33,7 +34,6 @@ from monitor.publishing.rerun.allan_chart import (
     finite_sections,
     grid,
 )
-from monitor.publishing.rerun.panels import format_duration
 from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation
 
 APPLICATION: Final = "imu-monitor"

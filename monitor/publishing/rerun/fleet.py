@@ -14,10 +14,12 @@ from typing import Final
 from drivers.errors import DecodeError
 from drivers.zenoh.sample_message import decode_samples
 from monitor.common import topics
-from monitor.publishing.messages import decoding, remote_device
+from monitor.publishing.messages.message import decode_message
+from monitor.publishing.messages.results import AllanMessage, EventMessage, StatusMessage
+from monitor.publishing.remote_devices import DeviceStates, split_key
 from monitor.publishing.rerun.panels import fleet_text
 from monitor.publishing.rerun.view import RerunView
-from monitor.publishing.terminal.live_table import DeviceStates, connection_note
+from monitor.publishing.terminal.watch import connection_note
 from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
 
 RECEIVE_TIMEOUT_S: Final = 0.1
@@ -65,9 +67,8 @@ class FleetView:
         self._arriving = arriving
         self._viewer = viewer
         self._detail = frozenset(detail)
-        self._noise: dict[str, remote_device.Noise] = {}  # newest coefficients of devices shown in detail
         self.board = DeviceStates()
-        self.malformed = 0  # number of messages of devices in detail that could not be decoded
+        self.malformed = 0  # number of samples and curves that could not be decoded
 
     def run(self, stop: threading.Event, tell: Callable[[str], None], seconds: float | None = None) -> None:
         """Process messages until ``stop`` is set.
@@ -102,19 +103,20 @@ class FleetView:
         if message.payload is None:
             self.board.set_token(message.key, message.there)
             return
-        self.board.process_message(message.key, message.payload)
-        found = remote_device.split_key(message.key)
-        if found is None:
+        decoded = self.board.process_message(message.key, message.payload)
+        device, topic = split_key(message.key) or ("", topics.ALIVE)
+        if isinstance(decoded, EventMessage) and decoded.t is not None:
+            self._viewer.event(device, decoded.t, decoded.to_event())
+        elif device not in self._detail:
             return
-        device, topic = found
-        try:
-            if topic is topics.EVENT:
-                happened = remote_device.event(message.payload)
-                self._viewer.event(device, happened.t, decoding.to_event(happened))
-            elif device in self._detail:
+        elif isinstance(decoded, StatusMessage):
+            if decoded.t is not None:
+                self._viewer.health(device, decoded.t, decoded.to_health())
+        elif decoded is None:
+            try:
                 self._show(device, topic, message.payload)
-        except (ValueError, DecodeError):
-            self.malformed += topic not in (topics.STATUS, topics.COEFFICIENTS, topics.GAP)
+            except (ValueError, DecodeError):
+                self.malformed += 1
 
     def draw(self, wall_s: float, now_s: float) -> None:
         """Draw the table of all devices.
@@ -130,21 +132,15 @@ class FleetView:
         self._viewer.overview(wall_s, fleet_text(devices, now_s, MAX_ROWS, connection_note(self.board, self._arriving)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
-        """Pass a message of a device shown in detail to the viewer."""
+        """Pass samples or a curve of a device shown in detail to the viewer."""
         if topic is topics.SAMPLES:
             rows = decode_samples(payload).block
             self._viewer.samples(device, rows.t_ns / 1e9, rows.values, rows.temperature_c)
-        elif topic is topics.COEFFICIENTS:
-            self._noise[device] = remote_device.noise(
-                remote_device.read(remote_device.CoefficientsMessage, topic, payload)
-            )
-        elif topic is topics.ALLAN and device in self._noise:
-            allan = remote_device.read(remote_device.AllanMessage, topic, payload)
-            self._viewer.estimate(device, allan.t, decoding.to_estimate(allan, self._noise[device]))
-        elif topic is topics.STATUS:
-            status = remote_device.status(payload)
-            if status.t is not None:
-                self._viewer.health(device, status.t, decoding.to_health(status))
+        elif topic is topics.ALLAN:
+            message, known = decode_message(AllanMessage, payload), self.board.coefficients(device)
+            if known is not None:
+                estimate = message.to_estimate(known.coefficients, known.k_or_r)
+                self._viewer.estimate(device, estimate.t_ns / 1e9, estimate)
 
     def _trouble(self) -> str:
         """Return the problems of the viewer and of the subscriber."""

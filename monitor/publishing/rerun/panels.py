@@ -11,14 +11,26 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from monitor.common.health import Health
-from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, KIND_NAMES, KINDS, Kind, axes_of, format_number
+from monitor.common.units import (
+    COEFFICIENT_UNITS,
+    DEVIATION_UNITS,
+    KIND_NAMES,
+    KINDS,
+    Kind,
+    axes_of,
+    format_duration,
+    format_milliseconds,
+    format_number,
+    format_sample_rate,
+)
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS
-from monitor.publishing.coefficient_cells import format_coefficient, measured_axes
-from monitor.publishing.messages import remote_device
-from monitor.publishing.messages.remote_device import RemoteDevice
+from monitor.publishing.coefficient_cells import format_coefficient
+from monitor.publishing.messages.message import remove_control_characters
+from monitor.publishing.messages.results import measured_axes
+from monitor.publishing.remote_devices import RemoteDevice
 
 FLEET_AXES: Final = ("gx", "gy", "gz")
 """Axes whose white noise is shown in the table of all devices [°/√h]."""
@@ -56,8 +68,8 @@ def health_text(device: str, health: Health, about: str = "") -> str:
     outputs = "".join(f", {name} **{state}**" for name, state in health.outputs.items())
     lines.append(f"up **{format_duration(health.uptime_s)}**{outputs}")
     lines.append(
-        f"latency **{_milliseconds(health.latency_p50_s)}** median, "
-        f"**{_milliseconds(health.latency_p99_s)}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"
+        f"latency **{format_milliseconds(health.latency_p50_s)}** median, "
+        f"**{format_milliseconds(health.latency_p99_s)}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"
     )
     return "\n\n".join(line for line in lines if line)
 
@@ -65,7 +77,8 @@ def health_text(device: str, health: Health, about: str = "") -> str:
 def overview_text(healths: Mapping[str, Health]) -> str:
     """Return a table of several devices, one line each."""
     rows = [
-        f"| **{name}** | {h.state} | {_rate(h)} | {h.received:,} | {h.lost:,} | {h.bad:,} | {h.text or 'all well'} |"
+        f"| **{name}** | {h.state} | {format_sample_rate(h.rate_hz)} | {h.received:,} | {h.lost:,} | {h.bad:,} "
+        f"| {h.text or 'all well'} |"
         for name, h in healths.items()
     ]
     head = "| device | state | rate | received | lost | bad | |\n|:--|:--|--:|--:|--:|--:|:--|"
@@ -90,7 +103,7 @@ def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: s
     states = ", ".join(f"**{count:,}** {_escape_cell(state)}" for state, count in counts.most_common())
     head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
     head[0] += f"; N in {COEFFICIENT_UNITS['gyro']['N'].name}" if devices else ""
-    head += [f"**{remote_device.strip_control_characters(note)}**"] if note else []
+    head += [f"**{remove_control_characters(note)}**"] if note else []
     table = [_fleet_row(one, now_s) for one in devices[:rows]]
     if table:
         columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in FLEET_AXES), ""]
@@ -105,12 +118,12 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
     name = _escape_cell(one.key)
     word = f"**{state.upper()}**" if one.rank(now_s) == 0 else _escape_cell(state)
     noise = [
-        "" if one.noise is None else format_coefficient(one.noise.coefficients, "N", axis).value.replace("| ", "")
+        "" if one.coefficients is None else format_coefficient(one.coefficients.coefficients, "N", axis).value
         for axis in FLEET_AXES
     ]
     if status is None:
         return f"| **{name}** | {word} | | | | | {' | '.join(noise)} | nothing known yet |"
-    rate = "—" if status.rate is None else f"{status.rate:.2f} Hz"
+    rate = format_sample_rate(status.rate)
     trouble = _escape_cell(one.problems()) or (
         f"no data for {now_s - one.last_message_s:.1f} s" if state in ("gone", "silent") else ""
     )
@@ -120,12 +133,12 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
 
 def _escape_cell(text: str) -> str:
     """Escape text of another process for a table cell, so that it cannot end the cell or form a link or an image."""
-    return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remote_device.strip_control_characters(text))
+    return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remove_control_characters(text))
 
 
 def noise_text(estimate: Estimate) -> str:
     """Return the tables of Q, N, B, K and R, one for each kind of sensor of the device."""
-    present = measured_axes(estimate.curve.avar)
+    present = [axis for _, axis in measured_axes(estimate.curve)]
     tables = [_noise_table(estimate, kind) for kind in KINDS if set(axes_of(kind)) & set(present)]
     if not tables:
         return "Too few samples yet."
@@ -161,33 +174,6 @@ def drift_text(look: DriftUpdate) -> str:
 def _coefficients_in_model(model: ArmaModel) -> tuple[bool, bool, bool]:
     """Return which of φ₁, φ₂ and θ₁ are part of the model."""
     return model.order[0] > 0, model.order[0] > 1, model.order[1] > 0
-
-
-def format_duration(seconds: float) -> str:
-    """Format a duration given in seconds with two units.
-
-    >>> format_duration(3725.0), format_duration(0.5), format_duration(90.0)
-    ('1 h 02 min', '0.500 s', '1 min 30 s')
-    """
-    if seconds < 60:
-        return f"{format_number(seconds)} s" if seconds < 10 else f"{seconds:.0f} s"
-    whole = round(seconds)
-    days, hours, minutes = whole // 86400, whole // 3600 % 24, whole // 60 % 60
-    if days:
-        return f"{days} d {hours:02d} h"
-    if hours:
-        return f"{hours} h {minutes:02d} min"
-    return f"{minutes} min {whole % 60:02d} s"
-
-
-def _rate(health: Health) -> str:
-    """Format the sample rate."""
-    return "—" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
-
-
-def _milliseconds(seconds: float | None) -> str:
-    """Format a duration in milliseconds."""
-    return "—" if seconds is None else f"{format_number(seconds * 1e3)} ms"
 
 
 def _noise_table(estimate: Estimate, kind: Kind) -> str:

@@ -17,7 +17,16 @@ import rerun as rr
 
 from drivers.sample import AXES, Event, Floats
 from monitor.common.health import Health
-from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, KINDS, SAMPLE_UNITS, Kind, axes_of, sensor_kind
+from monitor.common.units import (
+    COEFFICIENT_UNITS,
+    DEVIATION_UNITS,
+    KINDS,
+    SAMPLE_UNITS,
+    Kind,
+    axes_of,
+    format_utc,
+    sensor_kind,
+)
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalUpdate
 from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate
@@ -25,7 +34,6 @@ from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.history.reading import HistoryTable
-from monitor.history.time_ranges import format_utc
 from monitor.publishing.plots import colours
 from monitor.publishing.rerun import dynamic_surface, past_points
 from monitor.publishing.rerun.allan_chart import (

@@ -29,7 +29,7 @@ from monitor.drift.thermal.live_thermal import ThermalUpdate
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate, concatenate_histories
 from monitor.history.reading import HistoryTable
-from monitor.publishing.rerun.bounded_queue import BoundedQueue
+from monitor.publishing.bounded_queue import BoundedQueue
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerClosed, ViewerError, ViewerSettings
 
 if TYPE_CHECKING:

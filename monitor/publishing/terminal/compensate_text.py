@@ -8,11 +8,10 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
-from monitor.common.units import DEVIATION_UNITS, format_number
+from monitor.common.units import DEVIATION_UNITS, format_duration, format_number
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.compensation_score import SPANS_S, RestScore
-from monitor.publishing.rerun.panels import format_duration
 
 SCHEMA: Final = "imu-monitor/compensate/1"
 UNIT: Final = DEVIATION_UNITS["gyro"]

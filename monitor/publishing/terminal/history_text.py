@@ -14,10 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.sample import Floats
-from monitor.common.units import KIND_NAMES, KINDS, Kind, axes_of, format_number, unit_of
+from monitor.common.units import KIND_NAMES, KINDS, Kind, axes_of, format_number, format_utc, unit_of
 from monitor.history.bucket import COUNTS, STATES
 from monitor.history.reading import ColumnStatistics, HistoryTable
-from monitor.history.time_ranges import format_utc
 
 LETTERS: Final = ("N", "B", "K")
 """Coefficients shown for all axes; for a single axis all five are shown."""

@@ -20,7 +20,8 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Final, TextIO
 
-from monitor.publishing.rerun.bounded_queue import BoundedQueue
+from monitor.common.units import format_count
+from monitor.publishing.bounded_queue import BoundedQueue
 
 MAX_QUEUED_CHARACTERS: Final = 256 * 1024
 """Length of the queued text at most; some 2000 log lines."""
@@ -99,7 +100,7 @@ class QueuedWriter:
         blocked_s = self._blocked_s()
         frames = self._lost_frames + self._frames_in(blocked_s)
         counts = ((frames, "frame"), (self._dropped_lines(), "log line"))
-        dropped = " and ".join(_count(count, name) for count, name in counts if count)
+        dropped = " and ".join(format_count(count, name) for count, name in counts if count)
         if blocked_s:
             wrong = f"blocked for {blocked_s:.0f} s: nobody reads {self._place}"
         elif (error := self.error) is not None:
@@ -220,7 +221,9 @@ class QueuedWriter:
         if count and self._tell is not None:
             self._told_lines = dropped
             were = "was" if count == 1 else "were"
-            self._tell(f"{_count(count, 'log line')} {were} dropped because {self._reason or 'the queue was full'}")
+            self._tell(
+                f"{format_count(count, 'log line')} {were} dropped because {self._reason or 'the queue was full'}"
+            )
 
     # --- counting
 
@@ -300,11 +303,6 @@ def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
     poll = select.poll()
     poll.register(descriptor, select.POLLOUT)
     return bool(poll.poll(1000.0 * timeout_s))
-
-
-def _count(count: int, name: str) -> str:
-    """Format a count with its noun in singular or plural."""
-    return f"{count:,} {name}{'' if count == 1 else 's'}"
 
 
 def _reason(error: Exception) -> str:

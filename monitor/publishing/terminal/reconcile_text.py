@@ -14,9 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from drivers.sample import AXES
+from monitor.common.units import format_duration
 from monitor.publishing.reports import comparison_sentences as runs_words
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.publishing.rerun.panels import format_duration
 from monitor.reconcile.result import AxisResult, Reconciliation, ReconciliationStep
 from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect
 

@@ -9,8 +9,7 @@ from rich.console import Console
 from rich.padding import Padding
 from rich.table import Table
 
-from monitor.common.rates import format_rate
-from monitor.common.units import DEVIATION_UNITS, sensor_kind
+from monitor.common.units import DEVIATION_UNITS, format_duration, format_rate, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_share import SLOW_LETTERS, TemperatureShare
 from monitor.drift.thermal.thermal_fit import ThermalFit
@@ -18,7 +17,6 @@ from monitor.drift.thermal.thermal_model import Prediction
 from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_study import ModelComparison, ThermalFitReport, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
-from monitor.publishing.rerun.panels import format_duration
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"

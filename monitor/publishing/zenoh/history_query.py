@@ -14,7 +14,8 @@ from drivers.zenoh.connection_errors import explain_refusals
 from drivers.zenoh.session import format_error
 from monitor.common import topics
 from monitor.history.reading import HistoryTable
-from monitor.publishing.messages import history
+from monitor.publishing.messages.history import decode_history
+from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.zenoh.subscriber import client_configurations
 
 PATIENCE_S: Final = 20.0
@@ -66,7 +67,7 @@ def query_histories(
     for reply in replies:
         if reply.ok is not None:
             try:
-                found.append(history.decode_history(bytes(reply.ok.payload)))
+                found.append(decode_history(bytes(reply.ok.payload)))
             except ValueError as error:
                 wrong.append(LinkUnavailable(f"{reply.ok.key_expr}: not an answer of a history: {error}"))
     if not found:
@@ -78,7 +79,7 @@ def _error_of_reply(error: Any) -> Exception:
     """Convert an error reply of a daemon into an exception."""
     try:
         said = json.loads(bytes(error.payload))
-        text, status = history.clean(str(said["error"])[:500]), said.get("exit")
+        text, status = remove_control_characters(str(said["error"])[:500]), said.get("exit")
     except (ValueError, KeyError, TypeError, AttributeError):
         return LinkUnavailable("the daemon gave no answer, and no reason that can be read")
     return ERRORS.get(status, LinkUnavailable)(text)

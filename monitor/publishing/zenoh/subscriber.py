@@ -26,7 +26,7 @@ from drivers.errors import ConfigError
 from drivers.zenoh.connection_errors import explain_refusal
 from drivers.zenoh.session import DEFAULT_CONFIGURATION, configuration, endpoints, format_error, is_unconnected
 from monitor.common import topics
-from monitor.publishing.rerun.bounded_queue import BoundedQueue
+from monitor.publishing.bounded_queue import BoundedQueue
 from monitor.settings import file_permissions
 
 if TYPE_CHECKING:

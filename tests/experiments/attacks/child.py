@@ -75,12 +75,12 @@ def replace_endless_commands() -> None:
     """Let services, ``reconcile`` and long simulations end where their arguments have been accepted."""
     from monitor.cli import terminal_session
     from monitor.commands import reconcile, simulate
-    from monitor.publishing.terminal import live_table
+    from monitor.publishing.terminal import watch
 
     places: list[tuple[Any, str]] = [
         (terminal_session, "serve"),
         (terminal_session, "view"),
-        (live_table, "watch"),
+        (watch, "watch"),
         (reconcile, "make"),
     ]
     for place, name in places:

@@ -27,7 +27,7 @@ import psutil
 import zenoh
 
 from drivers.zenoh.session import configuration
-from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from tests.support.ports import free_port
 

@@ -26,7 +26,7 @@ from monitor.history.query import PARTS, HistoryQuery
 from monitor.history.reading import HistoryTable
 from monitor.history.sqlite_store import HistoryStore, StoredEvent, open_history
 from monitor.history.time_ranges import TimeRange
-from monitor.publishing.messages import history
+from monitor.publishing.messages.history import HistoryMessage
 from tests.experiments.benchmarks.machine import Load
 from tests.monitor.history.kills import kill
 from tests.monitor.publishing.made import estimate
@@ -113,8 +113,8 @@ def queries(path: Path) -> None:
         span = TimeRange(held[1] - seconds, held[1])
         read_s = _timed(lambda span=span, asked=asked: _read(path, span, asked))  # type: ignore[misc]
         found = _read(path, span, asked)
-        said_s = _timed(lambda found=found, asked=asked: history.encode_history(found, asked, 0.0, 0))  # type: ignore[misc]
-        size = len(history.encode_history(found, asked, 0.0, 0))
+        said_s = _timed(lambda found=found, asked=asked: HistoryMessage.reply(found, asked, 0.0, 0).encode())  # type: ignore[misc]
+        size = len(HistoryMessage.reply(found, asked, 0.0, 0).encode())
         print(
             f"{name}: {len(found)} buckets of {found.step_s} s; {read_s * 1e3:.0f} ms to read, "
             f"{said_s * 1e3:.0f} ms to write as {size / 1e3:.0f} kB"

@@ -10,10 +10,10 @@ from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import save_samples
 from monitor.commands import analyze, thermal
 from monitor.commands.analyze import Request, TooFewSamples, run_analysis
-from monitor.common.rates import MILLI_G
+from monitor.common.units import MILLI_G
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.publishing import exporters
-from monitor.publishing.messages import encoding
+from monitor.publishing.messages.analysis import AnalysisMessage
 from monitor.publishing.terminal.thermal_text import notes_on_hysteresis
 from tests.monitor.drift.cycles import cycle, loop, opening
 
@@ -70,7 +70,7 @@ def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
     results = run_analysis(Request(tmp_path / "warm.npz"))
     (note,) = (one for one in results.analysis.notes if "follows its temperature" in one)
     assert note.startswith("gz follows its temperature")
-    written = json.loads(encoding.encode_analysis(results.analysis, warmth=results.without_temperature))
+    written = json.loads(AnalysisMessage.of(results.analysis, temperature=results.without_temperature).encode())
     gz = written["axes"]["gz"]["without_temperature"]
     assert set(gz) == {"model", "coefficients", "share"}
     assert written["axes"]["gz"]["temperature"]["share"] > 0.9
@@ -105,7 +105,7 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
     assert named == ["gy", "gz", "az"]
     if shape == "ramp":  # the case in which nothing was said of gy
         assert results.analysis.estimate.coefficients.status[SYMBOLS.index("K"), 1] != Status.ESTIMATED
-    written = encoding.encode_analysis(results.analysis, warmth=results.without_temperature)
+    written = AnalysisMessage.of(results.analysis, temperature=results.without_temperature).encode()
     marks = {axis: one.get("temperature") for axis, one in json.loads(written)["axes"].items()}
     assert [axis for axis, one in marks.items() if one] == ["gy", "gz", "az"]
     assert set(marks["gy"]) == {"share", "p_value", "form", "one_way", "interval"}

@@ -22,7 +22,8 @@ from monitor.daemon.device_worker import Output
 from monitor.daemon.outputs import TableOutput
 from monitor.daemon.service import Service
 from monitor.noise.catalogue import read_model
-from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.remote_devices import DeviceStates
+from monitor.publishing.terminal import live_table
 from monitor.settings import loading
 from tests.monitor.daemon.operations.test_systemd import Listening
 from tests.monitor.publishing import made
@@ -267,7 +268,7 @@ def test_a_device_that_is_gone_has_no_row() -> None:
         table.event(name, 0.0, 1, Event("moved", 0, f"{name} was moved"))
     table.device_removed("first")
     with (console := Console(width=200)).capture() as captured:
-        console.print(board.table(0.0))
+        console.print(live_table.device_table(board, 0.0))
     assert "second was moved" in captured.get()
     assert "first" not in captured.get()
 

@@ -24,7 +24,8 @@ from monitor.estimation.fit.coefficients import Status
 from monitor.history import reading as past
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.time_ranges import TimeRange
-from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.remote_devices import DeviceStates
+from monitor.publishing.terminal import live_table
 from monitor.settings import loading
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
@@ -72,7 +73,7 @@ def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
             before = rounds.healths
             wait_for(lambda: rounds.healths >= before + 2, "two more rounds of the status")
             with (console := Console(width=200)).capture() as captured:
-                console.print(board.table(time.monotonic()))
+                console.print(live_table.device_table(board, time.monotonic()))
         finally:
             service.stop()
             thread.join(PATIENCE_S)

@@ -5,7 +5,8 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError
-from monitor.history.time_ranges import UNITS_S, TimeRange, format_utc, parse_duration_s, parse_time, parse_zenoh_range
+from monitor.common.units import format_utc
+from monitor.history.time_ranges import UNITS_S, TimeRange, parse_duration_s, parse_time, parse_zenoh_range
 
 NOW = 1_763_700_000.0
 TIMES = st.datetimes(datetime(1971, 1, 1), datetime(2200, 1, 1), timezones=st.just(UTC))

@@ -21,7 +21,7 @@ from drivers.links import zenoh_link
 from drivers.zenoh.session import configuration
 from monitor.common import topics
 from monitor.common.config_files import CONFIG_FOLDER
-from monitor.publishing.messages import encoding
+from monitor.publishing.messages.results import StatusMessage
 from monitor.publishing.zenoh.history_query import query_histories
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
@@ -109,7 +109,7 @@ def daemon(file: Path) -> Iterator[ZenohPublisher]:
 
     def work() -> None:
         while not ending.wait(0.1):
-            out.put(topics.STATUS, "nose", encoding.encode_status("nose", time.time(), made.health()))
+            out.put(topics.STATUS, "nose", StatusMessage.of("nose", time.time(), 0, made.health()).encode())
             while not out.commands.empty():
                 out.commands.get_nowait().answer(b'"done"')
 

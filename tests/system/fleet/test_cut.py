@@ -20,7 +20,7 @@ mode = "none"
 """
 WATCH = """
 import contextlib, sys, time
-from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 
 board = DeviceStates()

@@ -16,7 +16,7 @@ from monitor.cli import options
 from monitor.commands import thermal
 from monitor.common import topics
 from monitor.publishing.exporters import FORMATS, export, from_analysis
-from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
 from monitor.simulator.scheduled_effects import parse_effects

@@ -6,34 +6,36 @@ import numpy as np
 import pytest
 
 from drivers.sample import AXES, Event
-from monitor.common import topics
-from monitor.publishing.messages import decoding, encoding, remote_device
+from monitor.estimation.estimate import Estimate
+from monitor.publishing.messages.message import decode_message
+from monitor.publishing.messages.results import (
+    AllanMessage,
+    CoefficientsMessage,
+    EventMessage,
+    StatusMessage,
+    fitted_variance,
+)
 from tests.monitor.publishing import made
 
 
-def through_messages(estimate: object, **changed: object) -> object:
-    allan = json.loads(encoding.encode_allan("a", 1.76e9, estimate)) | changed  # type: ignore[arg-type]
-    noise = remote_device.noise(
-        remote_device.read(
-            remote_device.CoefficientsMessage, topics.COEFFICIENTS, encoding.encode_coefficients("a", 1.76e9, estimate)
-        )  # type: ignore[arg-type]
-    )
-    return decoding.to_estimate(
-        remote_device.read(remote_device.AllanMessage, topics.ALLAN, json.dumps(allan).encode()), noise
-    )
+def through_messages(estimate: Estimate, **changed: object) -> Estimate:
+    allan = json.loads(AllanMessage.of("a", 1.76e9, 0, estimate).encode()) | changed
+    payload = CoefficientsMessage.of("a", 1.76e9, 0, estimate).encode()
+    coefficients = decode_message(CoefficientsMessage, payload).to_coefficients()
+    return decode_message(AllanMessage, json.dumps(allan).encode()).to_estimate(coefficients, frozenset())
 
 
 def test_an_estimate() -> None:
     sent = made.estimate()
     got = through_messages(sent)
     for name in ("tau_s", "factors", "avar", "lo", "hi", "n"):
-        assert getattr(got.curve, name) == pytest.approx(getattr(sent.curve, name), rel=1e-9, nan_ok=True), name  # type: ignore[attr-defined]
+        assert getattr(got.curve, name) == pytest.approx(getattr(sent.curve, name), rel=1e-9, nan_ok=True), name
     for name in ("value", "lo", "hi", "status"):
-        assert getattr(got.coefficients, name) == pytest.approx(  # type: ignore[attr-defined]
+        assert getattr(got.coefficients, name) == pytest.approx(
             getattr(sent.coefficients, name), rel=1e-9, nan_ok=True
         ), name
-    assert (got.rate_hz, got.window_s, got.samples) == (sent.rate_hz, sent.window_s, sent.samples)  # type: ignore[attr-defined]
-    assert got.fitted == pytest.approx(sent.fitted, rel=0.02)  # type: ignore[attr-defined]
+    assert (got.rate_hz, got.window_s, got.samples) == (sent.rate_hz, sent.window_s, sent.samples)
+    assert got.fitted == pytest.approx(sent.fitted, rel=0.02)
 
 
 def test_the_fitted_curve_is_that_of_the_standard() -> None:
@@ -42,7 +44,7 @@ def test_the_fitted_curve_is_that_of_the_standard() -> None:
     coefficients.value[:] = np.nan
     coefficients.value[1, 0] = 3.0
     coefficients.value[2, 1] = 2.0
-    fitted = decoding.fitted_variance(np.array([1.0, 9.0]), coefficients)
+    fitted = fitted_variance(np.array([1.0, 9.0]), 1000.0, coefficients)
     assert fitted[:, 0] == pytest.approx([9.0, 1.0])
     assert fitted[:, 1] == pytest.approx([1.7651, 1.7651], rel=1e-4)
     assert np.isnan(fitted[:, 2:]).all()
@@ -59,10 +61,10 @@ def test_what_is_no_curve_is_refused(changed: dict[str, object]) -> None:
 
 def test_health_and_events() -> None:
     sent = made.health(text="viewer is slow")
-    got = decoding.to_health(remote_device.status(encoding.encode_status("a", 1.0, sent)))
+    got = StatusMessage.decode(StatusMessage.of("a", 1.0, 0, sent).encode()).to_health()
     assert got.text == "viewer is slow"
     assert (got.received, got.uptime_s, got.memory_bytes) == (sent.received, sent.uptime_s, sent.memory_bytes)
     happened = Event("noise_changed", 10**18, "gz rose", "gz", {"N": {"before": 1.0, "after": 2.0}})
-    read = decoding.to_event(remote_device.event(encoding.encode_event("a", 1e9, 5, happened, None)))
+    read = EventMessage.decode(EventMessage.of("a", 1e9, 5, happened).encode()).to_event()
     assert (read.kind, read.axis, read.text, read.values) == ("noise_changed", "gz", "gz rose", happened.values)
     assert read.axis in AXES

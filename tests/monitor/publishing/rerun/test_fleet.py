@@ -10,11 +10,11 @@ import pytest
 from drivers.sample import Event, make_block
 from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
-from monitor.publishing.messages import encoding
+from monitor.publishing.messages.results import AllanMessage, CoefficientsMessage, EventMessage, StatusMessage
+from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.rerun.fleet import FleetView, detail_key
 from monitor.publishing.rerun.panels import fleet_text
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
-from monitor.publishing.terminal.live_table import DeviceStates
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
 from monitor.settings.loading import ZenohTable
@@ -65,18 +65,18 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
         def publish() -> None:
             for device in ("nose", "tail"):
                 out.set_alive(device, True)
-                out.put(topics.STATUS, device, encoding.encode_status(device, time.time(), made.health()))
-                out.put(topics.COEFFICIENTS, device, encoding.encode_coefficients(device, 1.76e9, made.estimate()))
-                out.put(topics.ALLAN, device, encoding.encode_allan(device, 1.76e9, made.estimate()))
+                out.put(topics.STATUS, device, StatusMessage.of(device, time.time(), 0, made.health()).encode())
+                out.put(
+                    topics.COEFFICIENTS, device, CoefficientsMessage.of(device, 1.76e9, 0, made.estimate()).encode()
+                )
+                out.put(topics.ALLAN, device, AllanMessage.of(device, 1.76e9, 0, made.estimate()).encode())
                 out.put(topics.SAMPLES, device, encode_samples(device, 10, rows))
             stop.wait(0.2)
 
         topics_shown = ("samples", "coefficients", "allan", "status")
         wait_for(lambda: publish() or taken >= {f"imu/nose/{topic}" for topic in topics_shown} | {"imu/tail/status"})
         publish()  # an Allan curve that comes before any coefficients is not drawn
-        out.put(
-            topics.EVENT, "tail", encoding.encode_event("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz"), None)
-        )
+        out.put(topics.EVENT, "tail", EventMessage.of("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz")).encode())
         wait_for(lambda: "imu/tail/event" in taken and len(fleet.board.devices(time.monotonic())) == 2)
         tables = len(drawn)
         wait_for(lambda: len(drawn) >= tables + 2, "two more tables")
@@ -97,12 +97,12 @@ def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.
     drawn: list[float] = []
     monkeypatch.setattr(viewer, "health", lambda _device, wall_s, _health: drawn.append(wall_s))
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
-    fleet.take(Message("imu/a/status", encoding.encode_status("a", None, made.health(state="waiting"))))
+    fleet.take(Message("imu/a/status", StatusMessage.of("a", None, 0, made.health(state="waiting")).encode()))
     (known,) = fleet.board.devices(time.monotonic())
     assert known.status is not None
     assert known.status.state == "waiting"
     assert drawn == []
-    fleet.take(Message("imu/a/status", encoding.encode_status("a", 5.0, made.health())))
+    fleet.take(Message("imu/a/status", StatusMessage.of("a", 5.0, 0, made.health()).encode()))
     assert drawn == [5.0]
     assert fleet.malformed == fleet.board.malformed == 0
 
@@ -110,7 +110,7 @@ def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.
 def test_hostile_messages_change_nothing_and_are_counted() -> None:
     viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
-    fleet.take(Message("imu/a/coefficients", encoding.encode_coefficients("a", 1.0, made.estimate())))
+    fleet.take(Message("imu/a/coefficients", CoefficientsMessage.of("a", 1.0, 0, made.estimate()).encode()))
     for key, payload in {
         "imu/a/samples": b"\x81" * 10_000,
         "imu/a/allan": b'{"schema":"imu-monitor/allan/1","tau":[1]}',
@@ -118,7 +118,7 @@ def test_hostile_messages_change_nothing_and_are_counted() -> None:
         "other": b"",
     }.items():
         fleet.take(Message(key, payload))
-    assert fleet.malformed == 3
+    assert (fleet.malformed, fleet.board.malformed) == (2, 1)
     assert [one.key for one in fleet.board.devices(time.monotonic())] == ["imu/a"]
 
 
@@ -128,8 +128,10 @@ def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell
         "well": {},
         "bad": {"state": "lost", "text": "gone | <img src=x> [a](http://b)\n\n# head"},
     }.items():
-        board.process_message(f"imu/{device}/status", encoding.encode_status(device, 1.0, made.health(**changed)))
-        board.process_message(f"imu/{device}/coefficients", encoding.encode_coefficients(device, 1.0, made.estimate()))
+        board.process_message(f"imu/{device}/status", StatusMessage.of(device, 1.0, 0, made.health(**changed)).encode())
+        board.process_message(
+            f"imu/{device}/coefficients", CoefficientsMessage.of(device, 1.0, 0, made.estimate()).encode()
+        )
     text = fleet_text(board.devices(10.0), 10.0, 40, "1 of 2 there")
     lines = text.splitlines()
     assert lines[0] == "**2** devices: **1** lost, **1** running; N in °/√h"

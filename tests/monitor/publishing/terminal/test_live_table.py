@@ -13,9 +13,12 @@ from rich.console import Console
 from drivers.errors import ConfigError
 from drivers.sample import Event
 from monitor.common import topics
-from monitor.publishing.messages import encoding
+from monitor.publishing import remote_devices
+from monitor.publishing.messages.results import CoefficientsMessage, EventMessage, GapMessage, StatusMessage
+from monitor.publishing.remote_devices import MAX_EVENTS, DeviceStates
 from monitor.publishing.terminal import live_table
-from monitor.publishing.terminal.live_table import DeviceStates
+from monitor.publishing.terminal.coefficient_tables import analysis_table
+from monitor.publishing.terminal.watch import watch
 from tests.monitor.publishing import made
 
 NOW_S = 100.0
@@ -41,19 +44,19 @@ def board(clock: Clock) -> DeviceStates:
 
 def status(board: DeviceStates, device: str, prefix: str = "imu", **changed: object) -> None:
     board.process_message(
-        topics.STATUS.key(prefix, device), encoding.encode_status(device, 1.76e9, made.health(**changed))
+        topics.STATUS.key(prefix, device), StatusMessage.of(device, 1.76e9, 0, made.health(**changed)).encode()
     )
 
 
 def noise(board: DeviceStates, device: str, seconds: float = 3600.0, scale: float = 1.0) -> None:
     estimate = made.estimate(seconds=seconds, scale=scale)
     board.process_message(
-        topics.COEFFICIENTS.key("imu", device), encoding.encode_coefficients(device, 1.76e9, estimate)
+        topics.COEFFICIENTS.key("imu", device), CoefficientsMessage.of(device, 1.76e9, 0, estimate).encode()
     )
 
 
 def event(board: DeviceStates, device: str, text: str) -> None:
-    payload = encoding.encode_event(device, 1.76e9, 1, Event("noise_changed", 0, text), None)
+    payload = EventMessage.of(device, 1.76e9, 1, Event("noise_changed", 0, text)).encode()
     board.process_message(topics.EVENT.key("imu", device), payload)
 
 
@@ -61,7 +64,7 @@ def shown(
     board: DeviceStates, width: int = 120, now_s: float = NOW_S, height: int = 50, is_terminal: bool = False
 ) -> str:
     console = Console(width=width, height=height, file=io.StringIO(), force_terminal=is_terminal, record=True)
-    console.print(board.table(now_s))
+    console.print(live_table.device_table(board, now_s))
     return console.export_text()
 
 
@@ -115,7 +118,7 @@ def test_bounds_and_too_few_data_are_marked(board: DeviceStates) -> None:
     assert row(shown(board, 160), "early").count("≤") == 3  # B of the gyroscopes
     unknown = made.estimate()
     unknown.coefficients.status[:] = 0
-    board.process_message("imu/early/coefficients", encoding.encode_coefficients("early", 1.0, unknown))
+    board.process_message("imu/early/coefficients", CoefficientsMessage.of("early", 1.0, 0, unknown).encode())
     assert row(shown(board, 160), "early").count("—") == 9
 
 
@@ -144,7 +147,7 @@ def test_trouble_comes_first_and_has_a_sign_and_a_word(board: DeviceStates) -> N
 
 def test_hostile_messages_leave_a_bounded_board(board: DeviceStates) -> None:
     status(board, "good")
-    known = encoding.encode_status("good", 1.0, made.health())
+    known = StatusMessage.of("good", 1.0, 0, made.health()).encode()
     deep = known[:-1] + b',"more":' + b"[" * 20_000 + b"]" * 20_000 + b"}"
     many_axes = (
         b'{"schema":"imu-monitor/coefficients/1","samples":1,"axes":{'
@@ -166,16 +169,16 @@ def test_hostile_messages_leave_a_bounded_board(board: DeviceStates) -> None:
 def test_devices_beyond_the_bound_are_passed_over_until_others_have_been_silent_for_long(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(live_table, "MAX_DEVICES", 3)
+    monkeypatch.setattr(remote_devices, "MAX_DEVICES", 3)
     clock = [0.0]
     board = DeviceStates(lambda: clock[0])
-    payload = encoding.encode_status("a", 1.0, made.health())
+    payload = StatusMessage.of("a", 1.0, 0, made.health()).encode()
     for device in ("a", "b", "c", "d", "x" * 300):
         board.process_message(f"imu/{device}/status", payload)
         board.set_token(f"imu/{device}/alive", True)
     assert list(board._devices) == ["imu/a", "imu/b", "imu/c"]
-    assert board.passed_over == 4
-    clock[0] = live_table.FORGET_AFTER_S + 1.0
+    assert board.ignored == 4
+    clock[0] = remote_devices.FORGET_AFTER_S + 1.0
     board.process_message("imu/a/status", payload)
     board.process_message("imu/e/status", payload)
     assert sorted(board._devices) == ["imu/a", "imu/c", "imu/e"]
@@ -235,23 +238,23 @@ def test_k_or_r_is_marked_on_the_axes_that_have_it() -> None:
     whole = made.estimate(seconds=1000.0)
     either = replace(whole, k_or_r=np.array([False, True, False, False, False, False]))
     console = Console(width=160, file=io.StringIO(), record=True)
-    console.print(live_table.analysis_table(either))
+    console.print(analysis_table(either))
     text = console.export_text()
     assert "; K or R: one of them\n" in text
     assert row(text, "gy").count("K or R") == 2
     assert "K or R" not in row(text, "gz")
-    console.print(live_table.analysis_table(whole))
+    console.print(analysis_table(whole))
     assert "K or R" not in console.export_text()
 
 
 def test_axes_whose_slow_part_is_temperature_are_marked() -> None:
     console = Console(width=160, file=io.StringIO(), record=True)
-    console.print(live_table.analysis_table(made.estimate(seconds=1000.0), ("gy",)))
+    console.print(analysis_table(made.estimate(seconds=1000.0), ("gy",)))
     text = console.export_text()
     assert "; † its slow part is temperature\n" in text
     assert row(text, "gy").startswith("gy †")
     assert "†" not in row(text, "gz")
-    console.print(live_table.analysis_table(made.estimate(seconds=1000.0)))
+    console.print(analysis_table(made.estimate(seconds=1000.0)))
     assert "†" not in console.export_text()
 
 
@@ -259,7 +262,7 @@ def test_a_gyroscope_alone_has_no_accelerometer_columns(board: DeviceStates) -> 
     whole = made.estimate()
     whole.curve.avar[:, 3:] = float("nan")
     status(board, "a")
-    board.process_message("imu/a/coefficients", encoding.encode_coefficients("a", 1.0, whole))
+    board.process_message("imu/a/coefficients", CoefficientsMessage.of("a", 1.0, 0, whole).encode())
     text = shown(board, 160)
     assert "°/√h" in text
     assert "m/s/√h" not in text
@@ -269,13 +272,13 @@ def test_a_gyroscope_alone_has_no_accelerometer_columns(board: DeviceStates) -> 
 def test_the_last_events(board: DeviceStates) -> None:
     for i in range(9):
         event(board, "a", f"event {i}")
-    lines = shown(board).splitlines()[-live_table.EVENTS :]
+    lines = shown(board).splitlines()[-MAX_EVENTS:]
     assert [line.split("  ")[1:] for line in lines] == [["a", f"event {i}"] for i in range(4, 9)]
     assert all(len(line.split("  ")[0]) == 8 for line in lines)
 
 
 def test_a_time_that_is_no_date(board: DeviceStates) -> None:
-    payload = encoding.encode_event("a", 1e300, 1, Event("moved", 0, "moved"), None)
+    payload = EventMessage.of("a", 1e300, 1, Event("moved", 0, "moved")).encode()
     board.process_message("imu/a/event", payload)
     assert "1e+300 s  a  moved" in shown(board)
 
@@ -299,7 +302,7 @@ def test_a_sender_cannot_steer_the_terminal(board: DeviceStates) -> None:
     status(board, "a" + evil.replace("\n", ""), state=evil, text=evil, outputs={evil: evil})
     event(board, "a", evil)
     console = Console(width=200, file=io.StringIO(), force_terminal=False)
-    console.print(board.table(NOW_S))
+    console.print(live_table.device_table(board, NOW_S))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "[red]x[/red]" in text
     assert all(character.isprintable() or character == "\n" for character in text)
@@ -335,14 +338,14 @@ def test_two_threads_at_once(board: DeviceStates) -> None:
 def test_watch_refuses_what_zenoh_refuses() -> None:
     console = Console(file=io.StringIO())
     with pytest.raises(ConfigError, match=r'key expression "imu/\*\*\*"'):
-        live_table.watch("imu/***", console=console, once_s=0.0)
+        watch("imu/***", console=console, once_s=0.0)
     with pytest.raises(ConfigError, match='connect "nowhere"'):
-        live_table.watch(connect=["nowhere"], console=console, once_s=0.0)
+        watch(connect=["nowhere"], console=console, once_s=0.0)
 
 
 def test_a_device_that_disagrees_with_its_model_says_so(board: DeviceStates) -> None:
     status(board, "a")
-    board.process_message("imu/a/gap", encoding.encode_gap("a", 1.0, made.look(scale=1.2, gz=False)))
+    board.process_message("imu/a/gap", GapMessage.of("a", 1.0, 0, made.look(scale=1.2, gz=False)).encode())
     assert "gz disagrees with its model: " in shown(board, 160)
-    board.process_message("imu/a/gap", encoding.encode_gap("a", 1.0, made.look(gz=True)))
+    board.process_message("imu/a/gap", GapMessage.of("a", 1.0, 0, made.look(gz=True)).encode())
     assert "disagrees" not in shown(board, 160)

@@ -20,8 +20,8 @@ from rich.console import Console
 
 from drivers.errors import ConfigError
 from monitor.common import topics
-from monitor.publishing.messages import encoding
-from monitor.publishing.terminal import live_table
+from monitor.publishing.messages.results import CoefficientsMessage, StatusMessage
+from monitor.publishing.terminal import watch
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
 from monitor.settings.loading import ZenohTable
@@ -45,8 +45,10 @@ def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohPubl
 
     def talk() -> None:
         while not ending.wait(0.1):
-            out.put(topics.STATUS, device, encoding.encode_status(device, time.time(), made.health()))
-            out.put(topics.COEFFICIENTS, device, encoding.encode_coefficients(device, time.time(), made.estimate()))
+            out.put(topics.STATUS, device, StatusMessage.of(device, time.time(), 0, made.health()).encode())
+            out.put(
+                topics.COEFFICIENTS, device, CoefficientsMessage.of(device, time.time(), 0, made.estimate()).encode()
+            )
             out.put(topics.SAMPLES, device, b"raw")
             out.put(topics.ALLAN, device, b"curve")
 
@@ -145,7 +147,7 @@ def test_a_daemon_that_is_a_peer_is_heard_through_a_router(endpoint: str) -> Non
         out.set_alive("a", True)
 
         def both() -> bool:
-            out.put(topics.STATUS, "a", encoding.encode_status("a", time.time(), made.health()))
+            out.put(topics.STATUS, "a", StatusMessage.of("a", time.time(), 0, made.health()).encode())
             return keys(arriving, got) >= {"imu/a/status", "imu/a/alive"}
 
         wait_for(both)
@@ -244,7 +246,7 @@ def test_no_endpoint() -> None:
 def test_watch_once(endpoint: str) -> None:
     console = Console(width=120, file=io.StringIO())
     with daemon(endpoint, "a"):
-        live_table.watch(connect=[endpoint], console=console, once_s=2.0)
+        watch.watch(connect=[endpoint], console=console, once_s=2.0)
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert text.count("imu-monitor  1 device") == 1
     assert re.search(r"^a +● running +99\.98 +360,000 ", text, re.MULTILINE)
@@ -253,7 +255,7 @@ def test_watch_once(endpoint: str) -> None:
 
 def test_watch_prints_plain_tables_where_there_is_no_terminal(endpoint: str) -> None:
     console, stop = Console(width=120, file=io.StringIO()), threading.Event()
-    watcher = threading.Thread(target=live_table.watch, args=("imu/**", [endpoint], stop, console))
+    watcher = threading.Thread(target=watch.watch, args=("imu/**", [endpoint], stop, console))
     watcher.start()
     text = wait_for(lambda: console.file.getvalue() if console.file.getvalue().count("device") > 2 else "")  # type: ignore[attr-defined]
     stop.set()
@@ -267,7 +269,7 @@ def test_watch_prints_plain_tables_where_there_is_no_terminal(endpoint: str) -> 
 def test_watch_on_a_terminal_ends_with_ctrl_c_and_exit_0(endpoint: str) -> None:
     code = f"""
         from rich.console import Console
-        from monitor.publishing.terminal.live_table import watch
+        from monitor.publishing.terminal.watch import watch
         watch(connect=["{endpoint}"], console=Console(force_terminal=True, width=120))
     """
     with daemon(endpoint, "a"):

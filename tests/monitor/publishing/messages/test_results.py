@@ -15,7 +15,19 @@ from monitor.estimation.allan.total import total_curve
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.coefficients import SYMBOLS
-from monitor.publishing.messages import encoding
+from monitor.publishing.messages.analysis import AnalysisMessage
+from monitor.publishing.messages.results import (
+    AllanMessage,
+    CoefficientsMessage,
+    EventMessage,
+    GapMessage,
+    ReconcileMessage,
+    ResetMessage,
+    SlowStatistics,
+    StatusMessage,
+    ThermalMessage,
+    TotalMessage,
+)
 from tests.monitor.publishing import made
 
 UNIX_S = 1763700000.01
@@ -38,16 +50,16 @@ def gyro_z_only() -> Any:
 
 
 ALL = {
-    topics.ALLAN: encoding.encode_allan("bench-1", UNIX_S, made.estimate()),
-    topics.COEFFICIENTS: encoding.encode_coefficients("bench-1", UNIX_S, made.estimate()),
-    topics.TOTAL: encoding.encode_total("bench-1", UNIX_S, 360_000, *made.slow_curves()),
-    topics.GAP: encoding.encode_gap("bench-1", UNIX_S, made.look(gz=False, gx=True)),
-    topics.THERMAL: encoding.encode_thermal("bench-1", UNIX_S, 360_000, made.thermal_look()),
-    topics.EVENT: encoding.encode_event("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back"), None),
-    topics.STATUS: encoding.encode_status("bench-1", UNIX_S, made.health()),
-    topics.RESET: encoding.encode_reply("bench-1", UNIX_S, 360_000, "the window is empty"),
-    topics.RECONCILE: encoding.encode_reconciled(
-        "bench-1", UNIX_S, 360_000, {"schema": "x", "verdict": "agrees"}, 0, None
+    topics.ALLAN: AllanMessage.of("bench-1", UNIX_S, 0, made.estimate()).encode(),
+    topics.COEFFICIENTS: CoefficientsMessage.of("bench-1", UNIX_S, 0, made.estimate()).encode(),
+    topics.TOTAL: TotalMessage.of("bench-1", UNIX_S, 360_000, SlowStatistics(*made.slow_curves())).encode(),
+    topics.GAP: GapMessage.of("bench-1", UNIX_S, 0, made.look(gz=False, gx=True)).encode(),
+    topics.THERMAL: ThermalMessage.of("bench-1", UNIX_S, 360_000, made.thermal_look()).encode(),
+    topics.EVENT: EventMessage.of("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back")).encode(),
+    topics.STATUS: StatusMessage.of("bench-1", UNIX_S, 0, made.health()).encode(),
+    topics.RESET: ResetMessage.of("bench-1", UNIX_S, 360_000, "the window is empty").encode(),
+    topics.RECONCILE: ReconcileMessage(device="bench-1", t=UNIX_S, samples=360_000).encode_report(
+        {"schema": "x", "verdict": "agrees"}, 0, None
     ),
 }
 
@@ -123,7 +135,7 @@ def test_thermal() -> None:
 
 def test_gap() -> None:
     look = made.look(made.estimate(seconds=600.0), scale=1.1, gz=False, gx=True)
-    found = parsed(encoding.encode_gap("a", UNIX_S, look))
+    found = parsed(GapMessage.of("a", UNIX_S, 0, look).encode())
     assert (found["rate"], found["window"], found["filled"]) == (100.0, 3600.0, 600.0)
     assert found["tau"] == look.tau_s.tolist()
     assert list(found["axes"]) == list(AXES)
@@ -142,12 +154,12 @@ def test_gap() -> None:
 def test_where_a_model_knows_nothing_it_says_null() -> None:
     look = made.look(made.estimate(seconds=600.0))
     look.axes["gz"].z[0] = np.nan
-    assert parsed(encoding.encode_gap("a", UNIX_S, look))["axes"]["gz"]["z"][0] is None
+    assert parsed(GapMessage.of("a", UNIX_S, 0, look).encode())["axes"]["gz"]["z"][0] is None
 
 
 def test_the_reports_own_words_are_kept_and_the_head_is_ours() -> None:
     result = {"schema": "x", "samples": 5, "verdict": "explained", "axes": {"gz": {"steps": []}}}
-    found = parsed(encoding.encode_reconciled("a", UNIX_S, 360_000, result, 3, "/reports/a"))
+    found = parsed(ReconcileMessage(device="a", t=UNIX_S, samples=360_000).encode_report(result, 3, "/reports/a"))
     assert (found["schema"], found["samples"]) == ("imu-monitor/reconcile/1", 360_000)
     assert (found["verdict"], found["axes"], found["exit"], found["folder"]) == (
         "explained", {"gz": {"steps": []}}, 3, "/reports/a"
@@ -155,20 +167,20 @@ def test_the_reports_own_words_are_kept_and_the_head_is_ours() -> None:
 
 
 def test_too_few_data_are_null_and_say_so() -> None:
-    found = parsed(encoding.encode_coefficients("a", UNIX_S, made.estimate(seconds=600.0)))
+    found = parsed(CoefficientsMessage.of("a", UNIX_S, 0, made.estimate(seconds=600.0)).encode())
     assert found["axes"]["ax"]["R"] == {"value": None, "lo": None, "hi": None, "status": "unestimated"}
 
 
 def test_axes_that_are_not_measured_are_absent() -> None:
     estimate = gyro_z_only()
-    assert list(parsed(encoding.encode_coefficients("a", UNIX_S, estimate))["axes"]) == ["gz"]
-    assert list(parsed(encoding.encode_allan("a", UNIX_S, estimate))["axes"]) == ["gz"]
+    assert list(parsed(CoefficientsMessage.of("a", UNIX_S, 0, estimate).encode())["axes"]) == ["gz"]
+    assert list(parsed(AllanMessage.of("a", UNIX_S, 0, estimate).encode())["axes"]) == ["gz"]
 
 
 def test_allan() -> None:
     estimate = gyro_z_only()
     estimate.curve.avar[-1, 2] = estimate.curve.lo[-1, 2] = estimate.curve.hi[-1, 2] = np.nan
-    found = parsed(encoding.encode_allan("a", UNIX_S, estimate))
+    found = parsed(AllanMessage.of("a", UNIX_S, 0, estimate).encode())
     assert found["tau"] == estimate.curve.tau_s.tolist()
     assert set(found["axes"]["gz"]) == {"deviation", "lo", "hi"}
     gz = found["axes"]["gz"]
@@ -180,19 +192,19 @@ def test_allan() -> None:
 def test_event() -> None:
     what = Event(
         "noise_changed",
-        5,
+        21_000_000_000,
         "gz angle random walk rose by 47 %",
         axis="gz",
         values={"N": {"before": 1.5e-4, "after": 2.2e-4}},
-        since_ns=1,
+        since_ns=1_000_000_000,
         sigma=9.1,
     )
-    found = parsed(encoding.encode_event("bench-1", UNIX_S, 7, what, 1763699980.0))
+    found = parsed(EventMessage.of("bench-1", UNIX_S, 7, what).encode())
     assert {key: found[key] for key in list(found)[4:]} == {
         "kind": "noise_changed",
         "axis": "gz",
         "what": {"N": {"before": 1.5e-4, "after": 2.2e-4}},
-        "since": 1763699980.0,
+        "since": UNIX_S - 20.0,
         "sigma": 9.1,
         "text": "gz angle random walk rose by 47 %",
     }
@@ -200,7 +212,7 @@ def test_event() -> None:
 
 def test_status() -> None:
     health = made.health(outputs={"zenoh": "ok", "viewer": "stalled"}, text="…", rate_hz=None, latency_p99_s=None)
-    found = parsed(encoding.encode_status("bench-1", UNIX_S, health))
+    found = parsed(StatusMessage.of("bench-1", UNIX_S, 0, health).encode())
     assert {key: found[key] for key in list(found)[4:]} == {
         "state": "running",
         "rate": None,
@@ -235,12 +247,12 @@ def analyzed(**more: Any) -> dict[str, Any]:
     theta = np.zeros((5, 6)) + made.true_coefficients() ** 2
     values = 1e-3 * np.random.default_rng(1).standard_normal((3000, 6))
     return parsed(
-        encoding.encode_analysis(
+        AnalysisMessage.of(
             result,
             total_curve(values, 100.0, theta, np.array([1, 1000, 2900])),
             hadamard_curve(values, 100.0, theta, np.array([1, 1000])),
             compute_dynamic_allan(values, 100.0, 10.0, (0.01, 0.1, 0.2, 0.4, 1.0), step_s=5.0),
-        )
+        ).encode()
     )
 
 
@@ -309,7 +321,7 @@ def test_dynamic_curves_are_lists_by_time_step() -> None:
 
 
 def test_what_was_not_made_is_absent() -> None:
-    found = parsed(encoding.encode_analysis(made.analysis()))
+    found = parsed(AnalysisMessage.of(made.analysis()).encode())
     assert "dynamic" not in found
     assert list(found["axes"]["gz"]) == ["allan", "coefficients", "bandwidth"]
     assert found["motions"] == found["changes"] == []

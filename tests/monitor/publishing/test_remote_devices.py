@@ -6,43 +6,42 @@ import numpy as np
 import pytest
 
 from monitor.common import topics
-from monitor.publishing.messages import encoding, remote_device
-from monitor.publishing.messages.remote_device import RemoteDevice
+from monitor.publishing import remote_devices
+from monitor.publishing.messages.message import decode_message
+from monitor.publishing.messages.results import CoefficientsMessage, GapMessage, ResetMessage, StatusMessage
+from monitor.publishing.remote_devices import DeviceCoefficients, RemoteDevice
 from tests.monitor.publishing import made
 
 
 def test_coefficients_come_back_as_they_were() -> None:
     estimate = made.estimate(seconds=1000.0)
-    payload = encoding.encode_coefficients("a", 1.0, estimate)
-    found = remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload))
+    payload = CoefficientsMessage.of("a", 1.0, 0, estimate).encode()
+    found = DeviceCoefficients.from_message(decode_message(CoefficientsMessage, payload))
     for name in ("value", "lo", "hi", "status"):
         np.testing.assert_array_equal(getattr(found.coefficients, name), getattr(estimate.coefficients, name))
     assert found.axes == ("gx", "gy", "gz", "ax", "ay", "az")
-    assert found.seen_s == 1000.0
+    assert found.filled_s == 1000.0
 
 
 def test_what_is_seen_is_what_the_window_holds() -> None:
     """Not what came since the start: after a reset that is more."""
     estimate = dataclasses.replace(made.estimate(seconds=1800.0), samples=10_000_000)
-    payload = encoding.encode_coefficients("a", 1.0, estimate)
-    assert (
-        remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload)).seen_s
-        == 1800.0
-    )
+    payload = CoefficientsMessage.of("a", 1.0, 0, estimate).encode()
+    assert DeviceCoefficients.from_message(decode_message(CoefficientsMessage, payload)).filled_s == 1800.0
 
 
 def test_what_a_newer_daemon_adds_is_passed_over() -> None:
-    payload = encoding.encode_status("a", 1.0, made.health())[:-1] + b',"novelty":[1,{"x":null}]}'
-    assert remote_device.read(remote_device.StatusMessage, topics.STATUS, payload).received == 360_000
+    payload = StatusMessage.of("a", 1.0, 0, made.health()).encode()[:-1] + b',"novelty":[1,{"x":null}]}'
+    assert decode_message(StatusMessage, payload).received == 360_000
     axes = b'{"gz":{"N":{"value":1e-4,"lo":1e-5,"hi":1e-3,"status":"estimated"},"Z":{"status":"new"}},"mx":{}}'
     payload = b'{"schema":"imu-monitor/coefficients/1","samples":5,"axes":' + axes + b"}"
-    found = remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload))
+    found = DeviceCoefficients.from_message(decode_message(CoefficientsMessage, payload))
     assert found.axes == ("gz",)
     assert found.coefficients.value[1, 2] == 1e-4
 
 
 def test_a_status_may_have_no_time_yet() -> None:
-    assert remote_device.status(encoding.encode_status("a", None, made.health())).t is None
+    assert StatusMessage.decode(StatusMessage.of("a", None, 0, made.health()).encode()).t is None
 
 
 @pytest.mark.parametrize(
@@ -53,25 +52,25 @@ def test_a_status_may_have_no_time_yet() -> None:
         b"[]",
         b"\xff\xfe",
         b"{}",
-        encoding.encode_status("a", 1.0, made.health()).replace(b"status/1", b"status/2"),
-        encoding.encode_status("a", 1.0, made.health()).replace(b'"received":360000', b'"received":"many"'),
-        encoding.encode_reply("a", 1.0, 5, "x"),
+        StatusMessage.of("a", 1.0, 0, made.health()).encode().replace(b"status/1", b"status/2"),
+        StatusMessage.of("a", 1.0, 0, made.health()).encode().replace(b'"received":360000', b'"received":"many"'),
+        ResetMessage.of("a", 1.0, 5, "x").encode(),
     ],
 )
 def test_anything_else_is_a_value_error(payload: bytes) -> None:
     with pytest.raises(ValueError):  # noqa: PT011 - the text is msgspec's
-        remote_device.read(remote_device.StatusMessage, topics.STATUS, payload)
+        decode_message(StatusMessage, payload)
 
 
 def test_a_status_word_of_a_coefficient_that_is_not_known() -> None:
-    payload = encoding.encode_coefficients("a", 1.0, made.estimate()).replace(b'"estimated"', b'"guessed"')
+    payload = CoefficientsMessage.of("a", 1.0, 0, made.estimate()).encode().replace(b'"estimated"', b'"guessed"')
     with pytest.raises(ValueError, match="guessed"):
-        remote_device.noise(remote_device.read(remote_device.CoefficientsMessage, topics.COEFFICIENTS, payload))
+        DeviceCoefficients.from_message(decode_message(CoefficientsMessage, payload))
 
 
 def device(**changed: object) -> RemoteDevice:
-    payload = encoding.encode_status("a", 1.0, made.health(**changed))
-    return RemoteDevice("imu/a", 100.0, status=remote_device.read(remote_device.StatusMessage, topics.STATUS, payload))
+    payload = StatusMessage.of("a", 1.0, 0, made.health(**changed)).encode()
+    return RemoteDevice("imu/a", 100.0, status=StatusMessage.decode(payload))
 
 
 def test_a_device_that_speaks_is_what_it_says() -> None:
@@ -81,13 +80,13 @@ def test_a_device_that_speaks_is_what_it_says() -> None:
 
 def test_silence() -> None:
     one = device()
-    assert one.state(100.0 + remote_device.SILENCE_TIMEOUT_S - 0.1) == "running"
-    assert one.state(100.0 + remote_device.SILENCE_TIMEOUT_S + 0.1) == "silent"
+    assert one.state(100.0 + remote_devices.SILENCE_TIMEOUT_S - 0.1) == "running"
+    assert one.state(100.0 + remote_devices.SILENCE_TIMEOUT_S + 0.1) == "silent"
     one.token_exists = True
-    assert one.state(100.0 + remote_device.SILENCE_TIMEOUT_S + 0.1) == "silent"
+    assert one.state(100.0 + remote_devices.SILENCE_TIMEOUT_S + 0.1) == "silent"
     one.token_exists = False
-    assert one.state(100.0 + remote_device.GONE_TIMEOUT_S - 0.1) == "running"
-    assert one.state(100.0 + remote_device.GONE_TIMEOUT_S + 0.1) == "gone"
+    assert one.state(100.0 + remote_devices.GONE_TIMEOUT_S - 0.1) == "running"
+    assert one.state(100.0 + remote_devices.GONE_TIMEOUT_S + 0.1) == "gone"
 
 
 def test_a_replay_that_has_ended_is_not_missed() -> None:
@@ -115,27 +114,24 @@ def test_ranks_and_words_of_trouble() -> None:
 
 
 def test_a_topic_of_two_parts_and_keys_that_are_none() -> None:
-    assert remote_device.split_key("a/b/c/command/reset") == ("a/b/c", topics.RESET)
-    assert remote_device.split_key("status") is None
-    assert remote_device.split_key("/status") is None
-    assert remote_device.split_key("imu/bench-1/statuses") is None
+    assert remote_devices.split_key("a/b/c/command/reset") == ("a/b/c", topics.RESET)
+    assert remote_devices.split_key("status") is None
+    assert remote_devices.split_key("/status") is None
+    assert remote_devices.split_key("imu/bench-1/statuses") is None
 
 
 def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() -> None:
-    status = remote_device.read(
-        remote_device.StatusMessage, topics.STATUS, encoding.encode_status("a", 1.0, made.health())
-    )
-    payload = encoding.encode_gap("a", 1.0, made.look(scale=1.2, gz=False, gx=True))
+    status = decode_message(StatusMessage, StatusMessage.of("a", 1.0, 0, made.health()).encode())
+    payload = GapMessage.of("a", 1.0, 0, made.look(scale=1.2, gz=False, gx=True)).encode()
     one = RemoteDevice("imu/a", 0.0, status)
     assert one.rank(0.0) == 2
-    one.gap = remote_device.read(remote_device.GapMessage, topics.GAP, payload)
+    gap = decode_message(GapMessage, payload)
+    one.update(gap)
     assert one.rank(0.0) == 1
-    found = one.gap.axes["gz"]
+    found = gap.axes["gz"]
     lo, hi = found.where.tau
     assert one.problems() == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
-    one.gap = remote_device.read(
-        remote_device.GapMessage, topics.GAP, encoding.encode_gap("a", 1.0, made.look(gz=True))
-    )
+    one.update(decode_message(GapMessage, GapMessage.of("a", 1.0, 0, made.look(gz=True)).encode()))
     assert (one.rank(0.0), one.problems()) == (2, "")
 
 

@@ -1,11 +1,11 @@
-"""Amounts in sentences: the field's units, two digits, never an exponent."""
+"""Rates in sentences: two digits, never an exponent."""
 
 import math
 
 import pytest
 
 from drivers.sample import AXES
-from monitor.common.rates import format_rate
+from monitor.common.units import format_rate
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import threading
 
-from monitor.publishing.rerun.bounded_queue import BoundedQueue
+from monitor.publishing.bounded_queue import BoundedQueue
 from tests.support.waiting import FOREVER_S
 
 

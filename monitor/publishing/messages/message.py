@@ -1,0 +1,128 @@
+"""Base class of the messages, and their encoding as JSON.
+
+Each message is one ``msgspec.Struct``. The publisher, ``watch``, ``view`` and the history queries use the same structs.
+The fields have the names of the JSON keys and the order in which the keys are written. Numbers are in SI units. NaN is
+written as null, because JSON cannot represent it. In an array, null is read as NaN.
+
+Unknown keys are ignored, so messages of newer daemons can be read. Any payload that is not the expected message raises
+``ValueError``. The module does no I/O.
+"""
+
+from functools import cache
+from typing import Annotated, Any, ClassVar, Final, Self, TypeVar
+
+import msgspec
+import numpy as np
+
+from drivers.sample import Ints
+from monitor.common.topics import Topic
+
+MAX_PAYLOAD_BYTES: Final = 1_000_000
+"""Largest accepted payload; a message of six axes has a few kilobytes."""
+Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
+
+
+class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="schema"):
+    """Message about one device. The key ``schema`` is written and checked by msgspec, see the tag of each subclass."""
+
+    topic: ClassVar[Topic]
+
+    device: str = ""
+    t: float | None = None
+    """Unix time of the newest sample [s]; None before the first sample of a device that has its own clock."""
+    samples: Count = 0
+    """Number of samples of the device since the start."""
+
+    @classmethod
+    def of(cls, device: str, t: float | None, samples: int, result: Any) -> Self:
+        """Build the message from a result.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        t
+            Unix time of the result [s].
+        samples
+            Number of samples of the device since the start. A result that contains this number overrides it.
+        result
+            Result of the daemon.
+        """
+        raise NotImplementedError
+
+    def encode(self) -> bytes:
+        """Encode the message as JSON."""
+        return encode_json(self)
+
+
+M = TypeVar("M", bound=Message)
+
+
+def decode_message(kind: type[M], payload: bytes, max_bytes: int = MAX_PAYLOAD_BYTES) -> M:
+    """Decode a message.
+
+    Parameters
+    ----------
+    kind
+        Class of the message.
+    payload
+        JSON text.
+    max_bytes
+        Largest accepted payload.
+
+    Raises
+    ------
+    ValueError
+        If the payload is too large or is not a message of this class.
+    """
+    if len(payload) > max_bytes:
+        raise ValueError(f"the payload has {len(payload)} bytes; at most {max_bytes} are read")
+    try:
+        found = _decoder(kind).decode(payload)  # its errors are ValueErrors
+    except RecursionError as error:
+        raise ValueError(str(error)) from error
+    if not isinstance(found, kind):
+        raise ValueError(f'schema "{Message.__name__}" instead of {kind.topic.schema()}')
+    return found
+
+
+def encode_json(value: Any) -> bytes:
+    """Encode structs, arrays and built-in types as JSON."""
+    return _ENCODER.encode(value)
+
+
+def remove_control_characters(text: str) -> str:
+    """Replace control characters by spaces, because a terminal would interpret them.
+
+    >>> remove_control_characters("link\\x1b[2J lost\\nnow")
+    'link [2J lost now'
+    """
+    return "".join(one if one.isprintable() else " " for one in text)
+
+
+def _encode_array(value: Any) -> Any:
+    """Convert NumPy arrays and scalars, which msgspec cannot encode."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be encoded as JSON")
+
+
+def _decode_array(kind: Any, value: Any) -> Any:
+    """Convert a list of numbers, or a list of rows, to an array."""
+    if kind == Ints:
+        try:
+            return np.array(msgspec.convert(value, list[int]), np.int64)
+        except OverflowError as error:
+            raise ValueError("an integer has more than 64 bits") from error
+    rows = isinstance(value, list) and value and isinstance(value[0], list)
+    numbers = msgspec.convert(value, list[list[float | None]] if rows else list[float | None])
+    return np.array(numbers, np.float64)
+
+
+@cache
+def _decoder(kind: type[M]) -> "msgspec.json.Decoder[M | Message]":
+    """Return the decoder of a message. In a union, msgspec requires the key ``schema``."""
+    return msgspec.json.Decoder(kind | Message, dec_hook=_decode_array)
+
+
+_ENCODER: Final = msgspec.json.Encoder(enc_hook=_encode_array)

@@ -1,0 +1,585 @@
+"""Messages with the results, events and status of a device."""
+
+from collections.abc import Mapping
+from typing import Any, Final, NamedTuple, Self
+
+import msgspec
+import numpy as np
+from msgspec import UNSET, UnsetType
+
+from drivers.credential_masking import mask_secrets
+from drivers.sample import AXES, Event, Floats
+from monitor.common import topics
+from monitor.common.health import Health
+from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.recursive_least_squares import PredictionInterval
+from monitor.estimation.allan.curve import AllanCurve
+from monitor.estimation.allan.hadamard import HadamardCurve
+from monitor.estimation.allan.total import TotalCurve
+from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficient_fit import UNIT_SOURCES
+from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
+from monitor.publishing.messages.message import Count, Message, decode_message, remove_control_characters
+
+MAX_AVERAGING_TIMES: Final = 1000
+"""Largest accepted number of averaging times."""
+MAX_TEXT_LENGTH: Final = 400
+"""Length to which received texts are cut, so that no device can exhaust the memory of the receiver."""
+MAX_OUTPUTS: Final = 16
+STATUSES: Final = {status.name.lower(): status for status in Status}
+
+
+class SlowStatistics(NamedTuple):
+    """Statistics of the window that are computed step by step."""
+
+    total: TotalCurve
+    hadamard: HadamardCurve
+
+
+class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
+    """Deviations of one axis and the ends of their 95 % intervals."""
+
+    deviation: Floats
+    lo: Floats
+    hi: Floats
+
+
+class AllanAxis(DeviationCurve, frozen=True):
+    """Allan deviations of one axis; ``recent`` covers a shorter time, max(10 s, 16 τ) at each τ."""
+
+    recent: DeviationCurve | UnsetType = UNSET
+
+
+class CoefficientValue(msgspec.Struct, frozen=True):
+    """Coefficient of one axis with its 95 % interval and status."""
+
+    value: float | None = None
+    lo: float | None = None
+    hi: float | None = None
+    status: str = ""
+    other: str | UnsetType | None = msgspec.field(name="or", default=UNSET)
+    """The other symbol of K and R, if the data do not show which of the two is present."""
+
+
+class WindowMessage(Message, frozen=True, kw_only=True):
+    """Message with results of the window."""
+
+    rate: float | None = None
+    """Sample rate [Hz]."""
+    window: float | None = None
+    """Length of the full window [s]."""
+    filled: float | None = None
+    """Filled part of the window [s]."""
+
+
+class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema()):
+    """Message ``imu/<device>/allan``: Allan deviations of each measured axis."""
+
+    topic = topics.ALLAN
+    tau: Floats
+    axes: dict[str, AllanAxis]
+
+    @classmethod
+    def of(cls, device: str, t: float | None, samples: int, result: Estimate) -> Self:
+        """Build the message from an estimate."""
+        recent = result.display_curve
+        axes = {
+            axis: AllanAxis(
+                *deviation_columns(result.curve, i),
+                recent=UNSET if recent is None else DeviationCurve(*deviation_columns(recent, i)),
+            )
+            for i, axis in measured_axes(result.curve)
+        }
+        return cls(device=device, t=t, tau=result.curve.tau_s, axes=axes, **_window(result))
+
+    def to_estimate(self, coefficients: Coefficients, k_or_r: frozenset[str]) -> Estimate:
+        """Build an estimate. Degrees of freedom and numbers of terms are not part of the message and are unknown.
+
+        Parameters
+        ----------
+        coefficients
+            Coefficients of the device, from which the fitted curve is computed.
+        k_or_r
+            Axes on which either K or R is present and the data do not show which.
+
+        Raises
+        ------
+        ValueError
+            If the averaging times do not increase from above zero, or if a curve has another length.
+        """
+        tau_s, m = self.tau, self.tau.size
+        rate_hz, window_s, filled_s = self.rate or 0.0, self.window or 0.0, self.filled or 0.0
+        rising = tau_s.ndim == 1 and bool(np.all(tau_s > 0.0) and np.all(np.diff(tau_s) > 0.0))
+        if not 0 < m <= MAX_AVERAGING_TIMES or not rising or not rate_hz > 0.0 or self.t is None:
+            raise ValueError("the averaging times must increase from above zero")
+        deviation, lo, hi = (np.full((m, len(AXES)), np.nan) for _ in range(3))
+        for i, axis in enumerate(AXES):
+            if curve := self.axes.get(axis):
+                if not curve.deviation.shape == curve.lo.shape == curve.hi.shape == (m,):
+                    raise ValueError(f"{axis}: the number of deviations differs from {m} averaging times")
+                deviation[:, i], lo[:, i], hi[:, i] = curve.deviation, curve.lo, curve.hi
+        factors, terms = np.rint(tau_s * rate_hz).astype(np.int64), np.zeros((m, len(AXES)), np.int64)
+        edf = np.full((m, len(AXES)), np.nan)
+        return Estimate(
+            t_ns=round(self.t * 1e9),
+            rate_hz=rate_hz,
+            window_s=window_s,
+            samples=self.samples,
+            curve=AllanCurve(tau_s, factors, deviation**2, terms, edf, lo, hi, round(filled_s * rate_hz)),
+            fitted=fitted_variance(tau_s, rate_hz, coefficients),
+            coefficients=coefficients,
+            k_or_r=np.array([axis in k_or_r for axis in AXES]),
+        )
+
+
+class CoefficientsMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema()):
+    """Message ``imu/<device>/coefficients``: Q, N, B, K and R of each measured axis."""
+
+    topic = topics.COEFFICIENTS
+    axes: dict[str, dict[str, CoefficientValue]]
+
+    @classmethod
+    def of(cls, device: str, t: float | None, samples: int, result: Estimate) -> Self:
+        """Build the message from an estimate."""
+        axes = {
+            axis: coefficient_values(result.coefficients, i, bool(result.k_or_r[i]))
+            for i, axis in measured_axes(result.curve)
+        }
+        return cls(device=device, t=t, axes=axes, **_window(result))
+
+    def to_coefficients(self) -> Coefficients:
+        """Return the coefficients of all axes.
+
+        Raises
+        ------
+        ValueError
+            If a coefficient has an unknown status.
+        """
+        value, lo, hi = (np.full((len(SYMBOLS), len(AXES)), np.nan) for _ in range(3))
+        status = np.full(value.shape, Status.UNESTIMATED, np.int8)
+        for column, axis in enumerate(AXES):
+            for row, symbol in enumerate(SYMBOLS):
+                if one := self.axes.get(axis, {}).get(symbol):
+                    if one.status not in STATUSES:
+                        raise ValueError(f'unknown status "{one.status}"')
+                    numbers = np.array([one.value, one.lo, one.hi], np.float64)  # None becomes NaN
+                    value[row, column], lo[row, column], hi[row, column] = numbers
+                    status[row, column] = STATUSES[one.status]
+        return Coefficients(value, lo, hi, status)
+
+
+class TauRange(msgspec.Struct, frozen=True):
+    """Range of averaging times [s]."""
+
+    tau: tuple[float, float]
+
+
+class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
+    """Comparison of one axis with its model."""
+
+    agrees: bool | None = None
+    """Current decision; None if there is none yet. It has hysteresis: it changes later than ``gap`` crosses
+    ``threshold``."""
+    gap: float
+    where: TauRange
+    ratio: float | None = None
+    null95: float | None = None
+    threshold: float | None = None
+    measured: Floats | None = None
+    model: Floats | None = None
+    z: Floats | None = None
+
+
+class GapMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
+    """Message ``imu/<device>/gap``: measured deviations and those of the model in force, on the axes that can be
+    compared."""
+
+    topic = topics.GAP
+    tau: Floats | None = None
+    axes: dict[str, AxisGapValues]
+
+    @classmethod
+    def of(cls, device: str, t: float | None, samples: int, result: ModelGap) -> Self:
+        """Build the message from a comparison with the model."""
+        axes = {
+            axis: AxisGapValues(
+                agrees=result.agrees.get(axis),
+                gap=one.gap,
+                where=TauRange(one.tau_s),
+                ratio=one.ratio,
+                null95=one.null95,
+                threshold=one.threshold,
+                measured=one.measured,
+                model=one.model,
+                z=one.z,
+            )
+            for axis, one in result.axes.items()
+        }
+        return cls(
+            device=device,
+            t=t,
+            samples=result.samples,
+            rate=result.rate_hz,
+            window=result.window_s,
+            filled=result.n / result.rate_hz,
+            tau=result.tau_s,
+            axes=axes,
+        )
+
+
+class PredictedBias(msgspec.Struct, frozen=True):
+    """Predicted bias with its 95 % interval."""
+
+    bias: float | None
+    lo: float | None
+    hi: float | None
+
+    @classmethod
+    def of(cls, prediction: PredictionInterval | None) -> Self | None:
+        """Return the prediction; None if there is no model."""
+        return None if prediction is None else cls(prediction.bias, prediction.lo, prediction.hi)
+
+
+class AxisThermalValues(msgspec.Struct, frozen=True):
+    """Mean bias of one axis in an interval, and its predictions; ``text`` says why there is none."""
+
+    bias: float | None
+    error: float | None
+    multi_step: PredictedBias | None
+    """Prediction from the temperature alone."""
+    one_step: PredictedBias | None
+    """Prediction from the temperature and the preceding bias."""
+    model: str | None
+    slope: float | None
+    text: str
+
+
+class ThermalMessage(Message, frozen=True, kw_only=True, tag=topics.THERMAL.schema()):
+    """Message ``imu/<device>/thermal``: mean biases of an interval, which ends at ``t``, and their predictions."""
+
+    topic = topics.THERMAL
+    interval: float
+    temperature: float | None
+    axes: dict[str, AxisThermalValues]
+
+    @classmethod
+    def of(cls, device: str, t: float | None, samples: int, result: ThermalUpdate) -> Self:
+        """Build the message from the result of the thermal model for an interval."""
+        axes = {
+            axis: AxisThermalValues(
+                one.bias,
+                one.error,
+                PredictedBias.of(one.multi_step),
+                PredictedBias.of(one.one_step),
+                one.model or None,
+                one.slope,
+                one.text,
+            )
+            for axis, one in result.axes.items()
+        }
+        return cls(
+            device=device,
+            t=t,
+            samples=samples,
+            interval=result.interval_s,
+            temperature=result.temperature_c,
+            axes=axes,
+        )
+
+
+class DeviationTable(msgspec.Struct, frozen=True, eq=False):
+    """Deviations of all measured axes at the same averaging times."""
+
+    tau: Floats
+    axes: dict[str, DeviationCurve]
+
+    @classmethod
+    def of(cls, curve: TotalCurve | HadamardCurve) -> Self:
+        """Return the deviations of the axes that have at least one."""
+        curves = {axis: DeviationCurve(*deviation_columns(curve, i)) for i, axis in enumerate(AXES)}
+        return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
+
+
+class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()):
+    """Message ``imu/<device>/total``: total and Hadamard deviations, each with its own averaging times."""
+
+    topic = topics.TOTAL
+    total: DeviationTable
+    hadamard: DeviationTable
+
+    @classmethod
+    def of(cls, device: str, t: float | None, samples: int, result: SlowStatistics) -> Self:
+        """Build the message from both curves."""
+        total, hadamard = DeviationTable.of(result.total), DeviationTable.of(result.hadamard)
+        return cls(device=device, t=t, samples=samples, total=total, hadamard=hadamard)
+
+
+class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()):
+    """Message ``imu/<device>/event``."""
+
+    topic = topics.EVENT
+    kind: str
+    axis: str | None = None
+    what: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
+    """Values by coefficient, for example before and after a change."""
+    since: float | None = None
+    """Unix time at which the reported condition began [s]."""
+    sigma: float | None = None
+    text: str
+
+    @classmethod
+    def of(cls, device: str, t: float | None, samples: int, result: Event) -> Self:
+        """Build the message from an event."""
+        return cls(
+            device=device,
+            t=t,
+            samples=samples,
+            kind=result.kind,
+            axis=result.axis,
+            what={name: dict(sides) for name, sides in result.values.items()},
+            since=None if t is None else event_start_s(t, result),
+            sigma=result.sigma,
+            text=mask_secrets(result.text),
+        )
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Self:
+        """Decode a message of another process; its texts are cleaned.
+
+        Raises
+        ------
+        ValueError
+            If the payload is not an event, or has no time.
+        """
+        found = decode_message(cls, payload)
+        if found.t is None:
+            raise ValueError("an event without a time")
+        return msgspec.structs.replace(found, kind=_clean(found.kind), text=_clean(found.text))
+
+    def to_event(self) -> Event:
+        """Build an event with the changed coefficients, which are marked in plots."""
+        values: dict[str, dict[str, float]] = {
+            symbol: {side: value for side, value in self.what[symbol].items() if isinstance(value, float | int)}
+            for symbol in SYMBOLS
+            if symbol in self.what
+        }
+        axis = self.axis if self.axis in AXES else None
+        return Event(self.kind, round((self.t or 0.0) * 1e9), self.text, axis, values)
+
+
+class Latency(msgspec.Struct, frozen=True):
+    """Percentiles of the latency from receipt to publication [s]."""
+
+    p50: float | None = None
+    p99: float | None = None
+
+
+class StatusMessage(Message, frozen=True, kw_only=True, tag=topics.STATUS.schema()):
+    """Message ``imu/<device>/status``; see ``Health`` for the meaning of the fields."""
+
+    topic = topics.STATUS
+    state: str
+    rate: float | None = None
+    received: Count
+    lost: Count
+    bad: Count
+    overflowed: Count = 0
+    latency: Latency = Latency()
+    memory: Count = 0
+    outputs: dict[str, str] = msgspec.field(default_factory=dict)
+    uptime: float = 0.0
+    repeated: Count = 0
+    late: Count = 0
+    moving: bool = False
+    moved: Count = 0
+    crossed: tuple[str, ...] = ()
+    text: str = ""
+
+    @classmethod
+    def of(cls, device: str, t: float | None, samples: int, result: Health) -> Self:
+        """Build the message from the health of a device."""
+        return cls(
+            device=device,
+            t=t,
+            samples=result.received,
+            state=result.state,
+            rate=result.rate_hz,
+            received=result.received,
+            lost=result.lost,
+            bad=result.bad,
+            overflowed=result.overflowed,
+            latency=Latency(result.latency_p50_s, result.latency_p99_s),
+            memory=result.memory_bytes,
+            outputs={name: mask_secrets(state) for name, state in result.outputs.items()},
+            uptime=result.uptime_s,
+            repeated=result.repeated,
+            late=result.late,
+            moving=result.moving,
+            moved=result.moved,
+            crossed=result.crossed,
+            text=mask_secrets(result.text),
+        )
+
+    @classmethod
+    def decode(cls, payload: bytes) -> Self:
+        """Decode a message of another process; its texts are cleaned.
+
+        Raises
+        ------
+        ValueError
+            If the payload is not a status.
+        """
+        found = decode_message(cls, payload)
+        outputs = {_clean(name): _clean(state) for name, state in list(found.outputs.items())[:MAX_OUTPUTS]}
+        crossed = tuple(_clean(one) for one in found.crossed)
+        return msgspec.structs.replace(
+            found, state=_clean(found.state), text=_clean(found.text), outputs=outputs, crossed=crossed
+        )
+
+    def to_health(self) -> Health:
+        """Build the health of the device."""
+        return Health(
+            state=self.state,
+            rate_hz=self.rate,
+            received=self.received,
+            lost=self.lost,
+            bad=self.bad,
+            overflowed=self.overflowed,
+            latency_p50_s=self.latency.p50,
+            latency_p99_s=self.latency.p99,
+            memory_bytes=self.memory,
+            outputs=self.outputs,
+            text=self.text,
+            uptime_s=self.uptime,
+        )
+
+
+class ResetMessage(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
+    """Reply to ``imu/<device>/command/reset``; the result is a text for the user."""
+
+    topic = topics.RESET
+    text: str
+
+    @classmethod
+    def of(cls, device: str, t: float | None, samples: int, result: str) -> Self:
+        """Build the message from the text."""
+        return cls(device=device, t=t, samples=samples, text=result)
+
+
+class ReconcileMessage(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
+    """Head of the reply to ``imu/<device>/command/reconcile``; the keys of the report follow."""
+
+    topic = topics.RECONCILE
+
+    def encode_report(self, report: Mapping[str, Any], status: int, folder: str | None) -> bytes:
+        """Encode the reply.
+
+        Parameters
+        ----------
+        report
+            Report of the command.
+        status
+            Exit status of the command.
+        folder
+            Folder that contains the complete report; None if the report was not saved.
+        """
+        head = msgspec.to_builtins(self)
+        keys = {key: value for key, value in report.items() if key not in head}
+        return msgspec.json.encode({**head, **keys, "exit": status, "folder": folder})
+
+
+def coefficient_values(coefficients: Coefficients, axis: int, k_or_r: bool = False) -> dict[str, CoefficientValue]:
+    """Return the coefficients of one axis by symbol, as in messages and in ``analyze --json``.
+
+    Parameters
+    ----------
+    coefficients
+        Coefficients of all axes.
+    axis
+        Column of the axis.
+    k_or_r
+        True if either K or R is present and the data do not show which.
+    """
+    other = {"K": "R", "R": "K"} if k_or_r else {}
+    return {
+        symbol: CoefficientValue(
+            float(coefficients.value[row, axis]),
+            float(coefficients.lo[row, axis]),
+            float(coefficients.hi[row, axis]),
+            Status(int(coefficients.status[row, axis])).name.lower(),
+            other.get(symbol, UNSET),
+        )
+        for row, symbol in enumerate(SYMBOLS)
+    }
+
+
+def event_start_s(unix_s: float, event: Event) -> float | None:
+    """Return the Unix time [s] at which the condition reported by an event began; None if unknown.
+
+    Parameters
+    ----------
+    unix_s
+        Unix time of the event [s].
+    event
+        The event.
+    """
+    return None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
+
+
+def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -> Floats:
+    """Return the Allan variance of the estimated terms, shape [m, 6]; NaN on axes without estimated terms.
+
+    Parameters
+    ----------
+    tau_s
+        Averaging times [s], shape [m].
+    rate_hz
+        Sample rate [Hz].
+    coefficients
+        Coefficients of all axes.
+    """
+    unit_variances = np.column_stack([source.avar(tau_s, 1.0 / rate_hz) for source in UNIT_SOURCES])
+    total: Floats = unit_variances @ np.nan_to_num(coefficients.value) ** 2
+    total[:, np.isnan(coefficients.value).all(axis=0)] = np.nan
+    return total
+
+
+def deviation_columns(curve: AllanCurve | TotalCurve | HadamardCurve, axis: int) -> tuple[Floats, Floats, Floats]:
+    """Return the deviations of one axis and the ends of their intervals, each of shape [m].
+
+    Parameters
+    ----------
+    curve
+        Variances of all axes.
+    axis
+        Column of the axis.
+    """
+    match curve:
+        case AllanCurve():
+            variance = curve.avar
+        case TotalCurve():
+            variance = curve.tvar
+        case HadamardCurve():
+            variance = curve.hvar
+    return np.sqrt(variance[:, axis]), curve.lo[:, axis], curve.hi[:, axis]
+
+
+def measured_axes(curve: AllanCurve) -> list[tuple[int, str]]:
+    """Return the column and name of each axis that has a curve."""
+    return [(i, axis) for i, axis in enumerate(AXES) if not np.isnan(curve.avar[:, i]).all()]
+
+
+def _window(estimate: Estimate) -> dict[str, Any]:
+    """Return the fields that describe the window of an estimate."""
+    return {
+        "samples": estimate.samples,
+        "rate": estimate.rate_hz,
+        "window": estimate.window_s,
+        "filled": estimate.curve.n / estimate.rate_hz,
+    }
+
+
+def _clean(text: str) -> str:
+    """Return a received text without control characters, cut to MAX_TEXT_LENGTH."""
+    return remove_control_characters(text[:MAX_TEXT_LENGTH])

@@ -1,0 +1,289 @@
+"""State of all devices that daemons publish, from their messages.
+
+``watch``, ``view`` and the table of ``run`` show these states. The messages may come from any program on the network.
+Malformed messages are counted, and the memory for devices and texts is limited. The module does no I/O.
+"""
+
+import copy
+import threading
+import time
+from collections import OrderedDict, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from drivers.sample import AXES
+from monitor.common import topics
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficients import Coefficients
+from monitor.publishing.messages.message import Message, decode_message
+from monitor.publishing.messages.results import (
+    CoefficientsMessage,
+    EventMessage,
+    GapMessage,
+    StatusMessage,
+    measured_axes,
+)
+
+NORMAL_OUTPUT_STATES: Final = ("ok", "off")
+"""States of an output that are not shown."""
+GONE_TIMEOUT_S: Final = 1.5
+"""Age of the newest message [s] after which a device without liveliness token is gone. The status comes at 1 Hz, so a
+daemon that is killed is reported within two seconds."""
+SILENCE_TIMEOUT_S: Final = 5.0
+"""Age of the newest message [s] after which a device is silent, if its token exists or was never seen."""
+MAX_NAMED_LIMITS: Final = 6
+"""Largest number of exceeded limits that are listed by name."""
+MAX_DEVICES: Final = 20_000
+"""Largest number of devices. A further device replaces one that has been silent for FORGET_AFTER_S, or is ignored."""
+FORGET_AFTER_S: Final = 600.0
+MAX_KEY_LENGTH: Final = 200
+MAX_EVENTS: Final = 5
+"""Number of newest events that are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class DeviceCoefficients:
+    """Newest coefficients of a device."""
+
+    coefficients: Coefficients
+    axes: tuple[str, ...]  # measured axes
+    k_or_r: frozenset[str]  # axes on which either K or R is present and the data do not show which
+    filled_s: float | None = None  # filled part of the window [s]
+
+    @classmethod
+    def from_estimate(cls, estimate: Estimate) -> "DeviceCoefficients":
+        """Return the coefficients of an estimate."""
+        measured = measured_axes(estimate.curve)
+        k_or_r = frozenset(axis for i, axis in measured if estimate.k_or_r[i])
+        return cls(estimate.coefficients, tuple(axis for _, axis in measured), k_or_r)
+
+    @classmethod
+    def from_message(cls, message: CoefficientsMessage) -> "DeviceCoefficients":
+        """Return the coefficients of a message.
+
+        Raises
+        ------
+        ValueError
+            If a coefficient has an unknown status.
+        """
+        axes = tuple(axis for axis in AXES if axis in message.axes)
+        k_or_r = frozenset(axis for axis in axes if any(one.other for one in message.axes[axis].values()))
+        return cls(message.to_coefficients(), axes, k_or_r, message.filled)
+
+
+@dataclass(slots=True)
+class RemoteDevice:
+    """State of a remote device; times are those of the receiver's monotonic clock."""
+
+    key: str  # key of the device, without the topic
+    last_message_s: float  # time of the newest message of any topic
+    status: StatusMessage | None = None
+    coefficients: DeviceCoefficients | None = None
+    disagreements: tuple[str, ...] = ()  # one text for each axis that disagrees with its model
+    token_exists: bool | None = None  # True if its liveliness token exists; None if unknown
+
+    def state(self, now_s: float) -> str:
+        """Return the state that the daemon reports, or gone, silent or present (no status received yet)."""
+        age_s = now_s - self.last_message_s
+        ended = self.status is not None and self.status.state == "ended"
+        if age_s > GONE_TIMEOUT_S and self.token_exists is False and not ended:
+            return "gone"
+        if age_s > SILENCE_TIMEOUT_S and not ended:
+            return "silent"
+        return "present" if self.status is None else self.status.state
+
+    def rank(self, now_s: float) -> int:
+        """Return the sort key, worst first: 0 no data, 1 a problem or not ready, 2 running, 3 ended."""
+        state, status = self.state(now_s), self.status
+        if state in ("lost", "gone", "silent"):
+            return 0
+        if state == "ended":
+            return 3
+        if status is None or state != "running":
+            return 1
+        outputs_work = all(one in NORMAL_OUTPUT_STATES or one.startswith("ok,") for one in status.outputs.values())
+        troubled = status.text or status.overflowed or status.crossed or self.disagreements
+        return 2 if outputs_work and not troubled else 1
+
+    def problems(self) -> str:
+        """Return a description of all problems; empty if there are none."""
+        if self.status is None:
+            return ""
+        found = [self.status.text] if self.status.text else []
+        outputs = self.status.outputs.items()
+        found += [f"{name}: {state}" for name, state in outputs if state not in NORMAL_OUTPUT_STATES]
+        if self.status.overflowed:
+            found.append(f"{self.status.overflowed:,} samples overwritten before they were used: too slow here")
+        if crossed := self.status.crossed:
+            more = f" and {len(crossed) - MAX_NAMED_LIMITS} more" if len(crossed) > MAX_NAMED_LIMITS else ""
+            found.append(f"beyond its limit: {', '.join(crossed[:MAX_NAMED_LIMITS])}{more}")
+        return "; ".join([*found, *self.disagreements])
+
+    def update(self, message: Message) -> None:
+        """Update the state from a message.
+
+        Raises
+        ------
+        ValueError
+            If a coefficient has an unknown status. The state is not changed.
+        """
+        match message:
+            case StatusMessage():
+                self.status = message
+            case CoefficientsMessage():
+                self.coefficients = DeviceCoefficients.from_message(message)
+            case GapMessage():
+                self.disagreements = tuple(describe_disagreements(message))
+
+
+class DeviceStates:
+    """State of all devices, updated from the messages of ``monitor.common.topics``; thread-safe.
+
+    Parameters
+    ----------
+    clock
+        Clock for the age of messages [s]; callers pass times of the same clock.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.note = ""  # note for the user, e.g. which endpoints cannot be reached
+        self.malformed = 0  # number of messages that could not be decoded
+        self.ignored = 0  # number of messages of devices beyond MAX_DEVICES
+        self._clock = clock
+        self._devices: OrderedDict[str, RemoteDevice] = OrderedDict()  # by the time of the last message, oldest first
+        self._events: deque[tuple[str, EventMessage]] = deque(maxlen=MAX_EVENTS)
+        self._lock = threading.Lock()
+
+    def process_message(self, key: str, payload: bytes) -> Message | None:
+        """Process a message, and return it; None if its topic is not shown in tables or if it is malformed.
+
+        Parameters
+        ----------
+        key
+            Key of the message.
+        payload
+            Encoded message.
+        """
+        device, topic = split_key(key) or ("", topics.ALIVE)
+        with self._lock:
+            try:
+                message = decode_for_table(topic, payload)
+                if message is None:
+                    return None
+                known = self._devices.get(device) or RemoteDevice(device, 0.0)
+                known.update(message)
+            except ValueError:
+                self.malformed += 1
+                return None
+            if self._add(known):
+                known.last_message_s = self._clock()
+                self._devices.move_to_end(device)
+                if isinstance(message, EventMessage):
+                    self._events.append((device, message))
+        return message
+
+    def set_token(self, key: str, exists: bool) -> None:
+        """Process the change of a liveliness token.
+
+        Parameters
+        ----------
+        key
+            Key of the token.
+        exists
+            True if the token exists.
+        """
+        device, topic = split_key(key) or ("", None)
+        if topic is not topics.ALIVE:
+            return
+        with self._lock:
+            known = self._devices.get(device) or RemoteDevice(device, self._clock())
+            if self._add(known):
+                known.token_exists = exists
+
+    def remove(self, key: str) -> None:
+        """Remove the state and the events of the device that ``key`` belongs to."""
+        device, _ = split_key(key) or ("", None)
+        with self._lock:
+            self._devices.pop(device, None)
+            for one in [one for one in self._events if one[0] == device]:
+                self._events.remove(one)
+
+    def devices(self, now_s: float) -> list[RemoteDevice]:
+        """Return copies of the states of all devices at time ``now_s`` [s], those with problems first."""
+        with self._lock:
+            found = [copy.copy(one) for one in self._devices.values()]
+        return sorted(found, key=lambda one: (one.rank(now_s), one.key))
+
+    def coefficients(self, device: str) -> DeviceCoefficients | None:
+        """Return the newest coefficients of a device; None if there are none."""
+        with self._lock:
+            known = self._devices.get(device)
+        return None if known is None else known.coefficients
+
+    def events(self) -> list[tuple[str, EventMessage]]:
+        """Return the newest events with the keys of their devices, oldest first."""
+        with self._lock:
+            return list(self._events)
+
+    def _add(self, device: RemoteDevice) -> bool:
+        """Add a device if it is new; return False if there are too many devices."""
+        if device.key in self._devices:
+            return True
+        full = len(self._devices) >= MAX_DEVICES
+        oldest_s = next(iter(self._devices.values())).last_message_s if full else 0.0
+        if len(device.key) > MAX_KEY_LENGTH or (full and self._clock() - oldest_s < FORGET_AFTER_S):
+            self.ignored += 1
+            return False
+        if full:
+            self._devices.popitem(last=False)
+        self._devices[device.key] = device
+        return True
+
+
+def split_key(key: str) -> tuple[str, topics.Topic] | None:
+    """Split a key into the key of the device and the topic; None if the topic is not in ``monitor.common.topics``.
+
+    >>> split_key("imu/bench-1/status")
+    ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz', kept=1))
+    >>> split_key("imu/bench-1/mood")
+    """
+    for topic in topics.TOPICS:
+        device = key.removesuffix(f"/{topic.name}")
+        if device != key and device:
+            return device, topic
+    return None
+
+
+def decode_for_table(topic: topics.Topic, payload: bytes) -> Message | None:
+    """Decode a message that tables of devices show; None for all other topics.
+
+    Parameters
+    ----------
+    topic
+        Topic of the message.
+    payload
+        Encoded message.
+
+    Raises
+    ------
+    ValueError
+        If the payload is not a message of this topic.
+    """
+    if topic is topics.STATUS:
+        return StatusMessage.decode(payload)
+    if topic is topics.EVENT:
+        return EventMessage.decode(payload)
+    if topic is topics.COEFFICIENTS:
+        return decode_message(CoefficientsMessage, payload)
+    return decode_message(GapMessage, payload) if topic is topics.GAP else None
+
+
+def describe_disagreements(message: GapMessage) -> list[str]:
+    """Return a text for each axis that disagrees with its model."""
+    found = [(axis, message.axes[axis]) for axis in AXES if axis in message.axes]
+    return [
+        f"{axis} disagrees with its model: {one.gap:.3g} σ at τ {one.where.tau[0]:.3g} to {one.where.tau[1]:.3g} s"
+        for axis, one in found
+        if one.agrees is False
+    ]

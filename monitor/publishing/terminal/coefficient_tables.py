@@ -1,0 +1,79 @@
+"""Tables of the coefficients of one device with their intervals, for ``analyze`` and for ``watch``."""
+
+from collections.abc import Collection
+from typing import Final
+
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from monitor.common.units import COEFFICIENT_UNITS, KIND_NAMES, KINDS, NO_VALUE, Kind, axes_of, format_duration
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.publishing.coefficient_cells import (
+    TEMPERATURE_MARK,
+    TEMPERATURE_MEANS,
+    format_coefficient,
+    mark_temperature_axis,
+)
+from monitor.publishing.remote_devices import DeviceCoefficients
+from monitor.publishing.terminal.tables import WidthDependentTable, plain_table
+
+K_OR_R: Final = "K or R"
+"""Mark of K and R if the data do not show which of the two is present."""
+
+
+def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()) -> RenderableType:
+    """Return the table of coefficients with intervals for ``analyze``.
+
+    Parameters
+    ----------
+    estimate
+        The estimate.
+    axes_of_temperature
+        Axes to mark because temperature explains most of their slow variance.
+    """
+    return Group(*coefficient_tables(DeviceCoefficients.from_estimate(estimate), axes_of_temperature))
+
+
+def coefficient_tables(known: DeviceCoefficients, axes_of_temperature: Collection[str] = ()) -> list[RenderableType]:
+    """Return a legend and a table for each kind of sensor, with a row for each axis and a column for each coefficient.
+
+    Parameters
+    ----------
+    known
+        Coefficients of the device.
+    axes_of_temperature
+        Axes to mark because temperature explains most of their slow variance.
+    """
+    time_text = "" if known.filled_s is None else f"last {format_duration(known.filled_s)}; "
+    marks = f"; {K_OR_R}: one of them" if known.k_or_r else ""
+    marks += f"; {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
+    legend = Text(f"{time_text}[95 % interval]; ≤ bound; {NO_VALUE} too few data yet{marks}", style="dim")
+    parts: list[RenderableType] = [legend]
+    for kind in KINDS:
+        if set(axes_of(kind)) & set(known.axes):
+            wide, narrow = (_kind_table(known, kind, stacked, axes_of_temperature) for stacked in (False, True))
+            parts.append(WidthDependentTable(wide, narrow))
+    return parts
+
+
+def _kind_table(known: DeviceCoefficients, kind: Kind, stacked: bool, axes_of_temperature: Collection[str]) -> Table:
+    """Return the table of one kind of sensor; intervals are below the values if ``stacked``, else beside them."""
+    table = plain_table(kind if stacked else KIND_NAMES[kind])
+    for symbol in SYMBOLS:
+        table.add_column(f"{symbol} {COEFFICIENT_UNITS[kind][symbol].name}", justify="right", no_wrap=True)
+    separator = "\n" if stacked else " "
+    for axis in (axis for axis in axes_of(kind) if axis in known.axes):
+        cells = [_cell(known, symbol, axis, separator) for symbol in SYMBOLS]
+        table.add_row(Text(mark_temperature_axis(axis, axes_of_temperature), style="bold"), *cells)
+    return table
+
+
+def _cell(known: DeviceCoefficients, symbol: str, axis: str, separator: str) -> Text:
+    """Return the cell of one coefficient: value, interval and the mark K_OR_R."""
+    one = format_coefficient(known.coefficients, symbol, axis)
+    small = [f"[{one.interval}]"] if one.interval else []
+    if axis in known.k_or_r and symbol in ("K", "R"):
+        small.append(K_OR_R)
+    return Text.assemble(one.value, *((separator + part, "dim") for part in small))

@@ -1,0 +1,49 @@
+"""Helpers for tables in the terminal."""
+
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.table import Table
+
+UNLIMITED_WIDTH = 10_000
+
+
+def plain_table(*heads: str, gap: int = 2, show_header: bool = True) -> Table:
+    """Return an empty table without borders.
+
+    Parameters
+    ----------
+    *heads
+        Headers of the first columns, whose cells are not wrapped.
+    gap
+        Number of blanks between columns.
+    show_header
+        False to omit the headers.
+    """
+    table = Table(box=None, padding=(0, gap, 0, 0), pad_edge=False, header_style="bold", show_header=show_header)
+    for head in heads:
+        table.add_column(head, no_wrap=True)
+    return table
+
+
+def table_width(table: Table, console: Console, options: ConsoleOptions) -> int:
+    """Return the width that a table needs without wrapping.
+
+    Parameters
+    ----------
+    table
+        The table.
+    console, options
+        Destination.
+    """
+    return console.measure(table, options=options.update(max_width=UNLIMITED_WIDTH)).maximum
+
+
+class WidthDependentTable:
+    """Renderable that shows the wide table if it fits, and the narrow one otherwise."""
+
+    def __init__(self, wide: Table, narrow: Table) -> None:
+        self._wide = wide
+        self._narrow = narrow
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """Yield one of the two tables."""
+        yield self._wide if table_width(self._wide, console, options) <= options.max_width else self._narrow

@@ -1,0 +1,118 @@
+"""``imu-monitor watch``: the table of all devices that daemons publish over zenoh."""
+
+import contextlib
+import threading
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final, TextIO, cast
+
+from rich.console import Console
+
+from monitor.publishing.remote_devices import DeviceStates
+from monitor.publishing.terminal.live_table import LiveTable, device_table
+from monitor.publishing.terminal.queued_writer import QueuedWriter
+from monitor.publishing.zenoh.subscriber import KEYEXPR, ZenohSubscriber
+
+REFRESH_PERIOD_S: Final = 0.5
+PLAIN_PERIOD_S: Final = 1.0
+"""Interval between two tables if the output is not a terminal."""
+SILENCE_NOTE_S: Final = 5.0
+"""Time without any message after which the note says so, because access control refuses silently."""
+STDOUT: Final = "standard output"
+
+
+def watch(
+    keyexpr: str = KEYEXPR,
+    connect: Sequence[str] = (),
+    stop: threading.Event | None = None,
+    console: Console | None = None,
+    once_s: float | None = None,
+    file: Path | None = None,
+) -> None:
+    """Show the table until ``stop`` is set or Ctrl-C is pressed.
+
+    The table is written by a separate thread. A terminal or pipe that is not read delays neither messages nor the exit.
+
+    Parameters
+    ----------
+    keyexpr
+        Key expression that selects the devices.
+    connect
+        Endpoints of daemons or routers.
+    stop
+        Event that ends the function.
+    console
+        Console that formats the table.
+    once_s
+        Time to collect messages [s], after which the table is printed once. None: show it continuously.
+    file
+        Configuration file of zenoh.
+
+    Raises
+    ------
+    ConfigError
+        If zenoh rejects the key expression, an endpoint or the file with certificates and passwords.
+    OSError
+        If standard output cannot be written.
+    """
+    stop, console = stop or threading.Event(), console or Console()
+    stream, states = cast("TextIO", console.file), DeviceStates()
+    with (
+        contextlib.closing(ZenohSubscriber(keyexpr, connect, file)) as subscriber,
+        contextlib.suppress(KeyboardInterrupt),
+    ):
+        subscriber.start()
+        if once_s is not None:
+            stop.wait(once_s)
+            receive_messages(states, subscriber)
+            with QueuedWriter(stream, STDOUT, LiveTable(console, states).render) as writer:
+                writer.finish(stop)
+        elif console.is_terminal:
+            with QueuedWriter(stream, STDOUT, LiveTable(console, states).render, REFRESH_PERIOD_S) as writer:
+                while not stop.wait(REFRESH_PERIOD_S) and writer.error is None:
+                    receive_messages(states, subscriber)
+                    writer.redraw()
+        else:
+            with QueuedWriter(stream, STDOUT, limit=1) as writer:  # at most one table is queued
+                while not stop.wait(PLAIN_PERIOD_S) and writer.error is None:
+                    receive_messages(states, subscriber)
+                    with console.capture() as captured:
+                        console.print(device_table(states, time.monotonic()))
+                    writer.put(captured.get())
+
+
+def receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None:
+    """Process all received messages, and update the note about the connection.
+
+    Parameters
+    ----------
+    states
+        State of the devices.
+    subscriber
+        Source of the messages.
+    """
+    for message in subscriber.take(0.0):
+        if message.payload is None:
+            states.set_token(message.key, message.there)
+        else:
+            states.process_message(message.key, message.payload)
+    states.note = connection_note(states, subscriber)
+
+
+def connection_note(states: DeviceStates, subscriber: ZenohSubscriber) -> str:
+    """Return a description of what is wrong with the connection to the daemons; empty if nothing is.
+
+    Parameters
+    ----------
+    states
+        State of the devices.
+    subscriber
+        Source of the messages.
+    """
+    state, dropped = subscriber.state, subscriber.dropped
+    notes = [state] if state != "ok" else []
+    if state == "ok" and subscriber.open_s > SILENCE_NOTE_S and not states.devices(time.monotonic()):
+        notes.append("connected, but nothing comes: no daemon there, or no right to listen")
+    notes += [f"{dropped:,} messages dropped: too slow here"] if dropped else []
+    return "; ".join(notes)

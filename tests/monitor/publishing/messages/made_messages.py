@@ -1,0 +1,193 @@
+"""One message of each kind, from plain numbers: square roots and products give the same digits on every machine."""
+
+from pathlib import Path
+
+import numpy as np
+
+from drivers.sample import Event
+from monitor.common.health import Health
+from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate
+from monitor.drift.thermal.recursive_least_squares import PredictionInterval
+from monitor.drift.thermal.temperature_dependence import TemperatureDependence
+from monitor.drift.thermal.temperature_share import TemperatureShare
+from monitor.estimation.allan.curve import AllanCurve
+from monitor.estimation.allan.dynamic_allan import DynamicAllan
+from monitor.estimation.allan.hadamard import HadamardCurve
+from monitor.estimation.allan.total import TotalCurve
+from monitor.estimation.analysis import Analysis
+from monitor.estimation.detection.change_detection import Change
+from monitor.estimation.detection.model_gap import AxisGap, ModelGap
+from monitor.estimation.detection.motion_detection import Motion
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficient_fit import empty_fit
+from monitor.estimation.fit.coefficients import Coefficients, Status
+from monitor.history.query import PARTS, HistoryQuery
+from monitor.history.reading import HistoryTable
+from monitor.history.sqlite_store import StoredEvent
+from monitor.history.time_ranges import TimeRange
+from monitor.publishing.messages.analysis import AnalysisMessage, FailedAnalysisMessage
+from monitor.publishing.messages.history import HistoryMessage
+from monitor.publishing.messages.message import Message
+from monitor.publishing.messages.results import (
+    AllanMessage,
+    CoefficientsMessage,
+    EventMessage,
+    GapMessage,
+    ResetMessage,
+    SlowStatistics,
+    StatusMessage,
+    ThermalMessage,
+    TotalMessage,
+)
+
+EXAMPLES = Path(__file__).parent / "examples"
+UNIX_S = 1763700000.01
+TAU_S = np.array([0.01, 0.02, 0.04])
+SIX = np.arange(1.0, 7.0)
+
+
+def estimate() -> Estimate:
+    """Three gyroscopes; gz has one value less; K or R on gy; Q is a bound and R is not estimated."""
+    avar = np.outer(1.0 / TAU_S, SIX) * 1e-10
+    avar[:, 3:] = np.nan
+    avar[2, 2] = np.nan
+    sigma = np.sqrt(avar)
+    curve = AllanCurve(
+        TAU_S, np.array([1, 2, 4]), avar, np.ones((3, 6), np.int64), np.ones((3, 6)), 0.5 * sigma, 2.0 * sigma, 1500
+    )
+    shorter = AllanCurve(TAU_S, curve.factors, 4.0 * avar, curve.terms, curve.edf, 0.25 * sigma, 4.0 * sigma, 500)
+    return Estimate(
+        10**18, 100.0, 60.0, 360_000, curve, avar, coefficients(), np.array([False, True, *[False] * 4]), shorter
+    )
+
+
+def coefficients(scale: float = 1.0) -> Coefficients:
+    value = scale * np.outer([1e-6, 1e-4, 1e-5, 1e-7, 1e-9], SIX)
+    lo, hi, status = 0.5 * value, 2.0 * value, np.full((5, 6), Status.ESTIMATED, np.int8)
+    value[0], lo[0], status[0] = np.nan, 0.0, Status.UPPER_BOUND
+    value[4], lo[4], hi[4], status[4] = np.nan, np.nan, np.nan, Status.UNESTIMATED
+    return Coefficients(value, lo, hi, status)
+
+
+def gap() -> ModelGap:
+    def axis(name: str) -> AxisGap:
+        return AxisGap(
+            name, np.array([3e-4, 2e-4, np.nan]), np.array([2e-4, 2.5e-4, 1e-4]), np.array([6.5, -1.25, np.nan]),
+            6.5, (0.01, 0.02), 0, 2.5, 3.5, 4.5, 1500,
+        )  # fmt: skip
+
+    return ModelGap(10**18, 100.0, 60.0, 360_000, 1500, TAU_S, {"gx": axis("gx"), "gz": axis("gz")}, {"gz": False})
+
+
+def thermal() -> ThermalUpdate:
+    gz = AxisThermalUpdate(
+        3e-4, 1e-6, PredictionInterval(2e-4, 1e-4, 3e-4), PredictionInterval(2.2e-4, 1.8e-4, 2.6e-4), "linear", 2e-5, ""
+    )
+    az = AxisThermalUpdate(9.81, np.nan, None, None, "", np.nan, "the temperature hardly moved")
+    return ThermalUpdate(0, 600.0, 25.5, {"gz": gz, "az": az})
+
+
+def slow_curves() -> tuple[TotalCurve, HadamardCurve]:
+    found = estimate().curve
+    lo = found.lo.copy()
+    lo[1:] = np.nan
+    total = TotalCurve(TAU_S, found.factors, found.avar, found.terms, found.edf, lo, found.hi)
+    two = slice(0, 2)
+    hadamard = HadamardCurve(
+        TAU_S[two], found.factors[two], 0.25 * found.avar[two], found.terms[two], found.edf[two], lo[two], found.hi[two]
+    )
+    return total, hadamard
+
+
+def event() -> Event:
+    return Event(
+        "noise_changed", 5_000_000_000, "gz rose; tcp://user:secret@host", "gz",
+        {"N": {"before": 1.5e-4, "after": 2.5e-4}, "B": {"before": np.nan, "after": 1e-5}}, 1_000_000_000, 9.5,
+    )  # fmt: skip
+
+
+def health() -> Health:
+    return Health(
+        "running", 99.98, 360_000, 3, 1, 2, 0.0025, None, 182_000_000,
+        {"zenoh": "ok", "viewer": "stalled (3 dropped)"}, "too slow", 3600.5, 4, 5, True, 6, ("gz N", "ax B"),
+    )  # fmt: skip
+
+
+def analysis() -> Analysis:
+    motion = Motion("knock", 250, 400, 0.5, "gx", 0.25, "knocked")
+    noise = Change("noise_changed", 2, 25_000, 25_100, 9.5, {"N": (1.5e-4, 2.5e-4)}, "gz rose")
+    line = Change("noise_changed", 0, 30_000, 30_100, 12.0, {"band": (10.0, 20.0), "rms": (1e-3, 2e-3)}, "gx line")
+    found = estimate()
+    return Analysis(
+        found, 15.0, ("a note",), np.zeros((1, 6)), empty_fit(found.curve.avar),
+        np.array([np.nan, 33.5, *[np.nan] * 4]), (motion,), (noise, line), False, ("gz",),
+    )  # fmt: skip
+
+
+def dynamic() -> DynamicAllan:
+    deviation = np.multiply.outer(np.array([1.0, 2.0]), np.outer(TAU_S, SIX))
+    deviation[0, 2] = np.nan
+    value = np.multiply.outer(np.array([1.0, 2.0]), coefficients().value)
+    status = np.stack([coefficients().status] * 2)
+    return DynamicAllan(
+        np.array([10.0, 15.0]), 10.0, 100.0, TAU_S, deviation, 0.5 * deviation, 2.0 * deviation,
+        value, 0.5 * value, 2.0 * value, status,
+    )  # fmt: skip
+
+
+def without_temperature() -> TemperatureShare:
+    return TemperatureShare(
+        {"gz": "cubic"}, coefficients(), coefficients(0.5), (False,) * 6,
+        {"gz": TemperatureDependence(0.75, 1e-6, "cubic", True, 60.0)},
+    )  # fmt: skip
+
+
+def past() -> HistoryTable:
+    """Two buckets: N is estimated in the first and bounded in the second."""
+    names = (
+        "gz.N", "gz.N.lo", "gz.N.hi", "gz.N.bound", "gz.sigma.0.1", "gz.sigma.1", "rate", "latency",
+        "memory", "temperature",
+    )  # fmt: skip
+    last = np.array([
+        [1.1e-4, 1e-4, 1.2e-4, np.nan, 3e-4, np.nan, 99.98, 0.0025, 1.8e8, 21.3],
+        [np.nan, np.nan, np.nan, 3e-4, 4e-4, 5e-4, np.nan, np.nan, 1.9e8, np.nan],
+    ])  # fmt: skip
+    n = np.isfinite(last).astype(np.int64) * 3
+    return HistoryTable(
+        "bench-1", TimeRange(UNIX_S - 120.0, UNIX_S), 60, np.array([1763699880, 1763699940]), np.array([60, 60]),
+        names, n, (0.5 * last).astype(np.float32), (2.0 * last).astype(np.float32), last.astype(np.float32),
+        np.array([[6000, 1, 2, 3], [5000, 0, 0, 0]]), np.array([1, 3]),
+        (
+            StoredEvent(
+                UNIX_S - 30.0, "noise_changed", "gz rose", "gz", {"N": {"before": 1e-4, "after": 2e-4}}, UNIX_S, 9.5, 3
+            ),
+            StoredEvent(UNIX_S - 20.0, "moved", "moved"),
+        ),
+        2,
+    )  # fmt: skip
+
+
+def messages() -> dict[str, Message | AnalysisMessage | FailedAnalysisMessage]:
+    """Message of each kind by the name of its example."""
+    device, query = "bench-1", HistoryQuery(what=PARTS)
+    waiting = Health("waiting", None, 0, 0, 0, 0, None, None, 1, {}, "", 0.5)
+    return {
+        "allan": AllanMessage.of(device, UNIX_S, 0, estimate()),
+        "coefficients": CoefficientsMessage.of(device, UNIX_S, 0, estimate()),
+        "total": TotalMessage.of(device, UNIX_S, 360_000, SlowStatistics(*slow_curves())),
+        "gap": GapMessage.of(device, UNIX_S, 0, gap()),
+        "thermal": ThermalMessage.of(device, UNIX_S, 360_000, thermal()),
+        "event": EventMessage.of(device, UNIX_S, 7, event()),
+        "event_plain": EventMessage.of(device, UNIX_S, 7, Event("link_back", 0, "back")),
+        "status": StatusMessage.of(device, UNIX_S, 0, health()),
+        "status_before_the_first_sample": StatusMessage.of(device, None, 0, waiting),
+        "reset": ResetMessage.of(device, UNIX_S, 7, "the window is empty"),
+        "history": HistoryMessage.reply(past(), query, UNIX_S, 7),
+        "history_of_one_coefficient": HistoryMessage.reply(
+            past(), HistoryQuery(what=("coefficients",), axes=("gz",), letters=("B", "N")), UNIX_S, 7
+        ),
+        "analyze": AnalysisMessage.of(analysis()),
+        "analyze_with_all_curves": AnalysisMessage.of(analysis(), *slow_curves(), dynamic(), without_temperature()),
+        "analyze_failed": FailedAnalysisMessage(3, ["too few samples"]),
+    }
