@@ -111,7 +111,9 @@ def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
 def slope_of_recording(values: Floats) -> Floats:
     """Return the slope of the rate [k] over a recording [n, k] in units per sample, from its first and last third.
 
-    The slope is NaN if more than a fiftieth of the samples is missing.
+    The slope is the mean of the last third minus the mean of the first third, divided by two thirds of the duration T.
+    Under white noise its variance is 13.5 N²/T³, compared with 12 N²/T³ for a regression. Under rate random walk, the
+    variances are 5/4 and 6/5 of K²/T. The slope is NaN if more than a fiftieth of the samples is missing.
 
     >>> slope_of_recording(0.5 * np.arange(9.0)[:, None]).tolist()
     [0.5]

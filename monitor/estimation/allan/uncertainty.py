@@ -163,7 +163,7 @@ def _sampled_flicker(m: int) -> float:
 
 
 def _slope_variance(n: int) -> Floats:
-    """Return the variance of ``coefficient_fit.slope_of_thirds`` for unit Q² N² B² K², τ0 = 1.
+    """Return the variance of ``batch.slope_of_recording`` for unit Q² N² B² K², τ0 = 1.
 
     It follows from the autocovariances of phase. With τ = n/3 the sums over the four points are 4, 2τ, (9 ln 3 − 8 ln
     2) τ²/π and 5τ³/3, divided by (2τ²)².

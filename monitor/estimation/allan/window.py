@@ -254,7 +254,7 @@ class AllanWindow:
         """Return the slope of the rate of each axis over its newest samples.
 
         The slope is the mean of the last third minus the mean of the first third, divided by two thirds of the duration
-        (``coefficient_fit.slope_of_thirds``).
+        (``batch.slope_of_recording``).
 
         Parameters
         ----------

@@ -91,11 +91,6 @@ class MotionDetector:
         """True if the newest decided block belongs to an episode of motion."""
         return bool(self._state.place[BEGAN] >= 0)
 
-    @property
-    def held_back_s(self) -> float:
-        """Longest delay of a sample in seconds."""
-        return 2 * self._size / self._rate_hz
-
     def update(self, samples: SampleBlock) -> list[SampleBlock]:
         """Process a block, and return the samples that have become final, oldest first."""
         first = self._index + samples.lost

@@ -136,7 +136,7 @@ class MeasuredCurve:
 
     avar: Floats  # [m, k] Allan variance, squared unit of the axis; NaN if the window is too short
     terms: Ints  # [m, k] number of second differences averaged
-    slope: Floats  # [k] unit/s, ``slope_of_thirds``; NaN means not measured, then a ramp is only bounded
+    slope: Floats  # [k] unit/s, ``batch.slope_of_recording``; NaN means not measured, then a ramp is only bounded
     slopes: Floats  # [m, k] unit/s, mean second difference of phase over τ² at each τ
     before: NDArray[np.bool_] | None = None  # [5, k] ``entered`` of the previous fit; None for a single fit
 
@@ -174,8 +174,8 @@ def fit(
         ``entered`` of the previous fit of a live window. Terms are then added at 3 σ and dropped at 1.5 σ. None means a
         single fit with a threshold of 2.33 σ.
     slope : ndarray of float64, shape (6,), or None
-        Slope of the rate in unit/s, ``slope_of_thirds`` of the same window; NaN means not measured. Without a slope, a
-        ramp is never estimated, only bounded.
+        Slope of the rate in unit/s of the same window, see ``batch.slope_of_recording``; NaN means not measured.
+        Without a slope, a ramp is never estimated, only bounded.
     slopes : ndarray of float64, shape (m, 6), or None
         Mean second difference of phase over τ² at each τ of the same window, in unit/s. Without it, the products of a
         strong ramp with the noise bias K.
@@ -305,32 +305,6 @@ def empty_fit(avar: Floats) -> Fit:
         misfit=np.ones(avar.shape[1]),
         k_or_r=np.zeros(avar.shape[1], np.bool_),
     )
-
-
-def slope_of_thirds(phase: Floats, seconds: float) -> Floats:
-    """Return the slope of the rate over a window from its integral at the start, one third, two thirds and the end.
-
-    The slope is the mean of the last third minus the mean of the first third, divided by two thirds of the window.
-    Under white noise its variance is 13.5 N²/T³, compared with 12 N²/T³ for a regression. Under rate random walk, the
-    variances are 5/4 and 6/5 of K²/T.
-
-    Parameters
-    ----------
-    phase : ndarray of float64, shape (4, k)
-        Integral of the rate in unit·s.
-    seconds : float
-        Length of the window in seconds.
-
-    Returns
-    -------
-    ndarray of float64, shape (k,)
-        Slope in unit/s.
-
-    >>> t = np.array([[0.0], [30.0], [60.0], [90.0]])
-    >>> slope_of_thirds(0.5 * 0.1 * t**2, 90.0).round(12).tolist()
-    [0.1]
-    """
-    return np.asarray((phase[3] - phase[2] - phase[1] + phase[0]) / (2.0 / 9.0 * seconds**2))
 
 
 def _white_edf(design: Design, table: CovarianceTable, terms: Ints) -> Floats:

@@ -1,4 +1,4 @@
-"""Which window should weigh the squared second differences? Rectangle, one pole, two poles, Hann, a window per τ.
+"""Comparison of windows that weight the squared second differences: rectangle, Hann, and a window per τ.
 
     python -m tests.experiments.benchmarks.windows [--records 240] [--seed 1]
 
@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from drivers.sample import AXES, Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes
-from monitor.estimation.allan.fading import FadingWindow
 from monitor.estimation.allan.uncertainty import covariance_table as covariances
 from monitor.estimation.allan.window import AllanWindow, display_spans
 from monitor.estimation.fit.coefficient_fit import Fit, design, fit
@@ -37,26 +36,23 @@ HANN: Final = 1.5
 N_TRUE, N_STEP, B_TRUE = 1.5e-4, 1.5, 4e-5
 LOOKS_S: Final = (-1.0, 30.0, 120.0, 600.0, 1800.0, 3600.0, 7200.0, 14_400.0)
 """Fits, by the time since N changed."""
-KINDS: Final = ("rectangle", "one pole", "two poles", "Hann", "a window per τ")
+KINDS: Final = ("rectangle", "Hann", "a window per τ")
 RESTARTED: Final = "rectangle, restarted"
 TAUS: Final = 17
 """Of the table of costs."""
 
-Window = AllanWindow | FadingWindow
 Courses = dict[str, Floats]  # name: σ² [looks, m, 6]
 
 
-def windows(factors: Ints, length: int, rate_hz: float) -> dict[str, Window]:
+def windows(factors: Ints, length: int, rate_hz: float) -> dict[str, AllanWindow]:
     """The recursive ones."""
     return {
         "rectangle": AllanWindow(length, factors),
-        "one pole": FadingWindow(factors, length, 1),
-        "two poles": FadingWindow(factors, length, 2),
         "a window per τ": AllanWindow(length, factors, display_spans(factors, rate_hz, length)),
     }
 
 
-def course(window: Window, values: Floats, ends: Sequence[int]) -> Floats:
+def course(window: AllanWindow, values: Floats, ends: Sequence[int]) -> Floats:
     """σ² [looks, m, 6] after so many samples each."""
     looks = []
     for start, end in zip([0, *ends], ends, strict=False):
@@ -190,18 +186,14 @@ def cost_table(rounds: int, seed: int) -> None:
         each = [[t * 1e9 / n for t in took[f"{name} {how}"]] for how, n in (("blocks", 20_000), ("singles", 2_000))]
         shown.add_row(name, *(f"{median:.0f} ({best:.0f})" for median, best in each), f"{size / 1e3:,.0f}")
     console.print(shown)
-    month = FadingWindow(2 ** np.arange(30), 30 * 86_400e3)
-    console.print(f"a month at 1 kHz, 30 τ, one pole: {bytes_of(month) / 1e3:,.0f} kB held\n")
 
 
-def bytes_of(window: Window) -> int:
-    """Memory of its arrays; most of the rectangle's are views of three."""
-    if isinstance(window, AllanWindow):
-        return window._ints.nbytes + window._floats.nbytes + window._missing.nbytes
-    return sum(array.nbytes for array in vars(window).values() if isinstance(array, np.ndarray))
+def bytes_of(window: AllanWindow) -> int:
+    """Return the memory of the arrays of a window in bytes."""
+    return window._ints.nbytes + window._floats.nbytes + window._missing.nbytes
 
 
-def advancing(window: Window, values: Floats, size: int) -> Callable[[], None]:
+def advancing(window: AllanWindow, values: Floats, size: int) -> Callable[[], None]:
     """Advance by all values, ``size`` samples a call."""
     blocks = [values[i : i + size] for i in range(0, len(values), size)]
 

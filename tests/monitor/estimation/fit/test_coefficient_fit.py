@@ -8,9 +8,9 @@ from scipy.signal import butter, sosfilt
 from scipy.stats import binom
 
 from drivers.sample import AXES
-from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
 from monitor.estimation.allan.uncertainty import covariance_table, intervals
-from monitor.estimation.fit.coefficient_fit import UNIT_SOURCES, Fit, design, fit, slope_of_thirds
+from monitor.estimation.fit.coefficient_fit import UNIT_SOURCES, Fit, design, fit
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.noise.effect import Source
@@ -29,15 +29,10 @@ N = 60_000
 RECORDS = 144
 
 
-def slope(values: np.ndarray) -> np.ndarray:
-    n = len(values)
-    return slope_of_thirds(np.cumsum(values, axis=0)[[0, n // 3, 2 * n // 3, n - 1]] / RATE_HZ, n / RATE_HZ)
-
-
 def fit_values(values: np.ndarray, with_slope: bool = True, **more) -> Fit:
     factors = cluster_sizes(len(values), RATE_HZ)
     avar, terms = overlapping_avar(values, factors)
-    given = {"slope": slope(values)} if with_slope else {}
+    given = {"slope": slope_of_recording(values) * RATE_HZ} if with_slope else {}
     return fit(design(factors, RATE_HZ), covariance_table(len(values), factors), avar, terms, **given, **more)
 
 
