@@ -35,7 +35,7 @@ def test_interval_by_interval_is_the_whole_at_once(shape, phi):
     one, whole = RecursiveThermalFit(model, means.first(20)), RecursiveThermalFit(model, means)
     for k in range(20, 72):
         one.update(float(means.temperature_c[k]), float(means.bias[k]))
-    for name in ("sizes", "start", "sigma", "lowest_c", "highest_c"):
+    for name in ("coefficients", "initial_state", "sigma", "lowest_c", "highest_c"):
         np.testing.assert_allclose(getattr(one.model, name), getattr(whole.model, name), rtol=1e-7, err_msg=name)
     np.testing.assert_allclose(one.model.covariance, whole.model.covariance, rtol=1e-4, atol=1e-25)
     for mine, theirs in zip(one.predict(27.0), whole.predict(27.0), strict=True):
