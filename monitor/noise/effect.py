@@ -22,6 +22,7 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
+from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.quantities import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, Quantity
 from drivers.sample import AXES, Floats
