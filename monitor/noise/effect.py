@@ -1,23 +1,21 @@
-"""Base classes of the effects of a noise model: frozen dataclasses of parameters with units, with the physics in one
-place.
+"""Base classes of the effects of a noise model.
 
-There are four kinds of effects. A ``Source`` adds to the rate of its axis. Its ``avar`` and ``psd`` describe the
-sampled series that it simulates, so that fit, simulation and comparison use the same physics. ``avar`` is the
-overlapping Allan variance of samples ``tau0_s`` apart, and ``psd`` is their two-sided spectrum up to half the sample
-rate. A ``Leak`` adds a share of the measurement of another axis. ``NoiseStep`` changes the size of white noise. A
-``Transform`` acts on the sum, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
+An effect is a frozen dataclass of parameters with units. There are four kinds of effects:
 
-``start`` begins an endless series. A ``NoiseSeries`` adds its next samples to a block, and a ``RunningTransform``
-transform changes a block in place. Both depend only on their random generator and on the index of the sample, not on
-how the series is divided into blocks. Their memory does not grow. ``truth`` returns the randomly drawn values that the
-parameters do not contain.
+- A ``Source`` adds to the rate of its axis. The spectrum and the Allan variance of a source describe the sampled series
+  that the source simulates, so fit, simulation and comparison use the same physics.
+- A ``Leak`` adds a share of the measurement of another axis.
+- ``NoiseStep`` changes the size of white noise.
+- A ``Transform`` acts on the sum of sources and leaks, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
 
-If a variance depends on more than the model, such as the length of the recording or the temperature, it is NaN. No
-effect does I/O, reads a clock or keeps global random state.
+``start`` begins an endless series. A ``NoiseSeries`` adds samples to a block. A ``RunningTransform`` changes a block
+in place. The samples depend only on the random generator and on the index of the sample, not on how the series is
+divided into blocks. The memory of a series does not grow. No effect does I/O, reads a clock or keeps global random
+state.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from math import ceil, inf, isfinite
 from typing import Any, ClassVar, Final
@@ -26,7 +24,7 @@ import numpy as np
 
 from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
-from drivers.quantities import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER
+from drivers.quantities import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, Quantity
 from drivers.sample import AXES, Floats
 from monitor.noise.spectrum import Spectrum
 
@@ -46,7 +44,15 @@ class SampleBlockContext:
     scratch: Floats  # [n] work array, free for use during a call
 
 
-class NoiseSeries(ABC):
+class RunningEffect:
+    """Effect that is being simulated on one axis."""
+
+    def truth(self) -> dict[str, Any]:
+        """Return the random values drawn so far that the parameters do not contain."""
+        return {}
+
+
+class NoiseSeries(RunningEffect, ABC):
     """Endless time series of a source."""
 
     @abstractmethod
@@ -57,7 +63,7 @@ class NoiseSeries(ABC):
         ----------
         values : ndarray, shape (n,), float64
             Sum of the sources of the axis. It is updated in place.
-        block : Block
+        block : SampleBlockContext
             Index, temperature and work array of the block.
         """
 
@@ -76,46 +82,89 @@ class NoiseSeries(ABC):
             self.add(values, SampleBlockContext(first, np.full(n, np.nan), np.empty(n)))
         return values
 
-    def truth(self) -> dict[str, Any]:
-        """Return the randomly drawn values so far that the parameters do not contain; empty for plain noise."""
-        return {}
+
+class FunctionSeries(NoiseSeries):
+    """Series without a state: a function adds the samples of a block."""
+
+    def __init__(self, function: Callable[[Floats, SampleBlockContext], object]) -> None:
+        self._function = function
+
+    def add(self, values: Floats, block: SampleBlockContext) -> None:
+        """Call the function."""
+        self._function(values, block)
 
 
-class RunningTransform(ABC):
+class RunningTransform(RunningEffect, ABC):
     """Transform that runs on one axis."""
 
     @abstractmethod
     def apply(self, values: Floats) -> None:
         """Transform the next values [n] in place."""
 
-    def truth(self) -> dict[str, Any]:
-        """Return the randomly drawn values so far that the parameters do not contain."""
-        return {}
+
+class MemorylessTransform(RunningTransform):
+    """Running transform whose output depends only on the present sample: a function changes the values in place."""
+
+    def __init__(self, function: Callable[[Floats], object]) -> None:
+        self._function = function
+
+    def apply(self, values: Floats) -> None:
+        """Call the function."""
+        self._function(values)
 
 
-class Effect(ABC):
-    """Named effect on one axis.
+class ParameterTable:
+    """Table of parameters in a model file. A subclass is a frozen dataclass with fields from ``parameter``.
 
     Raises
     ------
     ConfigError
-        If a parameter is not a finite number, or outside the range of its field.
+        If a parameter is not a finite number, or lies outside the range of its field.
     """
 
     __slots__ = ()
 
-    name: ClassVar[str]
-    description: ClassVar[str]  # one sentence that explains the effect to users
+    name: ClassVar[str]  # name in model files, which is the name of the module
+
+    def __init_subclass__(cls) -> None:
+        cls.name = cls.__module__.rpartition(".")[2]
 
     def __post_init__(self) -> None:
         for f in fields(self):  # type: ignore[arg-type]
-            _check_parameter(self.name, f.name, getattr(self, f.name), f.metadata)
+            value = getattr(self, f.name)
+            if mistake := _find_mistake(value, f.metadata):
+                suggestion = format_suggestion(value, AXES) if f.metadata.get("axis") and isinstance(value, str) else ""
+                raise ConfigError(f"{self.name}: {f.name} {mistake}, is {value!r}{suggestion}")
 
-    def check_axis(self, axis: str) -> None:  # noqa: B027 - most effects may be on any axis
-        """Raise ConfigError if the effect cannot be on that axis."""
 
-    def check_rate(self, rate_hz: float) -> None:  # noqa: B027 - most effects have no frequency
+class Effect(ParameterTable, ABC):
+    """Effect on one axis. The name of an effect is the name of its module."""
+
+    __slots__ = ()
+
+    description: ClassVar[str]  # one sentence that explains the effect to users
+
+    @property
+    def events_hz(self) -> float:
+        """Return the mean number of random events per second."""
+        return 0.0
+
+    def check_axis(self, axis: str) -> None:
+        """Raise ConfigError if the effect cannot be on this axis."""
+
+    def check_rate(self, rate_hz: float) -> None:
         """Raise ConfigError if samples at ``rate_hz`` cannot show the effect."""
+        for f in fields(self):  # type: ignore[arg-type]
+            value = getattr(self, f.name)
+            if f.metadata.get("below_nyquist") and not value < 0.5 * rate_hz:
+                raise ConfigError(
+                    f"{self.name}: {f.name} must be below {0.5 * rate_hz:g} Hz, half the sample rate, is {value!r}"
+                )
+        if self.events_hz > MAX_EVENTS_PER_SAMPLE * rate_hz:
+            raise ConfigError(
+                f"{self.name}: {self.events_hz:g} events a second at {rate_hz:g} Hz; "
+                f"at most {MAX_EVENTS_PER_SAMPLE:g} in a sample are possible"
+            )
 
 
 class Source(Effect):
@@ -126,27 +175,10 @@ class Source(Effect):
     uses_temperature: ClassVar[bool] = False
 
     @abstractmethod
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the overlapping Allan variance in the squared unit of the axis.
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return spectral density, lines, slope and Allan variance of samples at intervals of ``tau0_s`` seconds.
 
-        Parameters
-        ----------
-        tau_s : ndarray, float64
-            Averaging times, s.
-        tau0_s : float
-            Sample interval, s.
-        """
-
-    @abstractmethod
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return the two-sided spectral density in unit²/Hz; zero for a spectral line or a slope.
-
-        Parameters
-        ----------
-        f_hz : ndarray, float64
-            Frequencies, 0 < f ≤ 1/(2 τ0), Hz.
-        tau0_s : float
-            Sample interval, s.
+        The spectrum is NaN if it depends on the temperature or on the length of the recording.
         """
 
     @abstractmethod
@@ -161,16 +193,35 @@ class Source(Effect):
             Generator of this effect alone.
         """
 
-    def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return density, lines and slope in the form that transforms use; ``tau0_s`` is the sample interval in
-        seconds."""
-        return Spectrum(lambda f: self.psd(f, tau0_s), lambda tau: self.avar(tau, tau0_s), tau0_s)
+    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
+        """Return the overlapping Allan variance in the squared unit of the axis.
+
+        Parameters
+        ----------
+        tau_s : ndarray, float64
+            Averaging times, s.
+        tau0_s : float
+            Sample interval, s.
+        """
+        return self.spectrum(tau0_s).avar(tau_s)
+
+    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """Return the two-sided spectral density in unit²/Hz. The density of a spectral line or a slope is zero.
+
+        Parameters
+        ----------
+        f_hz : ndarray, float64
+            Frequencies, 0 < f ≤ 1/(2 τ0), Hz.
+        tau0_s : float
+            Sample interval, s.
+        """
+        return self.spectrum(tau0_s).density(f_hz)
 
 
 class Leak(Effect):
     """Effect that adds ``coefficient`` times the measurement of the axis ``source``.
 
-    The measurement of the source axis consists of its own sources through its own transforms, without leaks into it.
+    The measurement of the source axis consists of the sources and transforms of the source axis, without leaks into it.
     Axes that leak into each other therefore need no order, and there is no circular dependence.
     """
 
@@ -187,7 +238,7 @@ class Transform(Effect):
 
     @abstractmethod
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum and Allan variance after the transform; NaN if there is neither a closed form nor an
+        """Return the spectrum after the transform. The result is NaN if there is neither a closed form nor an
         integral."""
 
     @abstractmethod
@@ -205,20 +256,23 @@ class Transform(Effect):
 
 def parameter(
     gyro_unit: str,
-    accelerometer_unit: str,
+    accelerometer_unit: str | None = None,
     *,
     signed: bool = False,
     positive: bool = False,
     whole: bool = False,
     optional: bool = False,
+    below_nyquist: bool = False,
     most: float = inf,
+    quantity: Quantity | None = None,
 ) -> Any:
     """Return a dataclass field with its units and its allowed range. The default range is all numbers ≥ 0.
 
     Parameters
     ----------
     gyro_unit, accelerometer_unit : str
-        SI units on the two kinds of axes; "1" for a dimensionless number.
+        SI units on the two kinds of axes. A dimensionless number has the unit "1". None means that the unit is the same
+        on both kinds of axes.
     signed : bool
         True if negative values are allowed.
     positive : bool
@@ -227,16 +281,22 @@ def parameter(
         True if only whole numbers are allowed.
     optional : bool
         True if the parameter may be absent (None).
+    below_nyquist : bool
+        True if the parameter is a frequency that must be below half the sample rate.
     most : float
         Largest allowed value.
+    quantity : Quantity or None
+        Quantity with the supported range. None selects the quantity by the unit.
     """
     metadata = {
-        "units": (gyro_unit, accelerometer_unit),
+        "units": (gyro_unit, accelerometer_unit or gyro_unit),
         "signed": signed,
         "positive": positive,
         "whole": whole,
         "optional": optional,
+        "below_nyquist": below_nyquist,
         "most": most,
+        "quantity": quantity or QUANTITIES.get(gyro_unit, PARAMETER),
     }
     return field(default=None, metadata=metadata) if optional else field(metadata=metadata)
 
@@ -246,67 +306,18 @@ def source_axis() -> Any:
     return field(metadata={"units": ("axis", "axis"), "axis": True})
 
 
-def parameter_units(effect: type[Effect]) -> Mapping[str, tuple[str, str]]:
-    """Return the units of every parameter of an effect: on a gyroscope, and on an accelerometer."""
-    return {f.name: f.metadata["units"] for f in fields(effect)}  # type: ignore[arg-type]
+def parameter_units(table: type[ParameterTable]) -> Mapping[str, tuple[str, str]]:
+    """Return the unit of every parameter of an effect, on a gyroscope and on an accelerometer."""
+    return {f.name: f.metadata["units"] for f in fields(table)}  # type: ignore[arg-type]
 
 
-def required_parameters(effect: type[Effect]) -> tuple[str, ...]:
+def required_parameters(table: type[ParameterTable]) -> tuple[str, ...]:
     """Return the parameters that a model file must give."""
-    return tuple(f.name for f in fields(effect) if f.default is MISSING)  # type: ignore[arg-type]
-
-
-def check_below_nyquist(effect: Effect, parameter: str, rate_hz: float) -> None:
-    """Check that a frequency is below half the sample rate.
-
-    Parameters
-    ----------
-    effect : Effect
-        Effect to check.
-    parameter : str
-        Name of the parameter, in Hz.
-    rate_hz : float
-        Sample rate, Hz.
-
-    Raises
-    ------
-    ConfigError
-        If the frequency is not below half the sample rate.
-    """
-    value = getattr(effect, parameter)
-    if not value < 0.5 * rate_hz:
-        raise ConfigError(
-            f"{effect.name}: {parameter} must be below {0.5 * rate_hz:g} Hz, half the sample rate, is {value!r}"
-        )
-
-
-def check_event_rate(effect: Effect, events_hz: float, rate_hz: float) -> None:
-    """Check that random events are rare enough for a simulation.
-
-    Parameters
-    ----------
-    effect : Effect
-        Effect to check.
-    events_hz : float
-        Mean number of events per second.
-    rate_hz : float
-        Sample rate, Hz.
-
-    Raises
-    ------
-    ConfigError
-        If there are more than MAX_EVENTS_PER_SAMPLE events per sample.
-    """
-    if events_hz > MAX_EVENTS_PER_SAMPLE * rate_hz:
-        raise ConfigError(
-            f"{effect.name}: {events_hz:g} events a second at {rate_hz:g} Hz; "
-            f"at most {MAX_EVENTS_PER_SAMPLE:g} in a sample are possible"
-        )
+    return tuple(f.name for f in fields(table) if f.default is MISSING)  # type: ignore[arg-type]
 
 
 def first_sample(time_s: float, rate_hz: float) -> int:
-    """Return the index of the first sample at or after a time, with a tolerance of a millionth of a sample for
-    rounding.
+    """Return the index of the first sample at or after a time. A millionth of a sample is allowed for rounding.
 
     Parameters
     ----------
@@ -318,29 +329,20 @@ def first_sample(time_s: float, rate_hz: float) -> int:
     return ceil(time_s * rate_hz - 1e-6)
 
 
-def _check_parameter(effect: str, name: str, value: Any, allows: Mapping[str, Any]) -> None:
-    """Raise ConfigError if a value is not allowed for a parameter."""
+def _find_mistake(value: Any, allows: Mapping[str, Any]) -> str:
+    """Return what the value of a parameter must be, or an empty text if the value is allowed."""
     if allows.get("axis"):
-        if value not in AXES:
-            raise ConfigError(f"{effect}: {name} must be one of {', '.join(AXES)}, is {value!r}{_suggestion(value)}")
-        return
+        return "" if value in AXES else f"must be one of {', '.join(AXES)}"
     if value is None and allows["optional"]:
-        return
+        return ""
     if isinstance(value, bool) or not isinstance(value, int | float) or not isfinite(value):
-        raise ConfigError(f"{effect}: {name} must be a finite number, is {value!r}")
+        return "must be a finite number"
     if value < 0.0 and not allows["signed"]:
-        raise ConfigError(f"{effect}: {name} must not be negative, is {value!r}")
+        return "must not be negative"
     if value == 0.0 and allows["positive"]:
-        raise ConfigError(f"{effect}: {name} must be above zero, is {value!r}")
-    quantity = QUANTITIES.get(allows["units"][0], PARAMETER)
-    if not quantity.supports(value):
-        raise ConfigError(f"{effect}: {name} must be {quantity.range_text()}, is {value!r}")
+        return "must be above zero"
+    if not allows["quantity"].supports(value):
+        return f"must be {allows['quantity'].range_text()}"
     if value > allows["most"]:
-        raise ConfigError(f"{effect}: {name} must be at most {allows['most']:g}, is {value!r}")
-    if allows["whole"] and value != int(value):
-        raise ConfigError(f"{effect}: {name} must be a whole number, is {value!r}")
-
-
-def _suggestion(value: Any) -> str:
-    """Return the hint with the nearest axis name, if the value is a string."""
-    return format_suggestion(value, AXES) if isinstance(value, str) else ""
+        return f"must be at most {allows['most']:g}"
+    return "must be a whole number" if allows["whole"] and value != int(value) else ""

@@ -12,16 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import Floats
+from monitor.noise.spectrum import Spectrum
 
 MAX_SERIES_ARGUMENT: Final = 1e-3
 """Largest |τ(1/T_c − iω)| for which the series is used. At this value, the series has an error of 2.5·10⁻⁴ of σ², and
 the closed form one of 10⁻⁷."""
 
 
-def avar(sigma: float, decay: complex, tau_s: Floats, tau0_s: float) -> Floats:
-    """Return the overlapping Allan variance σ² Re{[n(1 − φ²) − φ(1 − q)(3 − q)] / (n²(1 − φ)²)}, q = φⁿ, n = τ/τ0.
-
-    Zhang, "Allan variance of time series models for measurement data", Metrologia 45 (2008) 549, rearranged.
+def gauss_markov_spectrum(sigma: float, decay: complex, tau0_s: float) -> Spectrum:
+    """Return the spectrum of a process with a geometric autocorrelation.
 
     Parameters
     ----------
@@ -29,16 +28,22 @@ def avar(sigma: float, decay: complex, tau_s: Floats, tau0_s: float) -> Floats:
         Standard deviation of the process.
     decay : complex
         1/T_c − iω, 1/s.
-    tau_s : ndarray, float64
-        Averaging times, s.
     tau0_s : float
         Sample interval, s.
 
     Examples
     --------
     >>> tau = np.array([1.89])
-    >>> print(f"{avar(0.5**0.5, 1.0, tau, 1e-4)[0] ** 0.5:.3f}")  # peak of the deviation: 0.437 q √T_c
+    >>> print(f"{gauss_markov_spectrum(0.5**0.5, 1.0, 1e-4).avar(tau)[0] ** 0.5:.3f}")  # peak: 0.437 q √T_c
     0.437
+    """
+    return Spectrum(lambda f: _psd(sigma, decay, f, tau0_s), lambda tau: _avar(sigma, decay, tau, tau0_s), tau0_s)
+
+
+def _avar(sigma: float, decay: complex, tau_s: Floats, tau0_s: float) -> Floats:
+    """Return the overlapping Allan variance σ² Re{[n(1 − φ²) − φ(1 − q)(3 − q)] / (n²(1 − φ)²)}, q = φⁿ, n = τ/τ0.
+
+    Zhang, "Allan variance of time series models for measurement data", Metrologia 45 (2008) 549, rearranged.
     """
     n = np.asarray(tau_s, np.float64) / tau0_s
     x = np.asarray(n * (decay * tau0_s), np.complex128)
@@ -59,20 +64,8 @@ def _series(n: Floats, x: NDArray[np.complex128]) -> Floats:
     return np.asarray(np.real(2.0 / 3.0 * x * (1.0 + 0.5 / n**2) - 0.5 * x**2 + 7.0 / 30.0 * x**3))
 
 
-def psd(sigma: float, decay: complex, f_hz: Floats, tau0_s: float) -> Floats:
-    """Return the two-sided spectrum σ²τ0 Re{(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)}.
-
-    Parameters
-    ----------
-    sigma : float
-        Standard deviation of the process.
-    decay : complex
-        1/T_c − iω, 1/s.
-    f_hz : ndarray, float64
-        Frequencies, Hz.
-    tau0_s : float
-        Sample interval, s.
-    """
+def _psd(sigma: float, decay: complex, f_hz: Floats, tau0_s: float) -> Floats:
+    """Return the two-sided spectrum σ²τ0 Re{(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)}."""
     phi, d = np.exp(-decay * tau0_s), -np.expm1(-decay * tau0_s)
     # 1 − 2φ cos θ + φ² = (1 − φ)² + 4φ sin²(θ/2), a form without cancellation
     below = d**2 + 4.0 * phi * np.sin(np.pi * f_hz * tau0_s) ** 2

@@ -10,24 +10,21 @@ the length of a recording, or the position of a rate between two quantisation st
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
-from monitor.noise import model_file
 from monitor.noise.effect import Effect, Leak, Source, Transform
 from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.noise_step import NoiseStep
 from monitor.noise.effects.sample_rate_error import SampleRateError
+from monitor.noise.model_file import error_location, format_model, format_table, parse_model
+from monitor.noise.simulation import ModelStream, check_effects
 from monitor.noise.spectrum import Spectrum, undefined_spectrum, zero_spectrum
 from monitor.noise.temperature import Temperature
-
-if TYPE_CHECKING:
-    from monitor.noise.simulation import ModelStream
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +66,7 @@ class NoiseModel:
             if axis not in AXES:
                 raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
             for effect in effects:
-                with model_file.error_location(f"{axis}.{effect.name}"):
+                with error_location(f"{axis}.{effect.name}"):
                     effect.check_axis(axis)
         ratios = sorted({effect.ratio for _, effect in self if isinstance(effect, SampleRateError)})
         if len(ratios) > 1:
@@ -95,12 +92,7 @@ class NoiseModel:
         return NoiseModel(added, self.sample_rate_hz or other.sample_rate_hz, self.temperature or other.temperature)
 
     def __str__(self) -> str:
-        return model_file.format_table(self)
-
-    @property
-    def sources(self) -> Mapping[str, tuple[Source, ...]]:
-        """Return the sources of each axis."""
-        return {axis: tuple(e for e in effects if isinstance(e, Source)) for axis, effects in self.effects.items()}
+        return format_table(self.effects, self.sample_rate_hz, self.temperature)
 
     @property
     def rate_ratio(self) -> float:
@@ -109,7 +101,7 @@ class NoiseModel:
 
     @property
     def _clock(self) -> SampleRateError:
-        """Return the sample rate error of the model, or one of ratio 1."""
+        """Return the sample rate error of the model, or a sample rate error of ratio 1."""
         return next((e for _, e in self if isinstance(e, SampleRateError)), SampleRateError(ratio=1.0))
 
     # --- second moments
@@ -199,22 +191,11 @@ class NoiseModel:
         Raises
         ------
         ConfigError
-            If a frequency is at or above half the sample rate, a source axis has no effects, a noise step has no white
-            noise, or a required temperature is missing.
+            If ``check_effects`` finds a mistake.
         """
-        for axis, effect in self:
-            with model_file.error_location(f"{axis}.{effect.name}"):
-                effect.check_rate(rate_hz * self.rate_ratio)
-                if isinstance(effect, Leak) and not self.effects.get(effect.source):
-                    raise ConfigError(f"the model has no effect on its source {effect.source}")
-                if isinstance(effect, NoiseStep) and not any(
-                    isinstance(other, AngleRandomWalk) for other in self.effects[axis]
-                ):
-                    raise ConfigError(f"{axis} has no angle_random_walk to multiply")
-                if isinstance(effect, Source) and effect.uses_temperature and not temperature:
-                    raise ConfigError("no temperature: the model has no [temperature], and no recording gives one")
+        check_effects(self.effects, rate_hz * self.rate_ratio, temperature)
 
-    def stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> "ModelStream":
+    def stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> ModelStream:
         """Return an endless series of six axes. The same rate and seed give the same series.
 
         Parameters
@@ -229,12 +210,9 @@ class NoiseModel:
         Raises
         ------
         ConfigError
-            If a frequency is at or above half the sample rate, a source axis has no effects, a noise step has no white
-            noise, or a required temperature is missing.
+            If ``check_effects`` finds a mistake.
         """
-        from monitor.noise.simulation import ModelStream
-
-        return ModelStream(self, rate_hz, seed, temperature_c)
+        return ModelStream(self.effects, self.temperature, rate_hz, self.rate_ratio, seed, temperature_c)
 
     def simulate(self, n: int, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> Floats:
         """Return the first ``n`` samples [n, 6] of ``stream``, in rad/s and m/s².
@@ -259,7 +237,7 @@ class NoiseModel:
         ConfigError
             If the text is not valid. The message names the place in the file.
         """
-        effects, rate_hz, temperature = model_file.parse_model(text)
+        effects, rate_hz, temperature = parse_model(text)
         model = cls(sample_rate_hz=rate_hz, temperature=temperature)
         for axes, given in effects:
             model += cls(dict.fromkeys(axes, given))
@@ -269,4 +247,4 @@ class NoiseModel:
 
     def to_toml(self) -> str:
         """Return the model as text; ``from_toml`` reads it back to an equal model."""
-        return model_file.format_model(self)
+        return format_model(self.effects, self.sample_rate_hz, self.temperature)

@@ -1,26 +1,25 @@
 """Model files: conversion of TOML text to effects and back, and a table for display.
 
 A model file has ``sample_rate`` (Hz), optionally ``[temperature]``, and one table per axis. Each axis has one table per
-effect, or an array of tables if an effect occurs twice. ``g*`` and ``a*`` stand for all axes of a kind. An error in the
-file raises a ConfigError of one line, which names the place and the nearest known word. Absent parameters stay absent.
+effect, or an array of tables if an effect occurs twice. ``g*`` and ``a*`` stand for all axes of a kind. Every mistake
+gives one line of a ConfigError, which names the place in the file and the nearest known word.
 """
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final, TypeVar
 
 from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.quantities import RATE_HZ
 from drivers.sample import AXES
-from monitor.noise.effect import GYROS, Effect, parameter_units, required_parameters
+from monitor.noise.effect import GYROS, Effect, ParameterTable, parameter_units, required_parameters
 from monitor.noise.effects import EFFECTS
-from monitor.noise.temperature import TEMPERATURE_UNITS, Temperature
+from monitor.noise.temperature import Temperature
 from monitor.settings import toml_text
 
-if TYPE_CHECKING:
-    from monitor.noise.model import NoiseModel
+T = TypeVar("T", bound=ParameterTable)
 
 WILDCARDS: Final = {"g*": AXES[:3], "a*": AXES[3:]}
 """Keys that stand for all axes of a kind."""
@@ -53,7 +52,7 @@ def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature
     temperature = None
     with _collect_errors(mistakes):
         given = tables.pop("temperature", None)
-        temperature = None if given is None else Temperature.from_table(given)
+        temperature = None if given is None else _parse_table("temperature", Temperature, given)
     effects: list[AxisEffects] = []
     for axis, given in tables.items():
         with _collect_errors(mistakes):
@@ -63,12 +62,24 @@ def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature
     return effects, None if rate_hz is None else float(rate_hz), temperature
 
 
-def format_model(model: "NoiseModel") -> str:
-    """Return the text of a model file."""
-    lines = [] if model.sample_rate_hz is None else [f"sample_rate = {float(model.sample_rate_hz)!r}"]
-    if model.temperature is not None:
-        lines += ["", "[temperature]", *_assignments(model.temperature)]
-    for axis, effects in model.effects.items():
+def format_model(
+    axis_effects: Mapping[str, tuple[Effect, ...]], sample_rate_hz: float | None, temperature: Temperature | None
+) -> str:
+    """Return the text of a model file.
+
+    Parameters
+    ----------
+    axis_effects : mapping of str to tuple of Effect
+        Axis -> its effects.
+    sample_rate_hz : float or None
+        Sample rate, Hz.
+    temperature : Temperature or None
+        Simulated temperature.
+    """
+    lines = [] if sample_rate_hz is None else [f"sample_rate = {float(sample_rate_hz)!r}"]
+    if temperature is not None:
+        lines += ["", "[temperature]", *_assignments(temperature)]
+    for axis, effects in axis_effects.items():
         names = [effect.name for effect in effects]
         if not effects:
             lines += ["", f"[{axis}]"]
@@ -78,21 +89,22 @@ def format_model(model: "NoiseModel") -> str:
     return "\n".join(lines).lstrip() + "\n"
 
 
-def format_table(model: "NoiseModel") -> str:
+def format_table(
+    axis_effects: Mapping[str, tuple[Effect, ...]], sample_rate_hz: float | None, temperature: Temperature | None
+) -> str:
     """Return a table for display, with one line per effect: axis, name, and parameters with units.
 
-    Sample rate and temperature stand above the table.
+    Sample rate and temperature stand above the table. The arguments are those of ``format_model``.
     """
-    head = [] if model.sample_rate_hz is None else [f"sample rate {model.sample_rate_hz:g} Hz"]
-    if model.temperature is not None:
-        known = [(name, value) for name, value in _set_fields(model.temperature)]
-        head.append(
-            "temperature " + ", ".join(f"{name} = {value:g} {TEMPERATURE_UNITS[name]}" for name, value in known)
-        )
+    head = [] if sample_rate_hz is None else [f"sample rate {sample_rate_hz:g} Hz"]
+    if temperature is not None:
+        head.append(f"temperature {_format_parameters(temperature)}")
     rows = [("axis", "effect", "parameters")]
-    rows += [(axis, effect.name, _format_parameters(axis, effect)) for axis, effect in model]
+    rows += [
+        (axis, effect.name, _format_parameters(effect, axis)) for axis in AXES for effect in axis_effects.get(axis, ())
+    ]
     width = max(len(name) for _, name, _ in rows)
-    return "\n".join([*head, *(f"{axis:4}  {name:{width}}  {said}" for axis, name, said in rows)])
+    return "\n".join([*head, *(f"{axis:4}  {name:{width}}  {text}" for axis, name, text in rows)])
 
 
 @contextlib.contextmanager
@@ -113,16 +125,14 @@ def _collect_errors(mistakes: list[str]) -> Iterator[None]:
         mistakes += error.lines
 
 
-def _format_parameters(axis: str, effect: Effect) -> str:
-    """Return the parameters of an effect with their units."""
-    kind = 0 if axis in GYROS else 1
-    unit = {name: pair[kind] for name, pair in parameter_units(type(effect)).items()}
-    words = {"1": "", "axis": ""}
-    said = [
-        f"{name} = {value if isinstance(value, str) else format(value, 'g')} {words.get(unit[name], unit[name])}"
-        for name, value in _set_fields(effect)
-    ]
-    return ", ".join(one.rstrip() for one in said)
+def _format_parameters(table: ParameterTable, axis: str = GYROS[0]) -> str:
+    """Return the parameters of a table with their units on an axis."""
+    texts = []
+    for name, value in _set_fields(table):
+        unit = parameter_units(type(table))[name][axis not in GYROS]
+        number = value if isinstance(value, str) else format(value, "g")
+        texts.append(f"{name} = {number}" + ("" if unit in ("1", "axis") else f" {unit}"))
+    return ", ".join(texts)
 
 
 def _set_fields(table: Any) -> Iterator[tuple[str, Any]]:
@@ -155,12 +165,12 @@ def _parse_axis(axis: str, effects: Any, mistakes: list[str]) -> Iterator[Effect
             continue
         for parameters in given if isinstance(given, list) else [given]:
             with _collect_errors(mistakes):
-                yield _parse_effect(f"{axis}.{name}", EFFECTS[name], parameters)
+                yield _parse_table(f"{axis}.{name}", EFFECTS[name], parameters)
 
 
-def _parse_effect(place: str, effect: type[Effect], parameters: Any) -> Effect:
-    """Return the effect of one table."""
-    known = tuple(parameter_units(effect))
+def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
+    """Return the effect or the temperature of one table."""
+    known = tuple(parameter_units(kind))
     if not isinstance(parameters, dict):
         raise ConfigError(f"{place} must be a table with {', '.join(known)}")
     mistakes = [
@@ -170,10 +180,10 @@ def _parse_effect(place: str, effect: type[Effect], parameters: Any) -> Effect:
     ]
     # A misspelt parameter is also missing, but one line is enough.
     mistakes = mistakes or [
-        f"{place}: {name} is missing" for name in required_parameters(effect) if name not in parameters
+        f"{place}: {name} is missing" for name in required_parameters(kind) if name not in parameters
     ]
     if mistakes:
         raise ConfigError(*mistakes)
     with error_location(place):
-        return effect(**parameters)
+        return kind(**parameters)
     raise AssertionError  # not reached: the context manager does not suppress exceptions

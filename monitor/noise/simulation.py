@@ -13,6 +13,7 @@ changes no other series.
 
 import copy
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 from zlib import crc32
@@ -26,6 +27,7 @@ from monitor.noise.effect import (
     Effect,
     Leak,
     NoiseSeries,
+    RunningEffect,
     RunningTransform,
     SampleBlockContext,
     Source,
@@ -36,9 +38,8 @@ from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.noise_step import NoiseStep
 from monitor.noise.effects.sample_rate_error import SampleRateError
-from monitor.noise.model import NoiseModel
 from monitor.noise.model_file import error_location
-from monitor.noise.temperature import RecordedTemperature
+from monitor.noise.temperature import Temperature, recorded_temperature
 
 PIECE_SAMPLES: Final = 2048
 """Samples simulated at once. Six axes of them, with their work arrays, stay in the cache of a processor core."""
@@ -52,35 +53,86 @@ class SimulatedSamples:
     temperature_c: Floats  # [n] °C; NaN if the model has no temperature
 
 
-class ModelStream:
-    """Endless simulated series of a model; axes without effects are zero.
+def check_effects(axis_effects: Mapping[str, tuple[Effect, ...]], true_hz: float, temperature: bool) -> None:
+    """Check that effects can be simulated together.
 
     Parameters
     ----------
-    model : NoiseModel
-        Model to simulate.
-    rate_hz, seed, temperature_c
-        As in ``NoiseModel.stream``.
+    axis_effects : mapping of str to tuple of Effect
+        Axis -> its effects.
+    true_hz : float
+        True sample rate, Hz.
+    temperature : bool
+        True if a temperature is available, from the model or from a recording.
 
     Raises
     ------
     ConfigError
-        If the model cannot be simulated at that rate.
+        If a frequency is at or above half the sample rate, the axis of a leak has no effects, a noise step has no white
+        noise, or a required temperature is missing.
+    """
+    for axis in AXES:
+        effects = axis_effects.get(axis, ())
+        for effect in effects:
+            with error_location(f"{axis}.{effect.name}"):
+                effect.check_rate(true_hz)
+                if isinstance(effect, Leak) and not axis_effects.get(effect.source):
+                    raise ConfigError(f"the model has no effect on its source {effect.source}")
+                if isinstance(effect, NoiseStep) and not any(isinstance(one, AngleRandomWalk) for one in effects):
+                    raise ConfigError(f"{axis} has no angle_random_walk to multiply")
+                if isinstance(effect, Source) and effect.uses_temperature and not temperature:
+                    raise ConfigError("no temperature: the model has no [temperature], and no recording gives one")
+
+
+class ModelStream:
+    """Endless simulated series of six axes. Axes without effects are zero.
+
+    Parameters
+    ----------
+    axis_effects : mapping of str to tuple of Effect
+        Axis -> its effects.
+    temperature : Temperature or None
+        Simulated temperature.
+    rate_hz : float
+        Stated sample rate, Hz.
+    rate_ratio : float
+        True sample rate divided by the stated one.
+    seed : int
+        Seed of the random generators.
+    temperature_c : ndarray, shape (n,), or None
+        Temperature of a recording in °C, used instead of the simulated temperature.
+
+    Raises
+    ------
+    ConfigError
+        If the effects cannot be simulated at this rate.
     """
 
-    def __init__(self, model: NoiseModel, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> None:
-        model.check(rate_hz, temperature=temperature_c is not None or model.temperature is not None)
-        self._model = model
-        self._rate_hz = rate_hz
-        self._true_hz = rate_hz * model.rate_ratio
+    def __init__(
+        self,
+        axis_effects: Mapping[str, tuple[Effect, ...]],
+        temperature: Temperature | None,
+        rate_hz: float,
+        rate_ratio: float,
+        seed: int,
+        temperature_c: Floats | None = None,
+    ) -> None:
+        check_effects(axis_effects, rate_hz * rate_ratio, temperature_c is not None or temperature is not None)
+        self._effects = {axis: axis_effects.get(axis, ()) for axis in AXES}
+        self._true_hz = rate_hz * rate_ratio
         self._seed = seed
         self._count = 0  # number of samples drawn so far
         self._occurrences: Counter[tuple[str, str]] = Counter()
-        self._truths: list[tuple[str, Effect, NoiseSeries | RunningTransform]] = []
-        self._temperature = self._temperature_series(temperature_c)
+        self._truths: list[tuple[str, Effect, RunningEffect]] = []
+        self._temperature: NoiseSeries | None = None
+        if temperature_c is not None:
+            self._temperature = recorded_temperature(temperature_c)
+        elif temperature is not None:
+            self._temperature = temperature.start(self._true_hz, self._rng("temperature", "", 0))
         self._axes = {axis: _AxisSimulator() for axis in AXES}
-        for axis, effect in model:
-            self._begin(axis, effect)
+        for axis, effects in self._effects.items():
+            for effect in effects:
+                self._begin(axis, effect)
 
     def draw(self, n: int) -> Floats:
         """Return the next ``n`` samples [n, 6] in rad/s and m/s²."""
@@ -116,9 +168,11 @@ class ModelStream:
             raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
         if isinstance(effect, SampleRateError):
             raise ConfigError(f"{axis}.{effect.name}: the clock of a stream that runs cannot change")
-        model = self._model + NoiseModel({axis: (effect,)})
-        model.check(self._rate_hz, temperature=self._temperature is not None)
-        self._model = model
+        with error_location(f"{axis}.{effect.name}"):
+            effect.check_axis(axis)
+        effects = self._effects | {axis: (*self._effects[axis], effect)}
+        check_effects(effects, self._true_hz, self._temperature is not None)
+        self._effects = effects
         self._begin(axis, effect)
 
     def truth(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
@@ -128,18 +182,10 @@ class ModelStream:
         describe completely are left out.
         """
         truths: dict[str, dict[str, list[dict[str, Any]]]] = {}
-        for axis, effect, one in self._truths:
-            truth = one.truth()
-            if truth:
+        for axis, effect, running in self._truths:
+            if truth := running.truth():
                 truths.setdefault(axis, {}).setdefault(effect.name, []).append(truth)
         return truths
-
-    def _temperature_series(self, recorded_c: Floats | None) -> NoiseSeries | None:
-        """Return the series of the temperature: recorded, from the model, or None."""
-        if recorded_c is not None:
-            return RecordedTemperature(recorded_c)
-        generator = self._model.temperature
-        return None if generator is None else generator.start(self._true_hz, self._rng("temperature", "", 0))
 
     def _begin(self, axis: str, effect: Effect) -> None:
         """Start an effect on an axis."""
@@ -191,10 +237,10 @@ class _AxisSimulator:
         self.steps: list[tuple[int, float]] = []  # (index of the first sample, ratio)
         self.leaks: list[Leak] = []
         self.leaks_out = False
-        self._chain: list[tuple[int, RunningTransform]] = []  # (position in ORDER, transform), sorted
-        self._alone: list[
-            tuple[int, RunningTransform]
-        ] = []  # copies that act on the axis' own sources only; used if other axes leak into this one
+        # Transforms with their positions in TRANSFORM_ORDER, sorted.
+        self._chain: list[tuple[int, RunningTransform]] = []
+        # Copies that act on the sources of this axis only. They are used if other axes leak into this axis.
+        self._alone: list[tuple[int, RunningTransform]] = []
 
     @property
     def alone(self) -> bool:

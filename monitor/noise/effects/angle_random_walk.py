@@ -1,4 +1,4 @@
-"""Angle random walk N (velocity random walk on an accelerometer): white noise of the rate."""
+"""Angle random walk N, which is called velocity random walk on an accelerometer."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -7,6 +7,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,28 +20,20 @@ class AngleRandomWalk(Source):
 
     N: float = parameter("rad/√s", "m/s/√s")
 
-    name: ClassVar[str] = "angle_random_walk"
     description: ClassVar[str] = "White noise of the rate: averaging four times as long halves it."
 
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance N²/τ."""
-        return self.N**2 / tau_s
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return S = N² and σ² = N²/τ."""
+        return Spectrum(lambda f: np.full_like(f, self.N**2), lambda tau: self.N**2 / tau, tau0_s)
 
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return N² for every frequency."""
-        return np.full_like(f_hz, self.N**2)
-
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_White":
-        """Return a series of independent samples with standard deviation N √rate."""
-        return _White(self.N * rate_hz**0.5, rng)
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_WhiteNoise":
+        """Return independent samples with standard deviation N √rate."""
+        return _WhiteNoise(self.N * rate_hz**0.5, rng)
 
 
-class _White(NoiseSeries):
-    """Series of independent Gaussian samples."""
-
+class _WhiteNoise(NoiseSeries):
     def __init__(self, deviation: float, rng: np.random.Generator) -> None:
-        self._deviation = deviation
-        self._rng = rng
+        self._deviation, self._rng = deviation, rng
 
     def add(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal(out=block.scratch)

@@ -6,7 +6,8 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import RunningTransform, Transform, check_below_nyquist, parameter
+from monitor.common.compiled import compiled
+from monitor.noise.effect import RunningTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum
 
 
@@ -18,20 +19,15 @@ class BandwidthLimit(Transform):
     spectrum. The filter starts in its settled state at the first sample, so that gravity causes no transient.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
-    >>> limited = BandwidthLimit(cutoff=10.0, order=2).transform_spectrum(white_noise_spectrum(1.0, 0.01))
-    >>> print(f"{limited.density(np.array([10.0]))[0]:.6g}")
+    >>> filtered = BandwidthLimit(cutoff=10.0, order=2).transform_spectrum(white_noise_spectrum(1.0, 0.01))
+    >>> print(f"{filtered.density(np.array([10.0]))[0]:.6g}")
     0.005
     """
 
-    cutoff: float = parameter("Hz", "Hz", positive=True)
-    order: int = parameter("1", "1", positive=True, whole=True, most=8)
+    cutoff: float = parameter("Hz", positive=True, below_nyquist=True)
+    order: int = parameter("1", positive=True, whole=True, most=8)
 
-    name: ClassVar[str] = "bandwidth_limit"
     description: ClassVar[str] = "The sensor's own filter lets slow motion through and damps what is fast, noise too."
-
-    def check_rate(self, rate_hz: float) -> None:
-        """Raise ConfigError if the cutoff is not below half the sample rate."""
-        check_below_nyquist(self, "cutoff", rate_hz)
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum times |H|²."""
@@ -45,8 +41,71 @@ class BandwidthLimit(Transform):
 
         return spectrum.filtered(gain)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
         """Return the filter, which settles at the first sample."""
-        from monitor.noise.low_pass import LowPass, butterworth_sections  # imports Numba, which only simulation needs
+        return _LowPass(butterworth_sections(int(self.order), self.cutoff, rate_hz))
 
-        return LowPass(butterworth_sections(int(self.order), self.cutoff, rate_hz))
+
+def butterworth_sections(order: int, cutoff_hz: float, rate_hz: float) -> Floats:
+    """Return the second-order sections of a digital Butterworth low-pass with unit gain at f = 0.
+
+    In the s plane, the poles lie on a circle at angles θ from the negative real axis. Each pair of poles gives a
+    section of s² + 2 cos θ s + 1. An odd order adds a section of s + 1. The bilinear transform sets
+    s = (1 − z⁻¹)/(1 + z⁻¹) / tan(πf_c/f_s).
+
+    Parameters
+    ----------
+    order : int
+        Order of the filter.
+    cutoff_hz : float
+        Frequency of half power, Hz.
+    rate_hz : float
+        Sample rate, Hz.
+
+    Returns
+    -------
+    ndarray, shape (n, 5)
+        Coefficients b0, b1, b2, a1, a2 of each section.
+
+    Examples
+    --------
+    >>> butterworth_sections(1, 25.0, 100.0).round(9).tolist()
+    [[0.5, 0.5, 0.0, -0.0, 0.0]]
+    """
+    w = np.tan(np.pi * cutoff_hz / rate_hz)
+    sections = [[w / (1.0 + w), w / (1.0 + w), 0.0, (w - 1.0) / (w + 1.0), 0.0]] if order % 2 else []
+    for pair in range(order // 2):
+        damping = 2.0 * np.sin(np.pi * (2 * pair + 1) / (2 * order))
+        whole = 1.0 + damping * w + w * w
+        gain = w * w / whole
+        sections.append([gain, 2.0 * gain, gain, 2.0 * (w * w - 1.0) / whole, (1.0 - damping * w + w * w) / whole])
+    return np.array(sections)
+
+
+class _LowPass(RunningTransform):
+    def __init__(self, sections: Floats) -> None:
+        self._sections = sections
+        self._state: Floats | None = None
+
+    def apply(self, values: Floats) -> None:
+        if self._state is None:
+            b0, _, b2, _, a2 = self._sections.T
+            self._state = np.stack([1.0 - b0, b2 - a2], axis=1) * values[0]
+        filtered = np.ascontiguousarray(values)
+        _filter_sections(filtered, self._sections, self._state)
+        values[:] = filtered
+
+
+@compiled
+def _filter_sections(values: Floats, sections: Floats, state: Floats) -> None:
+    """Filter values [n] in place, in direct form II transposed. The state [sections, 2] continues in the next call."""
+    for i in range(sections.shape[0]):
+        b0, b1, b2, a1, a2 = sections[i]
+        one, two = state[i]
+        for k in range(values.size):
+            x = values[k]
+            y = b0 * x + one
+            one = b1 * x - a1 * y + two
+            two = b2 * x - a2 * y
+            values[k] = y
+        state[i, 0], state[i, 1] = one, two

@@ -16,6 +16,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.spectrum import Spectrum
 
 # fmt: off
 ONE_MINUS_POLE: Final = np.array([
@@ -34,6 +35,10 @@ ONE_MINUS_ZERO: Final = np.array([
 RESPONSE_CONSTANT: Final = 5.436556224293264
 """Constant of the filter: its squared response is 1 / (RESPONSE_CONSTANT · f/fs) within the band."""
 
+FLICKER_AVAR: Final = float(2.0 * np.log(2.0) / np.pi)
+"""Allan variance of continuous flicker noise with B = 1 (IEEE Std 952 eq. C.24)."""
+FLICKER_FLOOR: Final = FLICKER_AVAR**0.5
+"""Allan deviation of continuous flicker noise divided by B, 0.664."""
 MAX_SAMPLED_FACTOR: Final = 128
 """Largest number of samples per cluster for which the sampled form of σ² is integrated. Above, it differs from the
 continuous form by less than 1e-4."""
@@ -52,23 +57,22 @@ class BiasInstability(Source):
 
     B: float = parameter("rad/s", "m/s²")
 
-    name: ClassVar[str] = "bias_instability"
     description: ClassVar[str] = "Slow flicker of the bias: the floor that no averaging gets below."
 
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance (2 ln 2/π) B².
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return S = B²/(2πf) and σ² = (2 ln 2/π) B².
 
-        For clusters of few samples, the result is the value for samples, whose spectrum ends at 1/(2 τ0).
+        For clusters of few samples, σ² is the value for samples, whose spectrum ends at 1/(2 τ0).
         """
-        m = np.atleast_1d(np.asarray(tau_s / tau0_s, np.float64))
-        shape = np.full(m.shape, 2.0 * np.log(2.0) / np.pi)
-        few = m <= MAX_SAMPLED_FACTOR
-        shape[few] = _sampled_allan_variance(m[few])
-        return (self.B**2 * shape).reshape(np.shape(tau_s))
 
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return B²/(2πf)."""
-        return self.B**2 / (2.0 * np.pi * f_hz)
+        def avar(tau_s: Floats) -> Floats:
+            m = np.atleast_1d(np.asarray(tau_s / tau0_s, np.float64))
+            shape = np.full(m.shape, FLICKER_AVAR)
+            few = m <= MAX_SAMPLED_FACTOR
+            shape[few] = _sampled_allan_variance(m[few])
+            return (self.B**2 * shape).reshape(np.shape(tau_s))
+
+        return Spectrum(lambda f: self.B**2 / (2.0 * np.pi * f), avar, tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Flicker":
         """Return a stationary series."""
@@ -112,8 +116,10 @@ def _residues() -> Floats:
 
 
 @compiled
-def _add_flicker_noise(values, white, states, poles, residues, direct):  # type: ignore[no-untyped-def]
-    """Filter white noise [n], and add the 1/f noise to the values [n]; ``states`` continues from call to call."""
+def _add_flicker_noise(
+    values: Floats, white: Floats, states: Floats, poles: Floats, residues: Floats, direct: float
+) -> None:
+    """Filter white noise [n], and add the 1/f noise to the values [n]. The states continue in the next call."""
     for k in range(values.size):
         value = direct * white[k]
         for i in range(states.size):

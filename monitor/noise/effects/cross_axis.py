@@ -18,9 +18,8 @@ class CrossAxis(Leak):
     """
 
     source: str = source_axis()
-    coefficient: float = parameter("1", "1", signed=True)
+    coefficient: float = parameter("1", signed=True)
 
-    name: ClassVar[str] = "cross_axis"
     description: ClassVar[str] = "The axis is not square to its neighbour and reads a little of it."
 
     def check_axis(self, axis: str) -> None:

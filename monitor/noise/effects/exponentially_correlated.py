@@ -7,8 +7,9 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.noise import gauss_markov
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.gauss_markov import gauss_markov_spectrum
+from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,18 +27,13 @@ class ExponentiallyCorrelated(Source):
     """
 
     sigma: float = parameter("rad/s", "m/s²")
-    correlation_time: float = parameter("s", "s", positive=True)
+    correlation_time: float = parameter("s", positive=True)
 
-    name: ClassVar[str] = "exponentially_correlated"
     description: ClassVar[str] = "The bias wanders and comes back, and forgets where it was after a correlation time."
 
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance by the closed form of the class docstring."""
-        return gauss_markov.avar(self.sigma, 1.0 / self.correlation_time, tau_s, tau0_s)
-
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return the spectrum by the closed form of the class docstring."""
-        return gauss_markov.psd(self.sigma, 1.0 / self.correlation_time, f_hz, tau0_s)
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return the closed forms of the class docstring."""
+        return gauss_markov_spectrum(self.sigma, 1.0 / self.correlation_time, tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_GaussMarkov":
         """Return a stationary series."""
@@ -59,7 +55,7 @@ class _GaussMarkov(NoiseSeries):
 
 
 @compiled
-def _add_gauss_markov(values, white, phi, drive, state):  # type: ignore[no-untyped-def]
+def _add_gauss_markov(values: Floats, white: Floats, phi: float, drive: float, state: float) -> float:
     """Add the process to the values [n], and return its state."""
     for k in range(values.size):
         values[k] += state

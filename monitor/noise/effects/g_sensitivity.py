@@ -21,7 +21,6 @@ class GSensitivity(Leak):
     source: str = source_axis()
     coefficient: float = parameter("rad/s per m/s²", "1", signed=True)
 
-    name: ClassVar[str] = "g_sensitivity"
     description: ClassVar[str] = "The gyroscope feels acceleration: gravity and vibration shift its reading."
 
     def check_axis(self, axis: str) -> None:

@@ -8,8 +8,8 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.noise import gauss_markov
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, check_below_nyquist, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.gauss_markov import gauss_markov_spectrum
 from monitor.noise.spectrum import Spectrum
 
 
@@ -28,39 +28,27 @@ class Narrowband(Source):
     """
 
     sigma: float = parameter("rad/s", "m/s²")
-    frequency: float = parameter("Hz", "Hz", positive=True)
-    bandwidth: float = parameter("Hz", "Hz", positive=True)
+    frequency: float = parameter("Hz", positive=True, below_nyquist=True)
+    bandwidth: float = parameter("Hz", positive=True)
 
-    name: ClassVar[str] = "narrowband"
     description: ClassVar[str] = "Something near rings at its own frequency, with an amplitude that comes and goes."
-
-    def check_rate(self, rate_hz: float) -> None:
-        """Raise ConfigError if the frequency is not below half the sample rate."""
-        check_below_nyquist(self, "frequency", rate_hz)
 
     @property
     def _decay(self) -> complex:
         """Return 1/T_c − iω of the complex process, 1/s."""
         return pi * self.bandwidth - 2j * pi * self.frequency
 
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance by the closed form of ``gauss_markov`` with a complex φ."""
-        return gauss_markov.avar(self.sigma, self._decay, tau_s, tau0_s)
-
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return σ²τ0 Re{(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)}."""
-        return gauss_markov.psd(self.sigma, self._decay, f_hz, tau0_s)
-
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return the spectrum with the position of its peak, which refines the grid of the integral."""
-        return replace(Source.spectrum(self, tau0_s), peaks=((self.frequency, self.bandwidth),))
+        """Return the closed forms with the position of the peak, which refines the grid of an integral."""
+        peaks = ((self.frequency, self.bandwidth),)
+        return replace(gauss_markov_spectrum(self.sigma, self._decay, tau0_s), peaks=peaks)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Ringing":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Resonance":
         """Return a stationary series."""
-        return _Ringing(self.sigma, self._decay / rate_hz, rng)
+        return _Resonance(self.sigma, self._decay / rate_hz, rng)
 
 
-class _Ringing(NoiseSeries):
+class _Resonance(NoiseSeries):
     """Series of the real part of complex first-order noise."""
 
     def __init__(self, sigma: float, step: complex, rng: np.random.Generator) -> None:
@@ -76,7 +64,9 @@ class _Ringing(NoiseSeries):
 
 
 @compiled
-def _add_resonance(values, white, c, s, drive, x, y):  # type: ignore[no-untyped-def]
+def _add_resonance(
+    values: Floats, white: Floats, c: float, s: float, drive: float, x: float, y: float
+) -> tuple[float, float]:
     """Add x of the rotating pair (x, y) to the values [n], and return the pair."""
     for k in range(values.size):
         values[k] += x

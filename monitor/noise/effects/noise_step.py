@@ -17,8 +17,7 @@ class NoiseStep(Effect):
     'noise_step'
     """
 
-    time: float = parameter("s", "s")
-    ratio: float = parameter("1", "1")
+    time: float = parameter("s")
+    ratio: float = parameter("1")
 
-    name: ClassVar[str] = "noise_step"
     description: ClassVar[str] = "From one moment on the white noise is stronger, or weaker, by a factor."

@@ -8,6 +8,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 from monitor.noise.random_events import RandomEvents
+from monitor.noise.spectrum import Spectrum, white_noise_spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,28 +22,21 @@ class Outliers(Source):
     1e-08
     """
 
-    fraction: float = parameter("1", "1", most=1.0)
+    fraction: float = parameter("1", most=1.0)
     scale: float = parameter("rad/s", "m/s²")
 
-    name: ClassVar[str] = "outliers"
     description: ClassVar[str] = "Single samples are far off, the next ones are right again."
 
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance ps²τ0/τ."""
-        return self.fraction * self.scale**2 * tau0_s / tau_s
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return the spectrum of independent samples of variance ps²."""
+        return white_noise_spectrum(self.fraction * self.scale**2, tau0_s)
 
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return ps²τ0 for every frequency."""
-        return np.full_like(f_hz, self.fraction * self.scale**2 * tau0_s)
-
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Isolated":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_IsolatedErrors":
         """Return a series of outliers with geometric gaps, which correspond to an independent draw for every sample."""
-        return _Isolated(self.fraction, self.scale, rate_hz, rng)
+        return _IsolatedErrors(self.fraction, self.scale, rate_hz, rng)
 
 
-class _Isolated(NoiseSeries):
-    """Series of isolated errors."""
-
+class _IsolatedErrors(NoiseSeries):
     def __init__(self, fraction: float, scale: float, rate_hz: float, rng: np.random.Generator) -> None:
         def gaps(n: int) -> Floats:
             if fraction == 0.0:

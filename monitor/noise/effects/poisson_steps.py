@@ -7,9 +7,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, check_event_rate, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 from monitor.noise.effects.rate_random_walk import RateRandomWalk
 from monitor.noise.random_events import RandomEvents
+from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,37 +24,26 @@ class PoissonSteps(Source):
     1e-08
     """
 
-    rate: float = parameter("1/s", "1/s")
+    rate: float = parameter("1/s")
     height: float = parameter("rad/s", "m/s²")
 
-    name: ClassVar[str] = "poisson_steps"
     description: ClassVar[str] = "Now and then the bias jumps to a new place and stays there."
 
     @property
-    def _equivalent_random_walk(self) -> RateRandomWalk:
-        """Return the rate random walk with the same second moments."""
-        return RateRandomWalk(K=self.rate**0.5 * self.height)
+    def events_hz(self) -> float:
+        """Return the mean number of steps per second."""
+        return self.rate
 
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance of rate random walk with K² = λh²."""
-        return self._equivalent_random_walk.avar(tau_s, tau0_s)
-
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+    def spectrum(self, tau0_s: float) -> Spectrum:
         """Return the spectrum of rate random walk with K² = λh²."""
-        return self._equivalent_random_walk.psd(f_hz, tau0_s)
+        return RateRandomWalk(K=self.rate**0.5 * self.height).spectrum(tau0_s)
 
-    def check_rate(self, rate_hz: float) -> None:
-        """Raise ConfigError if the steps are too frequent for a simulation."""
-        check_event_rate(self, self.rate, rate_hz)
-
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Jumps":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_RandomSteps":
         """Return a series that starts at zero."""
-        return _Jumps(self.rate / rate_hz, self.height, rate_hz, rng)
+        return _RandomSteps(self.rate / rate_hz, self.height, rate_hz, rng)
 
 
-class _Jumps(NoiseSeries):
-    """Series of random steps."""
-
+class _RandomSteps(NoiseSeries):
     def __init__(self, rate: float, height: float, rate_hz: float, rng: np.random.Generator) -> None:
         gap = 1.0 / rate if rate > 0.0 else np.inf
         self._events = RandomEvents(

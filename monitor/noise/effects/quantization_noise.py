@@ -7,6 +7,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -19,18 +20,17 @@ class QuantizationNoise(Source):
 
     Q: float = parameter("rad", "m/s")
 
-    name: ClassVar[str] = "quantization_noise"
     description: ClassVar[str] = (
         "The angle is rounded anew at every reading: strong between neighbouring samples, gone over seconds."
     )
 
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance 3Q²/τ²."""
-        return 3.0 * self.Q**2 / tau_s**2
-
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return 4Q²/τ0 sin²(πfτ0)."""
-        return 4.0 * self.Q**2 / tau0_s * np.sin(np.pi * f_hz * tau0_s) ** 2
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return S = 4Q²/τ0 sin²(πfτ0) and σ² = 3Q²/τ²."""
+        return Spectrum(
+            lambda f: 4.0 * self.Q**2 / tau0_s * np.sin(np.pi * f * tau0_s) ** 2,
+            lambda tau: 3.0 * self.Q**2 / tau**2,
+            tau0_s,
+        )
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Differences":
         """Return a series of differences of white angle noise."""
@@ -38,8 +38,6 @@ class QuantizationNoise(Source):
 
 
 class _Differences(NoiseSeries):
-    """Series of differences of white noise."""
-
     def __init__(self, Q: float, rate_hz: float, rng: np.random.Generator) -> None:
         self._rng = rng
         self._scale = Q * rate_hz

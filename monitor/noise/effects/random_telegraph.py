@@ -7,9 +7,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise import gauss_markov
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, check_event_rate, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.gauss_markov import gauss_markov_spectrum
 from monitor.noise.random_events import RandomEvents
+from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,34 +26,28 @@ class RandomTelegraph(Source):
     """
 
     amplitude: float = parameter("rad/s", "m/s²")
-    dwell_time: float = parameter("s", "s", positive=True)
+    dwell_time: float = parameter("s", positive=True)
 
-    name: ClassVar[str] = "random_telegraph"
     description: ClassVar[str] = "The bias jumps between two levels at random times, like popcorn."
 
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance of exponentially correlated noise with σ = a/2, T_c = T/2."""
-        return gauss_markov.avar(0.5 * self.amplitude, 2.0 / self.dwell_time, tau_s, tau0_s)
+    @property
+    def events_hz(self) -> float:
+        """Return the mean number of switches per second."""
+        return 1.0 / self.dwell_time
 
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+    def spectrum(self, tau0_s: float) -> Spectrum:
         """Return the spectrum of exponentially correlated noise with σ = a/2, T_c = T/2."""
-        return gauss_markov.psd(0.5 * self.amplitude, 2.0 / self.dwell_time, f_hz, tau0_s)
-
-    def check_rate(self, rate_hz: float) -> None:
-        """Raise ConfigError if the switches are too frequent for a simulation."""
-        check_event_rate(self, 1.0 / self.dwell_time, rate_hz)
+        return gauss_markov_spectrum(0.5 * self.amplitude, 2.0 / self.dwell_time, tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_TwoLevels":
-        """Return a stationary series.
+        """Return a stationary series that starts at a random level.
 
-        It starts at a random level. The remaining first dwell time has the same distribution as a whole one.
+        The remainder of the first dwell time has the same distribution as a whole dwell time.
         """
         return _TwoLevels(0.5 * self.amplitude, self.dwell_time * rate_hz, rate_hz, rng)
 
 
 class _TwoLevels(NoiseSeries):
-    """Series that switches between two levels."""
-
     def __init__(self, level: float, dwell: float, rate_hz: float, rng: np.random.Generator) -> None:
         self._level = level if rng.random() < 0.5 else -level
         self._first_level = self._level

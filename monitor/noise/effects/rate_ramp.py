@@ -1,6 +1,6 @@
 """Rate ramp R: constant slope of the bias."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
@@ -20,29 +20,18 @@ class RateRamp(Source):
 
     R: float = parameter("rad/s²", "m/s³")
 
-    name: ClassVar[str] = "rate_ramp"
     description: ClassVar[str] = "The bias moves steadily in one direction, as while a sensor warms up."
-
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance R²τ²/2."""
-        return 0.5 * (self.R * tau_s) ** 2
-
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return zero, because a series without its slope is zero."""
-        return np.zeros_like(f_hz)
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return a spectrum that has only a slope."""
-        return replace(Source.spectrum(self, tau0_s), slope=self.R)
+        return Spectrum(np.zeros_like, lambda tau: 0.5 * (self.R * tau) ** 2, tau0_s, slope=self.R)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Slope":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Ramp":
         """Return a ramp that starts at zero."""
-        return _Slope(self.R / rate_hz)
+        return _Ramp(self.R / rate_hz)
 
 
-class _Slope(NoiseSeries):
-    """Series with a constant slope."""
-
+class _Ramp(NoiseSeries):
     def __init__(self, step: float) -> None:
         self._step = step
         self._count = 0

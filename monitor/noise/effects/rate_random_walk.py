@@ -8,6 +8,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,16 +24,15 @@ class RateRandomWalk(Source):
 
     K: float = parameter("rad/s/√s", "m/s²/√s")
 
-    name: ClassVar[str] = "rate_random_walk"
     description: ClassVar[str] = "The bias itself takes random steps and never returns: worse the longer one averages."
 
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance K²τ/3 (1 + τ0²/(2τ²))."""
-        return self.K**2 / 3.0 * (tau_s + 0.5 * tau0_s**2 / tau_s)
-
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return K²τ0²/(4 sin²(πfτ0))."""
-        return (0.5 * self.K * tau0_s / np.sin(np.pi * f_hz * tau0_s)) ** 2
+    def spectrum(self, tau0_s: float) -> Spectrum:
+        """Return S = K²τ0²/(4 sin²(πfτ0)) and σ² = K²τ/3 (1 + τ0²/(2τ²))."""
+        return Spectrum(
+            lambda f: (0.5 * self.K * tau0_s / np.sin(np.pi * f * tau0_s)) ** 2,
+            lambda tau: self.K**2 / 3.0 * (tau + 0.5 * tau0_s**2 / tau),
+            tau0_s,
+        )
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_RandomWalk":
         """Return a random walk that starts at zero."""
@@ -40,11 +40,8 @@ class RateRandomWalk(Source):
 
 
 class _RandomWalk(NoiseSeries):
-    """Series of a random walk."""
-
     def __init__(self, step: float, rng: np.random.Generator) -> None:
-        self._step = step
-        self._rng = rng
+        self._step, self._rng = step, rng
         self._level = 0.0
 
     def add(self, values: Floats, block: SampleBlockContext) -> None:
@@ -53,9 +50,9 @@ class _RandomWalk(NoiseSeries):
 
 
 @compiled
-def _add_random_walk(values, steps, step, place):  # type: ignore[no-untyped-def]
-    """Add the running sum to the values [n] and return it; the order of additions does not depend on the blocks."""
+def _add_random_walk(values: Floats, steps: Floats, step: float, level: float) -> float:
+    """Add the running sum to the values [n] and return it. The order of additions does not depend on the blocks."""
     for k in range(values.size):
-        place += step * steps[k]
-        values[k] += place
-    return place
+        level += step * steps[k]
+        values[k] += level
+    return level

@@ -6,7 +6,7 @@ from typing import ClassVar, Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import RunningTransform, Transform, parameter
+from monitor.noise.effect import MemorylessTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum, undefined_spectrum, white_noise_spectrum
 
 MIN_DEVIATION_STEPS: Final = 0.6
@@ -30,7 +30,6 @@ class Resolution(Transform):
 
     step: float = parameter("rad/s", "m/s²", positive=True)
 
-    name: ClassVar[str] = "resolution"
     description: ClassVar[str] = "The output moves in steps of one least significant bit."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
@@ -43,18 +42,12 @@ class Resolution(Transform):
             else undefined_spectrum(tau0_s)
         )
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Rounding":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
         """Return a rounding transform."""
-        return _Rounding(self.step)
 
+        def round_to_steps(values: Floats) -> None:
+            values /= self.step
+            np.rint(values, out=values)
+            values *= self.step
 
-class _Rounding(RunningTransform):
-    """Running rounding to whole steps."""
-
-    def __init__(self, step: float) -> None:
-        self._step = step
-
-    def apply(self, values: Floats) -> None:
-        values /= self._step
-        np.rint(values, out=values)
-        values *= self._step
+        return MemorylessTransform(round_to_steps)

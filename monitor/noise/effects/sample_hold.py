@@ -26,9 +26,8 @@ class SampleHold(Transform):
     0.500
     """
 
-    fraction: float = parameter("1", "1", most=0.999)
+    fraction: float = parameter("1", most=0.999)
 
-    name: ClassVar[str] = "sample_hold"
     description: ClassVar[str] = "Some samples are not new: the value before is sent once more."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
@@ -50,14 +49,12 @@ class SampleHold(Transform):
         rest = Spectrum(lambda f: lost * tau0_s * (1.0 - h**2) / squared(f), None, tau0_s)
         return spectrum.filtered(gain, around=((0.0, (1.0 - h) / (2.0 * np.pi * tau0_s)),)) + rest
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Holding":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_RepeatedSamples":
         """Return a transform whose first sample is always new."""
-        return _Holding(self.fraction, rng)
+        return _RepeatedSamples(self.fraction, rng)
 
 
-class _Holding(RunningTransform):
-    """Running transform that repeats samples at random."""
-
+class _RepeatedSamples(RunningTransform):
     def __init__(self, fraction: float, rng: np.random.Generator) -> None:
         self._fraction = fraction
         self._rng = rng
@@ -74,7 +71,7 @@ class _Holding(RunningTransform):
 
 
 @compiled
-def _repeat_samples(values, tosses, fraction, last):  # type: ignore[no-untyped-def]
+def _repeat_samples(values: Floats, tosses: Floats, fraction: float, last: float) -> tuple[float, int]:
     """Repeat samples in place at random, and return the last value and the number of repeated samples."""
     held = 0
     for k in range(values.size):

@@ -5,10 +5,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.errors import ConfigError
 from drivers.quantities import RATE_RATIO
-from drivers.sample import Floats
-from monitor.noise.effect import RunningTransform, Transform, parameter
+from monitor.noise.effect import MemorylessTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum
 
 
@@ -27,15 +25,9 @@ class SampleRateError(Transform):
     (0.01, 1.0)
     """
 
-    ratio: float = parameter("1", "1", positive=True)
+    ratio: float = parameter("1", positive=True, quantity=RATE_RATIO)
 
-    name: ClassVar[str] = "sample_rate_error"
     description: ClassVar[str] = "The clock is off: what happens at one frequency is seen at another."
-
-    def check_rate(self, rate_hz: float) -> None:
-        """Raise ConfigError if the ratio is outside the supported range."""
-        if not RATE_RATIO.supports(self.ratio):
-            raise ConfigError(f"{self.name}: ratio must be {RATE_RATIO.range_text()}, is {self.ratio!r}")
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum unchanged; ``restated`` converts its time scale after all transforms."""
@@ -54,13 +46,6 @@ class SampleRateError(Transform):
             tuple((f / r, width / r) for f, width in spectrum.peaks),
         )
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Unchanged":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
         """Return a transform that does nothing."""
-        return _Unchanged()
-
-
-class _Unchanged(RunningTransform):
-    """Transform that returns its input."""
-
-    def apply(self, values: Floats) -> None:
-        """Leave the values unchanged."""
+        return MemorylessTransform(lambda values: None)

@@ -5,8 +5,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.sample import Floats
-from monitor.noise.effect import RunningTransform, Transform, parameter
+from monitor.noise.effect import MemorylessTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
 OBSERVATION_S: Final = 3600.0
@@ -23,14 +22,13 @@ class Saturation(Transform):
     Spectrum and Allan variance are then unchanged. Otherwise there is no closed form, and they are NaN.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
-    >>> white = white_noise_spectrum(1.0, 0.01)
-    >>> [float(Saturation(limit=x).transform_spectrum(white).avar(np.array([1.0]))[0]) for x in (10.0, 1.0)]
+    >>> clipped = [Saturation(limit=x).transform_spectrum(white_noise_spectrum(1.0, 0.01)) for x in (10.0, 1.0)]
+    >>> [float(spectrum.avar(np.array([1.0]))[0]) for spectrum in clipped]
     [0.01, nan]
     """
 
     limit: float = parameter("rad/s", "m/s²", positive=True)
 
-    name: ClassVar[str] = "saturation"
     description: ClassVar[str] = "Beyond its range the sensor reads the end of the range."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
@@ -40,16 +38,6 @@ class Saturation(Transform):
         noise = spectrum.without_lines().mean_square(1.0 / max(OBSERVATION_S, 4.0 * spectrum.tau0_s)) ** 0.5
         return spectrum if steady + NOISE_SIGMAS * noise < self.limit else undefined_spectrum(spectrum.tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Clipping":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
         """Return a clipping transform."""
-        return _Clipping(self.limit)
-
-
-class _Clipping(RunningTransform):
-    """Running clipping at ± limit."""
-
-    def __init__(self, limit: float) -> None:
-        self._limit = limit
-
-    def apply(self, values: Floats) -> None:
-        np.clip(values, -self._limit, self._limit, out=values)
+        return MemorylessTransform(lambda values: np.clip(values, -self.limit, self.limit, out=values))

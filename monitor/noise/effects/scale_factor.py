@@ -5,8 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.sample import Floats
-from monitor.noise.effect import RunningTransform, Transform, parameter
+from monitor.noise.effect import MemorylessTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum
 
 
@@ -19,9 +18,8 @@ class ScaleFactor(Transform):
     4.0
     """
 
-    factor: float = parameter("1", "1")
+    factor: float = parameter("1")
 
-    name: ClassVar[str] = "scale_factor"
     description: ClassVar[str] = (
         "Everything the axis reads is too large or too small by one factor, as after a slip of units."
     )
@@ -30,16 +28,6 @@ class ScaleFactor(Transform):
         """Return the spectrum times f²."""
         return spectrum.scaled(self.factor)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Scaling":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
         """Return a multiplying transform."""
-        return _Scaling(self.factor)
-
-
-class _Scaling(RunningTransform):
-    """Running multiplication by a factor."""
-
-    def __init__(self, factor: float) -> None:
-        self._factor = factor
-
-    def apply(self, values: Floats) -> None:
-        values *= self._factor
+        return MemorylessTransform(lambda values: np.multiply(values, self.factor, out=values))

@@ -1,6 +1,6 @@
 """Sinusoidal noise, for example of a motor, the mains or a fan."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import cos, floor, pi, sin
 from typing import Any, ClassVar, Final
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, check_below_nyquist, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 from monitor.noise.spectrum import Spectrum, allan_of_line
 
 RENEWAL_SAMPLES: Final = 64
@@ -30,40 +30,26 @@ class Sinusoidal(Source):
     """
 
     amplitude: float = parameter("rad/s", "m/s²")
-    frequency: float = parameter("Hz", "Hz", positive=True)
-    phase: float | None = parameter("rad", "rad", signed=True, optional=True)
+    frequency: float = parameter("Hz", positive=True, below_nyquist=True)
+    phase: float | None = parameter("rad", signed=True, optional=True)
 
-    name: ClassVar[str] = "sinusoidal"
     description: ClassVar[str] = (
         "A steady oscillation at one frequency: a line in the spectrum, waves in the Allan curve."
     )
 
-    def check_rate(self, rate_hz: float) -> None:
-        """Raise ConfigError if the frequency is not below half the sample rate."""
-        check_below_nyquist(self, "frequency", rate_hz)
-
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the Allan variance A² sin⁴(πfτ)/(m² sin²(πfτ0))."""
-        return allan_of_line(self.frequency, 0.5 * self.amplitude**2, tau_s, tau0_s)
-
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return zero, because a line has power but no density."""
-        return np.zeros_like(f_hz)
-
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return a spectrum that has only one line."""
-        return replace(Source.spectrum(self, tau0_s), lines=((self.frequency, 0.5 * self.amplitude**2),))
+        """Return a spectrum that has only one line, because a line has power but no density."""
+        line = self.frequency, 0.5 * self.amplitude**2
+        return Spectrum(np.zeros_like, lambda tau: allan_of_line(*line, tau, tau0_s), tau0_s, lines=(line,))
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Line":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Sinusoid":
         """Return a sinusoid whose time counts from the first sample of the stream."""
         drawn = self.phase is None
         phase = float(rng.uniform(0.0, 2.0 * pi)) if self.phase is None else self.phase
-        return _Line(self.amplitude, self.frequency / rate_hz, phase, drawn)
+        return _Sinusoid(self.amplitude, self.frequency / rate_hz, phase, drawn)
 
 
-class _Line(NoiseSeries):
-    """Series of a sinusoid."""
-
+class _Sinusoid(NoiseSeries):
     def __init__(self, amplitude: float, step: float, phase: float, drawn: bool) -> None:
         self._amplitude, self._step, self._phase, self._drawn = amplitude, step, phase, drawn
 
@@ -75,8 +61,8 @@ class _Line(NoiseSeries):
 
 
 @compiled
-def _add_sinusoid(values, first, amplitude, step, phase):  # type: ignore[no-untyped-def]
-    """Add A sin(2π·step·k + phase) for k = first, …; ``step`` is in cycles per sample."""
+def _add_sinusoid(values: Floats, first: int, amplitude: float, step: float, phase: float) -> None:
+    """Add A sin(2π·step·k + phase) for k = first, …, with ``step`` in cycles per sample."""
     c, s = cos(2.0 * pi * step), sin(2.0 * pi * step)
     k = first - first % RENEWAL_SAMPLES
     while k < first + values.size:

@@ -9,6 +9,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +18,7 @@ class TemperatureLag(Source):
     T_l)/τ.
 
     T_l is the lagged temperature. It starts at the first temperature of the series. The temperature is constant between
-    samples. Allan variance and spectrum depend on the temperature and are NaN.
+    samples.
 
     >>> lag = TemperatureLag(coefficient=1e-4, reference=25.0, time_constant=60.0)
     >>> bool(np.isnan(lag.avar(np.array([1.0]), 0.01)[0]))
@@ -25,29 +26,22 @@ class TemperatureLag(Source):
     """
 
     coefficient: float = parameter("rad/s/°C", "m/s²/°C", signed=True)
-    reference: float = parameter("°C", "°C", signed=True)
-    time_constant: float = parameter("s", "s", positive=True)
+    reference: float = parameter("°C", signed=True)
+    time_constant: float = parameter("s", positive=True)
 
-    name: ClassVar[str] = "temperature_lag"
     description: ClassVar[str] = "The bias follows the temperature of the sensor, but later: heat takes its time."
     uses_temperature: ClassVar[bool] = True
 
-    def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return NaN, because the Allan variance depends on the temperature."""
-        return np.full_like(tau_s, np.nan)
-
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+    def spectrum(self, tau0_s: float) -> Spectrum:
         """Return NaN, because the spectrum depends on the temperature."""
-        return np.full_like(f_hz, np.nan)
+        return undefined_spectrum(tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Lagging":
+    def start(self, rate_hz: float, rng: np.random.Generator) -> "_LaggedBias":
         """Return a series that is settled at the first temperature."""
-        return _Lagging(self.coefficient, self.reference, -expm1(-1.0 / (self.time_constant * rate_hz)))
+        return _LaggedBias(self.coefficient, self.reference, -expm1(-1.0 / (self.time_constant * rate_hz)))
 
 
-class _Lagging(NoiseSeries):
-    """Series of a first-order lag of the temperature."""
-
+class _LaggedBias(NoiseSeries):
     def __init__(self, coefficient: float, reference_c: float, share: float) -> None:
         self._coefficient, self._reference_c, self._share = coefficient, reference_c, share
         self._lagged_c: float | None = None
@@ -60,9 +54,11 @@ class _Lagging(NoiseSeries):
 
 
 @compiled
-def _add_lagged_bias(values, temperature, inside, coefficient, reference, share):  # type: ignore[no-untyped-def]
-    """Add the bias of the lagged temperature to the values [n], and return that temperature in °C."""
+def _add_lagged_bias(
+    values: Floats, temperature_c: Floats, inside: float, coefficient: float, reference: float, share: float
+) -> float:
+    """Add the bias of the lagged temperature to the values [n], and return the lagged temperature in °C."""
     for k in range(values.size):
         values[k] += coefficient * (inside - reference)
-        inside += share * (temperature[k] - inside)
+        inside += share * (temperature_c[k] - inside)
     return inside

@@ -31,7 +31,7 @@ from monitor.commands.analyze import Request, run_analysis
 from monitor.common import config_files
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
-from monitor.noise.temperature import TEMPERATURE_UNITS as TEMPERATURE_KEYS
+from monitor.noise.temperature import Temperature
 from monitor.settings import loading, schema
 
 pytestmark = pytest.mark.timeout(900)
@@ -330,7 +330,7 @@ OTHERS: Final = "[ax.bias]\nvalue = 1.0\n[temperature]\nmean = 20.0\n"
 
 def model_texts(values: Sequence[str]) -> Iterator[str]:
     """Models in which one number is absurd."""
-    assert set(TEMPERATURE) == set(TEMPERATURE_KEYS)
+    assert set(TEMPERATURE) == {f.name for f in fields(Temperature)}
     for value in values:
         yield f"sample_rate = {value}\n{NOISE}"
         for key in TEMPERATURE:

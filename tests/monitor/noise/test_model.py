@@ -102,7 +102,7 @@ def test_an_effect_that_occurs_twice_is_an_array_of_tables():
         ("[temperature]\nmean = 3\nwander = 3", "temperature: wander needs a wander_time"),
         (
             "[temperature]\nmean = 3\nswing = 3\nperiod = 0",
-            "temperature: period: 0 s is outside",
+            "temperature: period must be above zero, is 0",
         ),
         ("temperature = 25", "temperature must be a table with mean, swing, period, wander, wander_time"),
     ],

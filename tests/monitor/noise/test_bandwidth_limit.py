@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt, sosfilt_zi, sosfreqz
 
-from monitor.noise.low_pass import LowPass, butterworth_sections
+from monitor.noise.effects import BandwidthLimit
+from monitor.noise.effects.bandwidth_limit import butterworth_sections
 
 
 @pytest.mark.parametrize("order", range(1, 9))
@@ -13,7 +14,7 @@ def test_samples_are_filtered_as_by_scipy(order: int, cutoff_hz: float) -> None:
     sections = butter(order, cutoff_hz, fs=100.0, output="sos")
     values = 9.81 + np.random.default_rng(order).standard_normal(3000)
     expected, _ = sosfilt(sections, values, zi=sosfilt_zi(sections) * values[0])
-    low_pass = LowPass(butterworth_sections(order, cutoff_hz, 100.0))
+    low_pass = BandwidthLimit(cutoff=cutoff_hz, order=order).start(100.0, np.random.default_rng())
     for piece in np.split(values, [1, 8, 1000, 1000]):  # views of values
         if piece.size:
             low_pass.apply(piece)
@@ -32,5 +33,5 @@ def test_the_gain_is_that_of_butterworth(order: int) -> None:
 
 def test_columns_of_a_table_are_filtered_in_place() -> None:
     table = np.full((10, 6), 9.81)
-    LowPass(butterworth_sections(2, 10.0, 100.0)).apply(table[:, 2])
+    BandwidthLimit(cutoff=10.0, order=2).start(100.0, np.random.default_rng()).apply(table[:, 2])
     assert table == pytest.approx(np.full((10, 6), 9.81), rel=1e-14)
