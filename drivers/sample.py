@@ -18,6 +18,9 @@ Ints = NDArray[np.int64]
 AXES: Final = ("gx", "gy", "gz", "ax", "ay", "az")
 """Axis order of every array with six columns: gyroscopes in rad/s, accelerometers in m/s²."""
 
+NS_PER_S: Final = 1e9
+"""Nanoseconds per second."""
+
 NO_TICK: Final = -1
 """Value of ``ticks`` for a sample whose frame carried no counter."""
 

@@ -116,6 +116,11 @@ class ArrivalRegression:
         r2 = self._sxt * self._sxt / (self._sxx * self._stt) if self._stt > 0.0 else 0.0
         return self._sxx / self._sxt, UNCERTAINTY_FACTOR * sqrt(max(1.0 / r2 - 1.0, 0.0)) if r2 > 0.0 else inf
 
+    def is_slower_than(self, period_s: float) -> bool:
+        """Return True if the points show with certainty a longer period than ``period_s``."""
+        found = self.measured()
+        return found is not None and found[0] * period_s < 1.0 - found[1]
+
     def period_s(self) -> float | None:
         """Return the sample period in seconds; None before the second point if there is no nominal rate."""
         if self.count >= 2 and self._sxt > 0.0 and (self.settled() or self._nominal_s is None):

@@ -1,11 +1,7 @@
-"""Detection of repeated, late and reordered rows by their keys (given times or device counters) and values.
+"""Detection of repeated rows by their keys (sender times or device counters) and values.
 
-A row is a repeat if an earlier row has the same key and the same values. If keys are too coarse to distinguish rows
-(many rows share a key but differ in their values), no row is called a repeat. Rows whose given times form a steady
-sequence in another order are sorted. Times that only jitter are not sorted, since the order of arrival is then correct.
-
-``EventRateLimiter`` limits the rate of the events about these rows. This module uses only the key and the values of a
-sample.
+A row is a repeat if an earlier row has the same key and the same values. If many rows share a key but differ in their
+values, the keys are too coarse to distinguish rows. In this case no row is called a repeat.
 """
 
 from collections import deque
@@ -14,12 +10,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import Event, Floats, Ints
+from drivers.sample import NO_TICK, NS_PER_S, CounterTiming, Floats, Ints, SampleBlock, SenderTiming, Timing, make_block
+from drivers.timing.event_rate_limiter import EventRateLimiter
 
 Mask = NDArray[np.bool_]
 
-NS_PER_S: Final = 1e9
-"""Nanoseconds per second."""
 MIN_NEW_KEYS: Final = 20
 """Minimum number of rows with a new key. With fewer rows, no row is called a repeat."""
 MAX_SHARED_FRACTION: Final = 0.05
@@ -28,10 +23,6 @@ SHARED_FRACTION_ROWS: Final = 2000
 """Number of recent rows over which the fraction of shared keys is computed."""
 SEARCH_ROWS: Final = 256
 """Number of earlier rows that are searched for a repeat."""
-STEP_TOLERANCE: Final = 0.25
-"""Tolerance as a fraction of a period. Times this close to a whole number of periods form a steady sequence."""
-MIN_EVENT_INTERVAL_S: Final = 1.0
-"""Shortest time between two events of one kind."""
 
 
 class DuplicateDetector:
@@ -39,9 +30,9 @@ class DuplicateDetector:
 
     Parameters
     ----------
-    ordered
-        True if keys only increase, so that a repeat may follow after other rows. False for a counter that wraps, where
-        a repeat follows its original at once.
+    ordered : bool
+        True if keys only increase. A repeat may then follow after other rows. False for a counter that wraps. A repeat
+        of a counter value must follow the first row immediately.
     """
 
     def __init__(self, ordered: bool) -> None:
@@ -56,16 +47,17 @@ class DuplicateDetector:
 
         Parameters
         ----------
-        keys
-            [n] int64, given times in ns or counter values.
-        values
-            [n, 6] float64. NaN equals NaN.
+        keys : array of int64, shape (n,)
+            Sender times in ns or counter values.
+        values : array of float64, shape (n, 6)
+            Values of the samples. NaN equals NaN.
 
         Returns
         -------
-        tuple
-            A bool array [n] that is True for repeats (None if there are none), and the number of other rows that share
-            a key with an earlier row. Those rows are kept.
+        repeats : array of bool, shape (n,), or None
+            True for each repeat. None if there are no repeats.
+        shared : int
+            Number of other rows that share a key with an earlier row. These rows are not repeats.
         """
         n = len(keys)
         fresh = int(keys[0]) > self._last if self._ordered else int(keys[0]) != self._last
@@ -118,89 +110,62 @@ class DuplicateDetector:
             self._kept -= len(self._tail.popleft()[0])
 
 
-def steady_order(t_ns: Ints, period_s: float) -> Ints | None:
-    """Return the order in which given times form a steady sequence.
+class RowFilter:
+    """Filter that removes rows from blocks and carries their ``lost`` counts on to the next row.
 
     Parameters
     ----------
-    t_ns
-        [n] int64, times in ns in order of arrival.
-    period_s
-        Sample period in s.
-
-    Returns
-    -------
-    ndarray or None
-        [n] int64, the row of each position. None if the times are in order already or form no steady sequence.
-
-    Examples
-    --------
-    >>> steady_order(np.array([0, 10, 30, 20, 40]) * 10**6, 0.01).tolist()
-    [0, 1, 3, 2, 4]
-    >>> steady_order(np.array([0, 10, 8, 20, 18]) * 10**6, 0.01) is None
-    True
-    """
-    if (np.diff(t_ns) >= 0).all():
-        return None
-    order = np.argsort(t_ns, kind="stable")
-    moved = np.flatnonzero(order != np.arange(len(order)))
-    steps = np.diff(t_ns[order]) / (NS_PER_S * period_s)
-    touched = np.unique(np.clip(np.concatenate([moved - 1, moved]), 0, len(steps) - 1))
-    whole = np.rint(steps[touched])
-    steady = (whole >= 1.0) & (np.abs(steps[touched] - whole) < STEP_TOLERANCE)
-    return order if bool(steady.all()) else None
-
-
-class EventRateLimiter:
-    """Rate limiter for events: passes at most one event of each kind in EVENT_S of sample time.
-
-    Events that are held back are summed up in the next one.
+    timing : Timing
+        Timing of the wire format. It decides which key identifies a row.
+    events : EventRateLimiter
+        Receiver of the events about repeated rows.
     """
 
-    def __init__(self) -> None:
-        self._events: list[Event] = []
-        self._last: dict[str, int] = {}
-        self._held_back: dict[tuple[str, str], tuple[int, str, int]] = {}
+    def __init__(self, timing: Timing, events: EventRateLimiter) -> None:
+        self.repeated_rows = 0
+        """Number of rows removed because they repeat an earlier row."""
+        self._timing = timing
+        self._events = events
+        self._detector = DuplicateDetector(ordered=isinstance(timing, SenderTiming))
+        self._carried_lost = 0  # missing samples before rows that were removed
 
-    def tell(self, kind: str, t_ns: int, text: str, n: int = 0) -> None:
-        """Report an event.
+    def remove_repeats(self, samples: SampleBlock) -> SampleBlock | None:
+        """Remove the rows that repeat an earlier row. Return None if no row remains."""
+        if isinstance(self._timing, SenderTiming):
+            keys, key_name = samples.t_ns, "time"
+        elif isinstance(self._timing, CounterTiming) and (samples.ticks != NO_TICK).all():
+            keys, key_name = samples.ticks, "count"
+        else:
+            return samples
+        repeats, shared = self._detector.find(keys, samples.values)
+        t_ns = int(samples.t_ns[-1])
+        if shared:
+            text = f"{{n}} rows have the same {key_name} as another row and other values; all rows are kept"
+            self._events.report("samples_repeated", t_ns, text, shared)
+        if repeats is None:
+            return samples
+        n = int(repeats.sum())
+        self.repeated_rows += n
+        text = f"{{n}} rows repeat an earlier row with the same {key_name} and values, and are left out"
+        self._events.report("samples_repeated", t_ns, text, n)
+        return self.select(samples, np.flatnonzero(~repeats))
+
+    def select(self, samples: SampleBlock, rows: Ints) -> SampleBlock | None:
+        """Return some rows of a block, or None if there are none.
+
+        Samples that are missing before a removed row count as missing before the next row.
 
         Parameters
         ----------
-        kind
-            Kind of the event.
-        t_ns
-            Time of the event in ns.
-        text
-            Text of the event. ``{n}`` is replaced by the sum of the counts of all events that were held back.
-        n
-            Count of this event.
+        samples : SampleBlock
+            Block of samples.
+        rows : array of int64, shape (n,)
+            Numbers of the rows to keep, in their new order.
         """
-        key = (kind, text if "{n}" in text else "")
-        held = self._held_back.pop(key, None)
-        if "{n}" in text:
-            n += held[2] if held else 0
-        else:  # the first event is reported, and the others are counted
-            n = held[2] + 1 if held else 0
-            text = held[1] if held else text
-        self._held_back[key] = (t_ns, text, n)
-        self.tell_due(t_ns)
-
-    def tell_due(self, t_ns: int) -> None:
-        """Report the events that have been held back for EVENT_S at the time ``t_ns``."""
-        for (kind, what), (at_ns, text, n) in [*self._held_back.items()] if self._held_back else ():
-            if kind not in self._last or abs(t_ns - self._last[kind]) >= MIN_EVENT_INTERVAL_S * NS_PER_S:
-                del self._held_back[(kind, what)]
-                self._last[kind] = t_ns
-                more = f", and {n} more of the kind within a second" if n and "{n}" not in text else ""
-                self._events.append(Event(kind, at_ns, text.replace("{n}", str(n)) + more))
-
-    def take(self, ended: bool = False) -> list[Event]:
-        """Return the events since the last call. If ``ended`` is True, return the events that are held back, too."""
-        if ended:
-            self._last.clear()
-            while self._held_back:
-                self.tell_due(0)
-                self._last.clear()
-        events, self._events = self._events, []
-        return events
+        if not rows.size:
+            self._carried_lost += samples.lost
+            return None
+        lost, self._carried_lost = samples.lost + self._carried_lost, 0
+        return make_block(
+            samples.t_ns[rows], samples.values[rows], samples.temperature_c[rows], samples.ticks[rows], lost
+        )

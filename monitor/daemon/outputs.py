@@ -1,6 +1,6 @@
 """Outputs of the daemon: zenoh messages, viewer, history file, log lines and the table in the terminal. None blocks.
 
-The parameters of all methods are described in ``monitor.daemon.device_worker.Output``.
+The parameters of all methods are described in ``monitor.daemon.output.Output``.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ from drivers.sample import Event, Ints, SampleBlock
 from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.common.health import Health
-from monitor.daemon.device_worker import Output
+from monitor.daemon.output import Output
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalUpdate
 from monitor.estimation.allan.hadamard import HadamardCurve

@@ -4,7 +4,7 @@ Blocks of samples enter in order. The latest results are in ``estimator``, ``the
 Detections are taken as events.
 
 The pipeline publishes nothing and reads no clock. Its owner decides when it may advance and what is published. After a
-restart of the program, ``relive`` replays the end of the recording through the pipeline without events.
+restart of the program, ``replay`` passes the end of the recording through the pipeline without events.
 """
 
 from collections import deque
@@ -108,10 +108,10 @@ class DevicePipeline:
         """Time in nanoseconds of the first sample in the window of an axis that was restarted, else None."""
         self.newest_ns = 0
         """Time of the newest sample that entered the pipeline, in nanoseconds; 0 before the first."""
-        self.identifier = ArmaWorker(f"drift of {device.name}", at_once=patient)
+        self.arma_worker = ArmaWorker(f"drift of {device.name}", at_once=patient)
         self._device = device
         self._model = model
-        self._ready = ready
+        self.ready = ready
         self._patient = patient
         self._needs = ready.all if needs_all else ready.window
         self._live = live
@@ -125,23 +125,23 @@ class DevicePipeline:
     def can_begin(self, rate_hz: float) -> bool:
         """Return True if the kernels that the pipeline needs to begin are compiled or can be interpreted."""
         if not self._interprets and not self._needs.is_set():
-            self._interprets = self._live and self._ready.reserve_interpreter(rate_hz)
+            self._interprets = self._live and self.ready.reserve_interpreter(rate_hz)
         return self._interprets or self._needs.is_set()
 
     @property
     def can_fit(self) -> bool:
         """True if the kernels of the noise coefficients can be called."""
-        return self._interprets or self._ready.fit.is_set()
+        return self._interprets or self.ready.fit.is_set()
 
     @property
     def fits_slowly(self) -> bool:
         """True if the kernels of the fit are interpreted. A fit then takes about 0.1 s."""
-        return self._interprets and not self._ready.fit.is_set()
+        return self._interprets and not self.ready.fit.is_set()
 
     @property
     def can_detect(self) -> bool:
         """True if the kernels of the motion and change detection can be called."""
-        return self._interprets or self._ready.all.is_set()
+        return self._interprets or self.ready.all.is_set()
 
     def interpreted(self, rate_hz: float | None) -> AbstractContextManager[None]:
         """Return the context in which the kernels are to be called.
@@ -153,7 +153,7 @@ class DevicePipeline:
         """
         if rate_hz is not None and self.estimator is None:
             self.can_begin(rate_hz)
-        return interpreted() if self._interprets and not self._ready.all.is_set() else nullcontext()
+        return interpreted() if self._interprets and not self.ready.all.is_set() else nullcontext()
 
     @property
     def waiting(self) -> bool:
@@ -198,10 +198,10 @@ class DevicePipeline:
     def update_drift_models(self) -> None:
         """Adopt new drift models and start the identification of those that are due, if an interval has just ended."""
         live = self.compensation
-        if live is None or not self._ready.all.is_set():  # another thread identifies the models and would compile
+        if live is None or not self.ready.all.is_set():  # another thread identifies the models and would compile
             return
         if live.compensator.samples_to_interval_end == live.compensator.interval_samples:
-            self.identifier.update(live)
+            self.arma_worker.update(live)
 
     def replay(self, samples: SampleBlock, rate_hz: float) -> None:
         """Process a recorded block without events, to rebuild the window after a restart.
@@ -223,7 +223,7 @@ class DevicePipeline:
         if live is not None and np.isfinite(samples.values[:, :3]).any():
             for at in range(0, len(samples), MAX_PIECE_SAMPLES):
                 live.update(samples[at : at + MAX_PIECE_SAMPLES])
-            self.identifier.update(live)
+            self.arma_worker.update(live)
             live.take()
         self.take_events()
         self.take_thermal_intervals()

@@ -35,6 +35,11 @@ class RingBuffer:
         self._lock = threading.Lock()
 
     @property
+    def empty(self) -> bool:
+        """True if the buffer holds no sample."""
+        return self._read == self._written
+
+    @property
     def room(self) -> int:
         """Number of samples that fit in before the oldest is overwritten."""
         return self.capacity - (self._written - self._read)

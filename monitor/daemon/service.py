@@ -23,11 +23,12 @@ from drivers.links.replay_link import ReplayLink
 from drivers.recordings.segment import SegmentMetadata
 from monitor.common.health import Health, format_service_status
 from monitor.daemon import kernel_compilation, reload
-from monitor.daemon.device_worker import DeviceWorker, Output
+from monitor.daemon.device_worker import DeviceWorker
 from monitor.daemon.operations.hooks import Hooks
 from monitor.daemon.operations.live_reconcile import Job, Reconciler
 from monitor.daemon.operations.log_level import LEVEL
 from monitor.daemon.operations.systemd import SystemdNotifier
+from monitor.daemon.output import Output
 from monitor.daemon.outputs import HistoryOutput, TableOutput, ViewerOutput, ZenohOutput
 from monitor.daemon.pipeline import KernelReadiness
 from monitor.daemon.reload import ConfigChange
@@ -107,17 +108,18 @@ class Service:
         self._reload_asked = False
         self.virtual: dict[str, VirtualImu] = {}
         self.recorder = _build_recorder(config)
+        self.outputs: list[Output] = []
         self.workers: list[DeviceWorker] = []
         self._self_timed_devices: set[str] = set()  # devices whose sample times do not come from the host clock
         for device in config.devices:
             self._register_device(*self._build_device(device))
         self.history = _build_history_writer(config)
         recall = None if self.history is None else self._answer_history_query
-        self.zenoh = ZenohPublisher(config.zenoh, [station.name for station in self.workers], recall)
+        self.zenoh = ZenohPublisher(config.zenoh, [worker.name for worker in self.workers], recall)
         self.viewer = _build_view(config, self._load_viewer_history)
         self._viewer_url = ""  # address of the viewer's web page that was announced last
         self.hooks = Hooks(config.hooks, self.zenoh.put_key)
-        self.outputs: list[Output] = [ZenohOutput(self.zenoh), self.hooks, *more]
+        self.outputs += [ZenohOutput(self.zenoh), self.hooks, *more]
         self.metrics = _build_metrics_output(config)
         if self.metrics is not None:
             self.outputs.append(self.metrics)
@@ -163,8 +165,8 @@ class Service:
             self.viewer.start()
         for imu in self.virtual.values():
             imu.start()
-        for station in self.workers:
-            station.start()
+        for worker in self.workers:
+            worker.start()
         if self.recorder is not None:
             self.recorder.start()
             threading.Thread(target=self._rebuild_windows, args=(self.workers,), name="rebuild", daemon=True).start()
@@ -190,21 +192,21 @@ class Service:
                 self._publish_status()
             if until_s is not None and now_s >= until_s:
                 return
-            if all(station.ended for station in self.workers):
+            if all(worker.ended for worker in self.workers):
                 return
             if self._reload_asked:
                 self._reload_asked = False
                 self._reload()
             self._wake.wait(MAX_IDLE_S)
             self._wake.clear()
-            if not any(station.device.publish_s == 0.0 for station in self.workers):
+            if not any(worker.device.publish_s == 0.0 for worker in self.workers):
                 self._stop.wait(ROUND_PAUSE_S)
 
     def _work_devices(self, now_s: float) -> None:
         """Process the new samples of every device, and announce on zenoh which devices are running."""
-        for station in self.workers:
-            station.work(self.outputs, now_s)
-            self.zenoh.set_alive(station.name, station.driver.state == "running")
+        for worker in self.workers:
+            worker.work(now_s)
+            self.zenoh.set_alive(worker.name, worker.driver.state == "running")
 
     def states(self) -> dict[str, str]:
         """Return the state of each output by its name: "ok", or a text that describes the problem."""
@@ -221,11 +223,11 @@ class Service:
             states["hook"] = self.hooks.state
         return states | {name: writer.state for name, writer in self._writers.items()}
 
-    def _rebuild_windows(self, stations: Sequence[DeviceWorker]) -> None:
+    def _rebuild_windows(self, workers: Sequence[DeviceWorker]) -> None:
         """Rebuild the windows of devices from their recordings, as soon as all kernels are compiled."""
         self._ready.all.wait()
-        for station in stations:
-            station.rebuild()
+        for worker in workers:
+            worker.rebuild()
 
     def _load_viewer_history(self, device: str) -> HistoryTable | None:
         """Return the stored results that the viewer shows when it opens, or None if there are none.
@@ -296,15 +298,15 @@ class Service:
 
             imu = VirtualImu(link, device.decoder, device.name)
             link = imu.link
-        return DeviceWorker(device, link, device.decoder, self._wake, self._ready, self.recorder), imu
+        return DeviceWorker(device, link, self.outputs, self._wake, self._ready, self.recorder), imu
 
-    def _register_device(self, station: DeviceWorker, imu: "VirtualImu | None") -> None:
+    def _register_device(self, worker: DeviceWorker, imu: "VirtualImu | None") -> None:
         """Add a worker, and its virtual IMU if the device is simulated, to the service."""
-        self.workers = [*self.workers, station]
-        if station.driver.times_are_unix:
-            self._self_timed_devices.add(station.name)
+        self.workers = [*self.workers, worker]
+        if worker.driver.times_are_unix:
+            self._self_timed_devices.add(worker.name)
         if imu is not None:
-            self.virtual[station.name] = imu
+            self.virtual[worker.name] = imu
 
     # --- reload of the configuration
 
@@ -312,7 +314,7 @@ class Service:
         """Read the configuration file again and apply the changes; with any mistake in the file, change nothing."""
         self._unit.reloading()
         try:
-            change = reload.compare_with_file(self.config, {station.name: station.model for station in self.workers})
+            change = reload.compare_with_file(self.config, {worker.name: worker.model for worker in self.workers})
             built = [self._build_device(device) for device in change.added]
         except ConfigError as error:
             _log.error("not reloaded, all goes on as it was", error=str(error))
@@ -324,51 +326,51 @@ class Service:
 
     def _apply(self, change: ConfigChange, built: "Sequence[tuple[DeviceWorker, VirtualImu | None]]") -> None:
         """Apply the changes of a configuration: stop removed devices, exchange limits, and start added devices."""
-        leaving = [station for station in self.workers if station.name in change.removed]
-        for station in leaving:
-            station.stop()  # all devices stop side by side, because each may take a moment
-        for station in leaving:
-            self._remove(station)
+        leaving = [worker for worker in self.workers if worker.name in change.removed]
+        for worker in leaving:
+            worker.stop()  # all devices stop side by side, because each may take a moment
+        for worker in leaving:
+            self._remove(worker)
         for device in change.limited:
-            next(station for station in self.workers if station.name == device.name).set_limits(device)
+            next(worker for worker in self.workers if worker.name == device.name).set_limits(device)
         self.config = change.config
         self.hooks.hooks = change.config.hooks
         LEVEL.name = change.config.log.level
-        for station, imu in built:
-            self._register_device(station, imu)
+        for worker, imu in built:
+            self._register_device(worker, imu)
         order = [device.name for device in change.config.devices]
-        self.workers.sort(key=lambda station: order.index(station.name))
+        self.workers.sort(key=lambda worker: order.index(worker.name))
         if self.viewer is not None:
             self.viewer.set_devices(_device_infos(change.config.devices))
-        for station, imu in built:
-            self._add(station, imu)
+        for worker, imu in built:
+            self._add(worker, imu)
 
-    def _add(self, station: DeviceWorker, imu: "VirtualImu | None") -> None:
+    def _add(self, worker: DeviceWorker, imu: "VirtualImu | None") -> None:
         """Start an added device while the other devices continue."""
-        self.zenoh.add(station.name)
+        self.zenoh.add(worker.name)
         if self.recorder is not None:
-            self.recorder.add(_segment_origins(self.config.storage, station.device))
+            self.recorder.add(_segment_origins(self.config.storage, worker.device))
         if imu is not None:
             imu.start()
-        station.start()
+        worker.start()
         if self.recorder is not None:
-            threading.Thread(target=self._rebuild_windows, args=([station],), name="rebuild", daemon=True).start()
+            threading.Thread(target=self._rebuild_windows, args=([worker],), name="rebuild", daemon=True).start()
 
-    def _remove(self, station: DeviceWorker) -> None:
+    def _remove(self, worker: DeviceWorker) -> None:
         """Remove a stopped device and publish its remaining samples, while the other devices continue."""
-        if station.name in self.virtual:
-            self.virtual.pop(station.name).stop()
-        if not self._work_until(lambda: station.join(0.0) and not station.rebuilding):
-            _log.warning("reader did not end in time", device=station.name)
-        station.work(self.outputs, time.monotonic(), drain=True)
-        self.workers = [one for one in self.workers if one is not station]
-        self.zenoh.remove(station.name)
+        if worker.name in self.virtual:
+            self.virtual.pop(worker.name).stop()
+        if not self._work_until(lambda: worker.join(0.0) and not worker.restore.active):
+            _log.warning("reader did not end in time", device=worker.name)
+        worker.work(time.monotonic(), drain=True)
+        self.workers = [one for one in self.workers if one is not worker]
+        self.zenoh.remove(worker.name)
         if self.recorder is not None:
-            self.recorder.remove(station.name)
-            self._work_until(lambda: self.recorder is None or not self.recorder.is_recording(station.name))
-        self._self_timed_devices.discard(station.name)
+            self.recorder.remove(worker.name)
+            self._work_until(lambda: self.recorder is None or not self.recorder.is_recording(worker.name))
+        self._self_timed_devices.discard(worker.name)
         for output in self.outputs:
-            output.device_removed(station.name)
+            output.device_removed(worker.name)
 
     def _work_until(self, done: Callable[[], bool]) -> bool:
         """Process all devices until ``done`` returns True, or for JOIN_TIMEOUT_S; return its last result."""
@@ -385,7 +387,7 @@ class Service:
         self._publish_recorder_events()
         states, memory = self.states(), memory_bytes()
         self._announce_viewer_url()
-        healths = {station.name: station.publish_status(self.outputs, states, memory) for station in self.workers}
+        healths = {worker.name: worker.publish_status(states, memory) for worker in self.workers}
         self._notify_systemd(healths, states)
 
     def _notify_systemd(self, healths: Mapping[str, Health], states: Mapping[str, str]) -> None:
@@ -396,16 +398,16 @@ class Service:
         )
         if tried and not self._unit.ready_sent:
             self._unit.ready()
-        turns = {station.name: station.read_attempts for station in self.workers}
+        turns = {worker.name: worker.read_attempts for worker in self.workers}
         stuck = self._unit.send_watchdog({name: count for name, count in turns.items() if count is not None}, now_s)
         self._unit.status(format_service_status(healths, states, stuck))
 
     def _publish_recorder_events(self) -> None:
         """Publish the events of the recorder."""
-        stations = {station.name: station for station in self.workers}
+        workers = {worker.name: worker for worker in self.workers}
         for told in self.recorder.take_events() if self.recorder is not None else ():
-            if told.device in stations:
-                stations[told.device].publish_event(self.outputs, told.kind, told.text)
+            if told.device in workers:
+                workers[told.device].publish_event(told.kind, told.text)
 
     def _announce_viewer_url(self) -> None:
         """Log the address of the viewer's web page each time it changes. A viewer in a window has no address."""
@@ -422,45 +424,45 @@ class Service:
 
     def _handle_commands(self) -> None:
         """Execute the commands that arrived over zenoh since the last round."""
-        stations = {station.name: station for station in self.workers}
+        workers = {worker.name: worker for worker in self.workers}
         while not self.zenoh.commands.empty():
             command = self.zenoh.commands.get_nowait()
-            if command.device in stations:
-                self._execute_command(command, stations[command.device])
+            if command.device in workers:
+                self._execute_command(command, workers[command.device])
             else:
                 command.refuse("the device was taken out of the configuration")
 
-    def _execute_command(self, command: Command, station: DeviceWorker) -> None:
+    def _execute_command(self, command: Command, worker: DeviceWorker) -> None:
         """Execute one command for a device, and answer it."""
         match command.verb:
             case "reset":
-                station.reset()
-                received = station.driver.counts.received
-                message = ResetMessage.of(station.name, station.now_unix_s(), received, "the window is empty")
+                worker.reset()
+                received = worker.driver.counts.received
+                message = ResetMessage.of(worker.name, worker.timeline.now_unix_s(), received, "the window is empty")
                 command.answer(message.encode())
-                _log.info("reset", device=station.name)
+                _log.info("reset", device=worker.name)
             case "reconcile":
-                self._reconcile(command, station)
+                self._reconcile(command, worker)
             case other:
                 command.refuse(f'unknown command "{other}"; known are reset, reconcile')
 
-    def _reconcile(self, command: Command, station: DeviceWorker) -> None:
+    def _reconcile(self, command: Command, worker: DeviceWorker) -> None:
         """Start a reconciliation with a copy of the window; a thread of its own sends the answer."""
-        held = station.window_snapshot()
+        held = worker.window_snapshot()
         if held is None:
             command.refuse("no samples yet")
             return
-        received, device = station.driver.counts.received, station.device
-        newest_s = station.unix_s(station.chain.newest_ns)
-        job = Job(station.name, newest_s, received, *held, device.model, device.reconcile_folder)
+        received, device = worker.driver.counts.received, worker.device
+        newest_s = worker.timeline.unix_s(worker.pipeline.newest_ns)
+        job = Job(worker.name, newest_s, received, *held, device.model, device.reconcile_folder)
         self._reconciler.start(job, command)
 
     def _publish_reconcile_events(self) -> None:
         """Publish an event for each reconciliation that has finished."""
-        stations = {station.name: station for station in self.workers}
+        workers = {worker.name: worker for worker in self.workers}
         for finished in self._reconciler.take():
-            if finished.device in stations:
-                stations[finished.device].publish_event(self.outputs, "reconciled", finished.text)
+            if finished.device in workers:
+                workers[finished.device].publish_event("reconciled", finished.text)
 
     def _close(self) -> None:
         """Stop the devices, publish their remaining samples, and close all outputs."""
@@ -484,20 +486,20 @@ class Service:
 
     def _drain(self) -> None:
         """Stop the readers, and publish the samples that are left in the ring buffers."""
-        for station in self.workers:
-            station.stop()
-        if any(station.waits_for_all for station in self.workers):
+        for worker in self.workers:
+            worker.stop()
+        if any(worker.waits_for_all for worker in self.workers):
             self._ready.all.wait()  # the samples of these devices are still in the ring buffer
         for imu in self.virtual.values():
             imu.stop()
-        for station in self.workers:
+        for worker in self.workers:
             until_s = time.monotonic() + JOIN_TIMEOUT_S
-            while not (ended := station.join(ROUND_PAUSE_S)) and time.monotonic() < until_s:
-                station.work(self.outputs, time.monotonic())  # a replay waits for space in its ring buffer
+            while not (ended := worker.join(ROUND_PAUSE_S)) and time.monotonic() < until_s:
+                worker.work(time.monotonic())  # a replay waits for space in its ring buffer
             if not ended:
-                _log.warning("reader did not end in time", device=station.name)
-            station.work(self.outputs, time.monotonic(), drain=True)
-            self.zenoh.set_alive(station.name, False)
+                _log.warning("reader did not end in time", device=worker.name)
+            worker.work(time.monotonic(), drain=True)
+            self.zenoh.set_alive(worker.name, False)
         self._publish_status()
 
 

@@ -1,98 +1,127 @@
 """Restore of the estimation window after a restart of the program, from the end of the recording.
 
 The recorded samples of the last window pass through the same pipeline again, without events. The other values come from
-the state that was recorded with the samples (``segment.State``): the start of each axis, and the values of the iterated
-fit.
+the state that was recorded with the samples (``segment.DaemonState``): the start of each axis, and the values of the
+iterated fit.
 """
 
+import time
 from typing import Final
 
 import msgspec
 import numpy as np
 
+from drivers.errors import ImuError
 from drivers.recordings.segment import DaemonState
-from drivers.sample import AXES, Ints, SampleBlock, make_block
+from drivers.sample import AXES, Event, Ints, SampleBlock, make_block
+from drivers.timing.sample_clock import LastSample, SampleClock
+from monitor.daemon.device_timeline import DeviceTimeline
 from monitor.daemon.pipeline import DevicePipeline
 from monitor.daemon.storage.recorder import RecordingTail
+from monitor.settings.loading import Device
 
 MIN_REPLAY_S: Final = 600.0
-"""Shortest part of the recording that is replayed, however short the window is, because change detection needs history.
-"""
+"""Shortest part of the recording that is replayed, because change detection needs a history of this length."""
 
 
-def restore_window(chain: DevicePipeline, tail: RecordingTail, rate_hz: float, window_s: float, offset_ns: int) -> str:
-    """Fill the pipeline with the end of a recording.
-
-    Parameters
-    ----------
-    chain : Chain
-        Pipeline of the device.
-    tail : Tail
-        End of the recording.
-    rate_hz : float
-        Sample rate.
-    window_s : float
-        Length of the window.
-    offset_ns : int
-        Offset that converts the times to Unix time, in nanoseconds.
-
-    Returns
-    -------
-    str
-        A sentence that describes the result.
-
-    Raises
-    ------
-    RecordingError, OSError
-        A segment can no longer be read.
-    """
-    state = tail.newest.state
-    counted = np.zeros(len(AXES), np.int64)
-    for piece in tail.pieces(max(window_s, MIN_REPLAY_S)):
-        samples = piece.samples
-        counted += _count_since_restart(samples, state)
-        t_ns = samples.t_ns - offset_ns
-        chain.replay(make_block(t_ns, samples.values, samples.temperature_c, lost=samples.lost), rate_hz)
-    if chain.estimator is None:
-        return chain.refusal_reason or "nothing could be rebuilt from the recording"
-    for axis, unix_s in enumerate(state.since):
-        # changes that are detected in the replay were already known before the restart
-        chain.since_ns[axis] = None if unix_s is None else round(unix_s * 1e9) - offset_ns
-        if unix_s is not None:
-            chain.estimator.restart(axis, int(counted[axis]))
-    if state.theta:
-        shape = (-1, len(AXES))
-        theta = np.array(state.theta, np.float64).reshape(shape)
-        chain.estimator.restore_fit(np.array(state.entered).reshape(shape), theta)
-    filled_s = chain.estimator.filled / chain.estimator.rate_hz
-    return f"{filled_s:.6g} s of the window were rebuilt from the recording"
-
-
-def known(
-    chain: DevicePipeline, before: DaemonState, rate_hz: float | None, tick_step: float | None, offset_ns: int
-) -> DaemonState:
-    """Return the state that is to be recorded with the samples now.
+class WindowRestore:
+    """Restore of the window of one device, and the state that the next restart needs.
 
     Parameters
     ----------
-    chain : Chain
-        Pipeline of the device.
-    before : State
-        State at the start of the program. It is returned with new rates while there is no estimator.
-    rate_hz : float or None
-        Sample rate.
-    tick_step : float or None
-        Counter ticks from one sample to the next.
-    offset_ns : int
-        Offset that converts the times to Unix time, in nanoseconds.
+    device : Device
+        Settings of the device.
+    pipeline : DevicePipeline
+        Pipeline to fill. While ``active`` is True, only ``rebuild`` may use the pipeline.
+    clock : SampleClock
+        Sample clock of the device. It counts the samples since the end of the recording as missing.
+    timeline : DeviceTimeline
+        Timeline of the device. It receives the event ``window_rebuilt``.
     """
-    tick_step = tick_step or before.tick_step
-    if chain.estimator is None:
-        return msgspec.structs.replace(before, rate=rate_hz or before.rate, tick_step=tick_step)
-    entered, theta = chain.estimator.fit_state()
-    since = tuple(None if t_ns is None else (t_ns + offset_ns) / 1e9 for t_ns in chain.since_ns)
-    sizes = tuple(None if np.isnan(size) else float(size) for size in theta.ravel())
-    return DaemonState(chain.estimator.rate_hz, since, tick_step, sizes, tuple(entered.ravel().tolist()))
+
+    def __init__(self, device: Device, pipeline: DevicePipeline, clock: SampleClock, timeline: DeviceTimeline) -> None:
+        self._device = device
+        self._pipeline = pipeline
+        self._clock = clock
+        self._timeline = timeline
+        self._tail: RecordingTail | None = None  # end of the recording, until the window has been rebuilt from it
+        self._state_before = DaemonState()  # state of the estimate before the restart
+
+    @property
+    def active(self) -> bool:
+        """True from ``resume`` to the end of ``rebuild``."""
+        return self._tail is not None
+
+    def resume(self, tail: RecordingTail | None) -> None:
+        """Continue after the end of the recording, if there is one that ended less than one window ago."""
+        if tail is None:
+            return
+        newest, state = tail.newest.samples, tail.newest.state
+        t_ns = int(newest.t_ns[-1]) - self._timeline.offset_ns(time.monotonic_ns())
+        ago_s = (time.time_ns() - int(newest.t_ns[-1])) / 1e9
+        rate_hz = self._device.rate_hz or state.rate
+        if rate_hz is None or not 0.0 <= ago_s <= self._device.window_s:
+            text = f"the recording ended {ago_s:.4g} s ago; the window starts empty"
+            if ago_s < 0.0:
+                text = "the recording ends later than the present time of the host clock; the window starts empty"
+            self._timeline.add_event_now("window_rebuilt", text)
+            return
+        self._clock.resume(LastSample(t_ns, int(newest.ticks[-1]), rate_hz, state.tick_step))
+        self._tail, self._state_before = tail, state
+
+    def rebuild(self) -> None:
+        """Fill the window from the recording while new samples wait in the ring buffer; call it in a thread."""
+        tail = self._tail
+        if tail is None:
+            return
+        offset_ns = self._timeline.offset_ns(time.monotonic_ns())
+        try:
+            text = self._replay(tail, offset_ns)
+        except (ImuError, OSError) as error:
+            text = f"the window could not be rebuilt from the recording: {error}"
+            self._pipeline.reset()
+        finally:
+            t_ns = int(tail.newest.samples.t_ns[-1]) - offset_ns
+            self._timeline.add_event(Event("window_rebuilt", t_ns, text))
+            self._tail = None
+
+    def state(self) -> DaemonState:
+        """Return the state of the estimate that is to be recorded with the samples now."""
+        before, estimator = self._state_before, self._pipeline.estimator
+        if self.active:
+            return before
+        tick_step = self._clock.tick_step or before.tick_step
+        if estimator is None:
+            return msgspec.structs.replace(before, rate=self._clock.rate_hz or before.rate, tick_step=tick_step)
+        offset_ns = self._timeline.offset_ns(self._pipeline.newest_ns)
+        entered, theta = estimator.fit_state()
+        since = tuple(None if t_ns is None else (t_ns + offset_ns) / 1e9 for t_ns in self._pipeline.since_ns)
+        parameters = tuple(None if np.isnan(value) else float(value) for value in theta.ravel())
+        return DaemonState(estimator.rate_hz, since, tick_step, parameters, tuple(entered.ravel().tolist()))
+
+    def _replay(self, tail: RecordingTail, offset_ns: int) -> str:
+        """Fill the pipeline with the end of a recording; return a message that describes the result."""
+        pipeline, state = self._pipeline, tail.newest.state
+        rate_hz = self._clock.rate_hz or state.rate or 0.0
+        counted = np.zeros(len(AXES), np.int64)
+        for piece in tail.pieces(max(self._device.window_s, MIN_REPLAY_S)):
+            samples = piece.samples
+            counted += _count_since_restart(samples, state)
+            t_ns = samples.t_ns - offset_ns
+            pipeline.replay(make_block(t_ns, samples.values, samples.temperature_c, lost=samples.lost), rate_hz)
+        if pipeline.estimator is None:
+            return pipeline.refusal_reason or "the recording holds no samples for the window"
+        for axis, unix_s in enumerate(state.since):
+            # changes that are detected in the replay were already known before the restart
+            pipeline.since_ns[axis] = None if unix_s is None else round(unix_s * 1e9) - offset_ns
+            if unix_s is not None:
+                pipeline.estimator.restart(axis, int(counted[axis]))
+        if state.theta:
+            shape = (-1, len(AXES))
+            theta = np.array(state.theta, np.float64).reshape(shape)
+            pipeline.estimator.restore_fit(np.array(state.entered).reshape(shape), theta)
+        filled_s = pipeline.estimator.filled / pipeline.estimator.rate_hz
+        return f"{filled_s:.6g} s of the window were rebuilt from the recording"
 
 
 def _count_since_restart(samples: SampleBlock, state: DaemonState) -> Ints:

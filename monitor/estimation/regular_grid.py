@@ -18,10 +18,11 @@ import numpy as np
 
 from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.quantities import RATE_HZ
-from drivers.sample import AXES, Floats, Ints, SampleBlock, SenderTiming
+from drivers.sample import AXES, NS_PER_S, Floats, Ints, SampleBlock, SenderTiming
 from drivers.timing.arrival_regression import snap_to_standard_rate
-from drivers.timing.duplicate_rows import NS_PER_S
-from drivers.timing.sample_clock import FORWARD_JUMP_S, JUMP_S, SampleClock
+from drivers.timing.arrival_timeline import JUMP_S
+from drivers.timing.sample_clock import SampleClock
+from drivers.timing.sender_times import FORWARD_JUMP_S
 from monitor.common.units import format_rate, format_two_digits
 from monitor.estimation.detection.repeated_samples import repeated_share
 from monitor.estimation.detection.resolution import QuantizationStep, find_coarse_axes

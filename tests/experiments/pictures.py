@@ -260,7 +260,7 @@ def fleet(out: Path, folder: Path) -> Path:
     path = out / "viewer-fleet.png"
     with window() as (port, shoot), serving(folder, FLEET, port) as service:
         tail, wing = service.virtual["tail"], service.virtual["wing"]
-        until(lambda: all(station.latest is not None for station in service.workers), 120.0)
+        until(lambda: all(station.publisher.latest is not None for station in service.workers), 120.0)
         begun_s = time.monotonic()
         for at_s, act in (
             (PULLED_S, tail.unplug),
@@ -299,7 +299,9 @@ def view(out: Path, folder: Path) -> Path:
         viewer.start()
         looking.start()
         try:
-            until(lambda: all(station.latest is not None for one in daemons for station in one.workers), 120.0)
+            until(
+                lambda: all(station.publisher.latest is not None for one in daemons for station in one.workers), 120.0
+            )
             time.sleep(PULLED_AGAIN_S)
             daemons[0].virtual[MEMBERS[3]].unplug()
             daemons[1].virtual[MEMBERS[4]].unplug()
@@ -331,7 +333,7 @@ def yesterday(out: Path, folder: Path) -> Path:
 
 def fitted(service: Service) -> bool:
     """Whether there are coefficients."""
-    latest = service.workers[0].latest
+    latest = service.workers[0].publisher.latest
     return latest is not None and bool(np.isfinite(latest.fitted).any())
 
 
@@ -376,7 +378,7 @@ def effect(out: Path, _: Path) -> Path:
             (sensor,) = [device.link for device in config.devices]
             assert isinstance(sensor, loading.VirtualTable)
             begun_s = time.monotonic()
-            until(lambda: service.workers[0].latest is not None, 60.0)
+            until(lambda: service.workers[0].publisher.latest is not None, 60.0)
             time.sleep(begun_s + sensor.effect_at + SHOWN_S - time.monotonic())
             shoot(path)
     return small(path)
@@ -520,7 +522,7 @@ def replay(folder: Path, changed: bool = False) -> str:
 
 def replayed(service: Service, seconds: float) -> bool:
     """Whether so much of the recording is in the estimate."""
-    latest = service.workers[0].latest
+    latest = service.workers[0].publisher.latest
     return latest is not None and latest.t_ns >= (T0 + seconds) * 1e9
 
 

@@ -14,7 +14,7 @@ from drivers.recordings import save_samples
 from drivers.sample import Event, SampleBlock
 from monitor.common.config_files import CONFIG_FOLDER
 from monitor.common.units import format_utc
-from monitor.daemon.device_worker import Output
+from monitor.daemon.output import Output
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history import reading as past

@@ -79,9 +79,9 @@ def healthy(folder: Path, text: str) -> Iterator[Running]:
 def goes_on(run: Running) -> None:
     """The healthy device's samples arrive, are worked on and are published, at once."""
     caught = run.caught
-    before = run.station("healthy").published
+    before = run.station("healthy").publisher.published
     newest_ns = caught.estimates["healthy"].t_ns if "healthy" in caught.estimates else 0
-    wait_for(lambda: run.station("healthy").published >= before + 50, "samples of the healthy device")
+    wait_for(lambda: run.station("healthy").publisher.published >= before + 50, "samples of the healthy device")
     newer = lambda: "healthy" in caught.estimates and caught.estimates["healthy"].t_ns > newest_ns  # noqa: E731
     wait_for(newer, "estimates of the healthy device")
     wait_for(lambda: caught.healths["healthy"].state == "running", "its status")
@@ -276,7 +276,7 @@ def test_a_subscriber_that_takes_nothing(tmp_path: Path, kind: str) -> None:
                 slow.send_signal(signal.SIGSTOP)
             path.replace(later)  # the replay tries until it is one
             bulk = run.station("bulk")
-            wait_for(lambda: bulk.published == BULK, "the whole recording")
+            wait_for(lambda: bulk.publisher.published == BULK, "the whole recording")
             goes_on(run)
             assert slow.poll() is None
             assert run.caught.healths["healthy"].outputs["zenoh"] == "ok"
@@ -430,5 +430,5 @@ def test_a_tau_that_the_found_rate_makes_impossible(tmp_path: Path) -> None:
     text = '[[device]]\nname = "odd"\ntau = [0.001]\ndriver = { link = "virtual", seed = 2 }\n'
     with healthy(tmp_path, text + NO_ZENOH + NO_VIEWER) as run:
         says(run, "odd", "no estimate: tau: none of [0.001] s")
-        published = run.station("odd").published
-        wait_for(lambda: run.station("odd").published > published, "its samples")
+        published = run.station("odd").publisher.published
+        wait_for(lambda: run.station("odd").publisher.published > published, "its samples")

@@ -16,7 +16,7 @@ SAYS = {
     "no_descriptors": "Too many open files",
     "full_disk": "No space left on device; recording stopped",
     "slow_disk": "ok",
-    "clock_back": "ahead of the host's clock",
+    "clock_back": "ahead of the host clock",
     "router": "nobody at",
 }
 """Frozen viewers and rubbish on the line have tests of their own, in ``test_faults``."""

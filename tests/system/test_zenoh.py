@@ -59,7 +59,7 @@ mode = "none"
                 publisher.stdin.flush()
                 # all but the part of a block that is still to come
                 wanted = min(allowed - allowed % 1000, 1_000_000)
-                wait_for(lambda wanted=wanted: station.published >= wanted, "the samples")  # type: ignore[misc]
+                wait_for(lambda wanted=wanted: station.publisher.published >= wanted, "the samples")  # type: ignore[misc]
             publisher.stdin.close()
             assert publisher.wait(PATIENCE_S) == 0
     assert (counts.received, counts.bad, counts.lost, run.station("run1").ring.overflowed) == (1_000_000, 0, 0, 0)

@@ -28,7 +28,7 @@ from typing import Final
 import structlog
 
 from drivers.sample import Event
-from monitor.daemon.device_worker import Output
+from monitor.daemon.output import Output
 from monitor.publishing.messages.results import EventMessage
 from monitor.settings.loading import Hook
 

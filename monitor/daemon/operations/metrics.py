@@ -20,7 +20,7 @@ import numpy as np
 
 from drivers.sample import AXES, Event
 from monitor.common.health import Health
-from monitor.daemon.device_worker import Output
+from monitor.daemon.output import Output
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS
 from monitor.settings.loading import Metrics
@@ -71,7 +71,7 @@ GAUGES: Final[dict[str, tuple[str, Numbers]]] = {
 class MetricsOutput(Output):
     """Output that keeps the newest values and serves them.
 
-    The parameters of the output methods are described in ``monitor.daemon.device_worker.Output``.
+    The parameters of the output methods are described in ``monitor.daemon.output.Output``.
 
     Parameters
     ----------

@@ -1,15 +1,11 @@
-"""Repeats, order and the pace of telling, each by itself; with the clock around them in ``test_clock``."""
+"""Repeats, order and the pace of limiter, each by itself; with the clock around them in ``test_sample_clock``."""
 
 import numpy as np
 import pytest
 
-from drivers.timing.duplicate_rows import (
-    MIN_EVENT_INTERVAL_S,
-    MIN_NEW_KEYS,
-    DuplicateDetector,
-    EventRateLimiter,
-    steady_order,
-)
+from drivers.timing.duplicate_rows import MIN_NEW_KEYS, DuplicateDetector
+from drivers.timing.event_rate_limiter import MIN_EVENT_INTERVAL_S, EventRateLimiter
+from drivers.timing.sender_times import steady_order
 
 MS = 10**6
 
@@ -66,24 +62,24 @@ def test_only_a_steady_sequence_is_put_in_order(t, order):
 
 
 def test_events_keep_their_distance_and_nothing_is_forgotten():
-    telling = EventRateLimiter()
+    limiter = EventRateLimiter()
     for i in range(100):
-        telling.tell("a", i * 100 * MS, "{n} rows", 2)
-    telling.tell("b", 9900 * MS, "once")
-    told = telling.take()
+        limiter.report("a", i * 100 * MS, "{n} rows", 2)
+    limiter.report("b", 9900 * MS, "once")
+    told = limiter.take()
     assert [event.text for event in told if event.kind == "b"] == ["once"]
     of_a = [event for event in told if event.kind == "a"]
     assert len(of_a) == 10
     assert np.diff([event.t_ns for event in of_a]).min() >= MIN_EVENT_INTERVAL_S * 1e9
-    last = telling.take(ended=True)
+    last = limiter.take(ended=True)
     assert sum(int(event.text.split()[0]) for event in of_a + last) == 200
-    assert telling.take(ended=True) == []
+    assert limiter.take(ended=True) == []
 
 
 def test_other_texts_of_a_kind_are_counted_while_they_are_held_back():
-    telling = EventRateLimiter()
+    limiter = EventRateLimiter()
     for text in ("first", "second", "third", "fourth"):
-        telling.tell("a", 5 * MS, text)
-    assert [event.text for event in telling.take()] == ["first"]
-    telling.tell_due(2000 * MS)
-    assert [event.text for event in telling.take()] == ["second, and 2 more of the kind within a second"]
+        limiter.report("a", 5 * MS, text)
+    assert [event.text for event in limiter.take()] == ["first"]
+    limiter.release(2000 * MS)
+    assert [event.text for event in limiter.take()] == ["second, and 2 more events of this kind within one second"]

@@ -374,7 +374,7 @@ def test_given_times_that_jump_are_told_and_the_rate_survives():
     for at in range(0, 3000, 100):
         out += clock.assign_times(make_block(np.rint(t[at : at + 100] * NS).astype(np.int64), np.zeros((100, 6))))
     texts = [event.text for event in clock.take_events()]
-    assert [text.split(" by ")[0] for text in texts] == ["time went back", "time went on"]
+    assert [text.split(" by ")[0] for text in texts] == ["time went back", "time jumped ahead"]
     assert clock.rate_hz == 100.0
     assert lost(out) == round((9000.0 - 14.99) * 100) - 1
 

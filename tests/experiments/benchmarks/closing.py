@@ -54,10 +54,15 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder, case(Path(folder)) as run:
             station = run.station("healthy")
             faults.goes_on(run)
-            until_s, newest_s, seen, longest_s = time.monotonic() + 10.0, time.monotonic(), station.published, 0.0
+            until_s, newest_s, seen, longest_s = (
+                time.monotonic() + 10.0,
+                time.monotonic(),
+                station.publisher.published,
+                0.0,
+            )
             while (now_s := time.monotonic()) < until_s:
-                if station.published != seen:
-                    longest_s, newest_s, seen = max(longest_s, now_s - newest_s), now_s, station.published
+                if station.publisher.published != seen:
+                    longest_s, newest_s, seen = max(longest_s, now_s - newest_s), now_s, station.publisher.published
                 time.sleep(0.002)
             begun_s = time.monotonic()
             run.stop()

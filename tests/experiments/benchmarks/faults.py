@@ -28,7 +28,8 @@ import numpy as np
 
 from drivers.recordings import segment
 from monitor.common.health import Health
-from monitor.daemon.device_worker import DeviceWorker, Output
+from monitor.daemon.device_worker import DeviceWorker
+from monitor.daemon.output import Output
 from monitor.daemon.service import Service
 from monitor.settings import loading
 from tests.support.ports import free_endpoint, free_port
@@ -465,7 +466,7 @@ def clock_back(folder: Path, times: int) -> Outcome:
         with mock.patch("time.time_ns", side_effect=lambda: true() - 3600 * 10**9):
             for _ in range(5):
                 rig.flows(RATE)
-            outcome = rig.outcome("clock set back an hour", rig.said.wait("ahead of the host's clock"))
+            outcome = rig.outcome("clock set back an hour", rig.said.wait("ahead of the host clock"))
     times_s = np.concatenate(
         [
             piece.samples.t_ns / 1e9

@@ -1,7 +1,8 @@
 """A ``SampleClock`` under watch: what must hold of the times it gives and of what it calls missing."""
 
 from drivers.sample import SampleBlock, SenderTiming, Timing
-from drivers.timing.sample_clock import JUMP_S, SampleClock
+from drivers.timing.arrival_timeline import JUMP_S
+from drivers.timing.sample_clock import SampleClock
 from tests.experiments.fuzz.checks import LARGEST_LOSS
 
 FASTEST_HZ = 32_000.0

@@ -18,7 +18,7 @@ from structlog.testing import capture_logs
 from drivers.errors import ConfigError
 from drivers.sample import Event
 from monitor.daemon import reload
-from monitor.daemon.device_worker import Output
+from monitor.daemon.output import Output
 from monitor.daemon.outputs import TableOutput
 from monitor.daemon.service import Service
 from monitor.noise.catalogue import read_model
@@ -147,9 +147,9 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
     path.write_text(device("stays") + device("goes") + device("changes") + rest)
     with running(path, gone) as service:
         stations = {station.name: station for station in service.workers}
-        wait_for(lambda: all(station.published > 300 for station in service.workers))
+        wait_for(lambda: all(station.publisher.published > 300 for station in service.workers))
         wait_for(lambda: service.zenoh.state == "ok" and service.viewer is not None and service.viewer.state == "ok")
-        ring, estimator = stations["stays"].ring, stations["stays"].chain.estimator
+        ring, estimator = stations["stays"].ring, stations["stays"].pipeline.estimator
         path.write_text(device("stays") + device("comes") + device("changes", 'publish = "5 Hz"') + rest)
         with session(connect=[endpoint]) as listener:
             heard: dict[str, list[Any]] = {}
@@ -168,7 +168,7 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
             assert not [one for one in listener.get("imu/goes/command/reset", timeout=PATIENCE_S) if one.ok is not None]
         new = {station.name: station for station in service.workers}
         assert new["stays"] is stations["stays"]
-        assert (new["stays"].ring, new["stays"].chain.estimator) == (ring, estimator)
+        assert (new["stays"].ring, new["stays"].pipeline.estimator) == (ring, estimator)
         # a simulated sensor on a busy machine drops what it has no time to send; nothing else may be missing
         assert new["stays"].driver.counts.lost <= service.virtual["stays"].truth.dropped
         assert new["changes"] is not stations["changes"]
@@ -185,19 +185,19 @@ def test_new_limits_and_hooks_hold_at_once_and_a_wrong_file_changes_nothing(tmp_
     path.write_text(device("a") + QUIET)
     with capture_logs() as lines, running(path) as service:
         (station,) = service.workers
-        wait_for(lambda: station.latest is not None and station.published > 500)
+        wait_for(lambda: station.publisher.latest is not None and station.publisher.published > 500)
         path.write_text("[[device")
         service.reload()
         wait_for(lambda: any(line["event"].startswith("not reloaded") for line in lines))
         limit = '[[device.limit]]\naxes = "a*"\nletter = "N"\nabove = 1e-5\nhold = "1s"\n'
         path.write_text(device("a") + limit + '[[hook]]\non = ["*"]\ncommand = ["/bin/true"]\n' + QUIET)
         service.reload()
-        wait_for(lambda: station.health({}, 0).crossed == ("ax N", "ay N", "az N"))
+        wait_for(lambda: station.status.health({}, 0).crossed == ("ax N", "ay N", "az N"))
         assert service.states()["hook"] == "ok"
         assert service.workers == [station]
         path.write_text(device("a") + QUIET)
         service.reload()
-        wait_for(lambda: station.health({}, 0).crossed == ())
+        wait_for(lambda: station.status.health({}, 0).crossed == ())
     wrong = [line for line in lines if line["event"].startswith("not reloaded")]
     assert [line["log_level"] for line in wrong] == ["error"]
     assert "not TOML" in wrong[0]["error"]
@@ -242,13 +242,15 @@ def test_reloads_leave_nothing_behind(tmp_path: Path) -> None:
     path, rest = tmp_path / "c.toml", f'[zenoh]\nlisten = ["{free_endpoint()}"]\n[viewer]\nmode = "none"\n'
     path.write_text(device("stays") + device("a") + rest)
     with running(path) as service:
-        wait_for(lambda: service.zenoh.state == "ok" and all(one.published > 50 for one in service.workers))
+        wait_for(lambda: service.zenoh.state == "ok" and all(one.publisher.published > 50 for one in service.workers))
         most = (0, 0)
         for i in range(8):
             name = "ba"[i % 2]
             path.write_text(device("stays") + device(name) + rest)
             service.reload()
-            wait_for(lambda name=name: service.workers[-1].name == name and service.workers[-1].published > 50)
+            wait_for(
+                lambda name=name: service.workers[-1].name == name and service.workers[-1].publisher.published > 50
+            )
             if i == 1:
                 most = in_use()
             elif i > 1:

@@ -15,7 +15,7 @@ from drivers.recordings import save_samples
 from drivers.sample import Event
 from monitor.common.health import Health
 from monitor.daemon import kernel_compilation
-from monitor.daemon.device_worker import Output
+from monitor.daemon.output import Output
 from monitor.daemon.outputs import TableOutput
 from monitor.daemon.service import Service
 from monitor.estimation.detection.model_gap import ModelGap
@@ -163,12 +163,12 @@ record = false
         assert wait_for(lambda: told.count(received=False) >= 2)  # there is no recording yet
         away.rename(recording)
         assert wait_for(lambda: told.count(received=True) >= 2)  # its samples wait in the ring
-        assert service.workers[0].published == 0
+        assert service.workers[0].publisher.published == 0
     finally:
         compiled.set()
         thread.join(PATIENCE_S)
     assert not thread.is_alive()
-    assert service.workers[0].published == n
+    assert service.workers[0].publisher.published == n
     first_s, last_s = 0.0, (n - 1) / 100.0
     assert {unix_s for unix_s, health in told.healths if not health.received} == {None}
     stamps = [unix_s for unix_s, health in told.healths if health.received]
@@ -272,7 +272,7 @@ def test_a_recording_that_shows_no_rate_says_so(tmp_path: Path) -> None:
     )
     service = Service(loading.load(path), [told])
     service.run(60.0)
-    assert service.workers[0].published == 50
+    assert service.workers[0].publisher.published == 50
     assert told.all == []
     assert told.health_text.endswith("; no estimate: the times of the samples do not show a rate; set `rate`")
 
@@ -289,7 +289,7 @@ def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch
     service = Service(config(tmp_path, 'link = "replay", path = "short.npz", speed = "max"', 'mode = "none"'))
     with capture_logs() as logs:
         service.run(PATIENCE_S)
-    latest = service.workers[0].latest
+    latest = service.workers[0].publisher.latest
     assert latest is not None
     assert latest.samples == 500
     assert np.isfinite(latest.fitted[:, 2]).any()
@@ -304,10 +304,10 @@ def test_a_replay_that_is_stopped_loses_nothing_it_has_counted(tmp_path: Path) -
     (station,) = service.workers
     thread = threading.Thread(target=service.run)
     thread.start()
-    wait_for(lambda: station.published > 0)
+    wait_for(lambda: station.publisher.published > 0)
     service.stop()
     thread.join(PATIENCE_S)
     assert not thread.is_alive()
     assert station.driver.state != "ended"
     assert station.ring.overflowed == 0
-    assert station.published == station.driver.counts.received < n
+    assert station.publisher.published == station.driver.counts.received < n

@@ -34,7 +34,7 @@ def test_a_repeated_row_does_not_enter(rows):
     grid, rate, notes = resample_to_grid(recorded_blocks(sent / 100, values[sent], rows), None)
     assert rate == 100.0
     assert np.array_equal(grid, values)
-    assert notes == ["10 rows repeat others, time and values; left out"]
+    assert notes == ["10 rows repeat an earlier row with the same time and values, and are left out"]
 
 
 def test_rows_out_of_order_are_put_in_order():
@@ -42,7 +42,7 @@ def test_rows_out_of_order_are_put_in_order():
     sent = np.insert(np.delete(np.arange(6000), 2500), 2502, 2500)
     grid, _, notes = resample_to_grid(recorded_blocks(sent / 100, values[sent]), None)
     assert np.array_equal(grid, values)
-    assert notes == ["rows that came out of order: 1; put in order"]
+    assert notes == ["rows out of order: 1; sorted by time"]
 
 
 @pytest.mark.long

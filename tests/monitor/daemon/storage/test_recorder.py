@@ -295,7 +295,7 @@ def station(folder: Path, keeper: Recorder, window_s: float = 30.0, axes: AxisMa
         kernels.set()
     link = LoopbackLink()
     device = Device("bench", RATE, window_s, "octave", 0.1, 0.1, link, decoder, axes or AxisMap(), 0.0)
-    return DeviceWorker(device, link, decoder, threading.Event(), ready, keeper)
+    return DeviceWorker(device, link, [], threading.Event(), ready, keeper)
 
 
 def now_rows(first: int, n: int, wall_ns: int) -> SampleBlock:
@@ -311,12 +311,12 @@ def lived(tmp_path: Path, tick_step: float | None = 1.0) -> DeviceWorker:
     mono_ns = time.monotonic_ns()
     for first in range(0, 6000, 50):
         before._push(rows(first, 50, start_ns=mono_ns - 6000 * 10_000_000))
-        before.work([], first / 100.0)
-    before.work([], 100.0, drain=True)
-    keeper.set_state("bench", msgspec.structs.replace(before._restart_state(), tick_step=tick_step))
+        before.work(first / 100.0)
+    before.work(100.0, drain=True)
+    keeper.set_state("bench", msgspec.structs.replace(before.restore.state(), tick_step=tick_step))
     wait_for(lambda: sum(len(piece.samples) for piece in written(tmp_path / "bench")) == 6000)
     before._push(rows(6000, 1, start_ns=mono_ns - 6000 * 10_000_000))  # with what is known at last
-    before.work([], 101.0, drain=True)
+    before.work(101.0, drain=True)
     keeper.close(PATIENCE_S)
     return before
 
@@ -325,22 +325,22 @@ def test_the_window_after_a_restart_is_the_one_before(tmp_path: Path) -> None:
     before = lived(tmp_path)
     keeper = Recorder(Storage(tmp_path), [origin("bench", AxisMap())])
     after = station(tmp_path, keeper)
-    after._resume(keeper.tail("bench"))
+    after.restore.resume(keeper.tail("bench"))
     assert not after._can_take()  # new samples wait
     after.rebuild()
     assert after._can_take()
-    old, new = before.chain.estimator.get(), after.chain.estimator.get()
+    old, new = before.pipeline.estimator.get(), after.pipeline.estimator.get()
     assert new.curve.n == old.curve.n == 3000
     np.testing.assert_array_equal(new.curve.terms, old.curve.terms)
     np.testing.assert_allclose(new.curve.avar, old.curve.avar, rtol=1e-9)
     for _ in range(10):  # the live fit takes a step each look
-        old = before.chain.estimator.get()
+        old = before.pipeline.estimator.get()
     np.testing.assert_allclose(new.coefficients.value, old.coefficients.value, rtol=1e-9)
     # bounds are sought to seven digits
     np.testing.assert_allclose(new.coefficients.hi, old.coefficients.hi, rtol=1e-6)
     np.testing.assert_array_equal(new.coefficients.status, old.coefficients.status)
-    assert after.chain.signal_monitor is not None
-    (event,) = after._pending_events
+    assert after.pipeline.signal_monitor is not None
+    (event,) = after.timeline._events
     assert event.kind == "window_rebuilt"
     assert event.text == "30 s of the window were rebuilt from the recording"
 
@@ -352,18 +352,18 @@ def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path:
     mono_ns = time.monotonic_ns()
     for first in range(0, 6000, 50):
         before._push(rows(first, 50, start_ns=mono_ns - 6000 * 10_000_000))
-        before.work([], first / 100.0)
+        before.work(first / 100.0)
         if first == 5000:
-            before.chain.estimator.restart(2, 1000)
-            before.chain.since_ns[2] = before._newest_ns - 9_995_000_000
-            before.publish_status([], {}, 0)
+            before.pipeline.estimator.restart(2, 1000)
+            before.pipeline.since_ns[2] = before.timeline._newest_ns - 9_995_000_000
+            before.publish_status({}, 0)
             all_written(keeper)
     wait_for(lambda: sum(len(piece.samples) for piece in written(tmp_path / "bench")) == 6000)
     keeper.close(PATIENCE_S)
     after = station(tmp_path, Recorder(Storage(tmp_path), [origin("bench", AxisMap())]))
-    after._resume(after._recorder.tail("bench"))
+    after.restore.resume(after._recorder.tail("bench"))
     after.rebuild()
-    old, new = before.chain.estimator.get(), after.chain.estimator.get()
+    old, new = before.pipeline.estimator.get(), after.pipeline.estimator.get()
     assert old.curve.terms[0, 2] < old.curve.terms[0, 0]
     np.testing.assert_array_equal(new.curve.terms, old.curve.terms)
     np.testing.assert_allclose(new.curve.avar, old.curve.avar, rtol=1e-9)
@@ -389,8 +389,8 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
             assert counts.lost == 40
         else:
             assert counts.lost <= RATE * (time.monotonic() - begun_s)
-        wait_for(lambda: after.work([], time.monotonic()) or after.chain.estimator.samples >= 6059)
-        assert after.chain.estimator.filled == 3000
+        wait_for(lambda: after.work(time.monotonic()) or after.pipeline.estimator.samples >= 6059)
+        assert after.pipeline.estimator.filled == 3000
     finally:
         after.stop()
         after.join(PATIENCE_S)
@@ -400,8 +400,8 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
     ("axes", "older_s", "reason"),
     [
         (AxisMap((1, 0, 2, 3, 4, 5)), 0.0, None),
-        (AxisMap(), 40.0, "ends 40"),
-        (AxisMap(), -3600.0, "ends after the host's clock"),
+        (AxisMap(), 40.0, "ended 40"),
+        (AxisMap(), -3600.0, "later than the present time"),
     ],
     ids=["another mounting", "longer ago than the window", "the clock was set back"],
 )
@@ -411,11 +411,11 @@ def test_what_the_samples_cannot_go_on_from_begins_anew(tmp_path, axes, older_s:
     keeper.samples("bench", rows(0, 3000, start_ns=time.time_ns() - int((older_s + 30.0) * 1e9)), 0)
     keeper.close(PATIENCE_S)
     after = station(tmp_path, Recorder(Storage(tmp_path), [origin("bench", axes)]), axes=axes)
-    after._resume(after._recorder.tail("bench"))
+    after.restore.resume(after._recorder.tail("bench"))
     after.rebuild()
-    assert after.chain.estimator is None
+    assert after.pipeline.estimator is None
     assert after._can_take() is False or after.ring.room == after.ring.capacity
-    texts = [event.text for event in after._pending_events]
+    texts = [event.text for event in after.timeline._events]
     assert texts == [] if reason is None else reason in texts[0]
 
 
@@ -424,9 +424,9 @@ def test_files_that_are_no_segments_are_passed_over(tmp_path: Path) -> None:
     (tmp_path / "bench" / segment.segment_name(900, 1.8e9)).write_bytes(b"no stream at all")
     (tmp_path / "bench" / segment.segment_name(901, 1.8e9)).write_bytes(b"")
     after = station(tmp_path, Recorder(Storage(tmp_path), [origin("bench", AxisMap())]))
-    after._resume(after._recorder.tail("bench"))
+    after.restore.resume(after._recorder.tail("bench"))
     after.rebuild()
-    assert after.chain.estimator.filled == 3000
+    assert after.pipeline.estimator.filled == 3000
 
 
 # --- other programs in the same folder

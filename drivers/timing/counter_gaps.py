@@ -1,0 +1,224 @@
+"""Missing samples according to the counter of a device.
+
+The counter shows missing samples exactly, apart from whole turns of a short counter. A pause of the link or a delay
+that is not caught up shows these turns (``drivers.timing.arrival_timeline``).
+
+A sample may be read late but never early. A step of the counter is therefore a gap if that many samples fit between the
+earliest time at which the last sample can have been taken (``drivers.timing.arrival_bound``) and the arrival. A longer
+step is a jump of the counter, and the arrival time decides how many samples are missing.
+"""
+
+from collections import deque
+from typing import Final
+
+import numpy as np
+
+from drivers.sample import NS_PER_S, CounterTiming, Ints, SampleBlock
+from drivers.timing.arrival_regression import ArrivalRegression
+from drivers.timing.arrival_timeline import JUMP_S, MAX_GAP_SAMPLES, MAX_RATE_HZ, PERIOD_TOLERANCE, ArrivalTimeline
+from drivers.timing.event_rate_limiter import EventRateLimiter
+
+MAX_STEP_TICKS: Final = 1 << 62
+"""Largest step of the counter."""
+MIN_STUCK_SAMPLES: Final = 10
+"""Consecutive samples with the same counter value after which the counter is reported as stuck."""
+STEP_HISTORY: Final = 255
+"""Number of recent counter steps from which the typical step is determined."""
+STEP_TOLERANCE: Final = 0.25
+"""Relative tolerance within which a counter step equals the typical step."""
+
+
+class CounterGaps:
+    """Detector of gaps in the counter values of one device.
+
+    Parameters
+    ----------
+    counter : CounterTiming
+        Modulus and tick length of the counter.
+    timeline : ArrivalTimeline
+        Arrival times of the samples.
+    events : EventRateLimiter
+        Receiver of the events about jumps and a stuck counter.
+    """
+
+    def __init__(self, counter: CounterTiming, timeline: ArrivalTimeline, events: EventRateLimiter) -> None:
+        self.typical_step = TypicalStep()
+        self.clock_line = ArrivalRegression()
+        """Line of device time against sample index. It is empty if the length of a tick is unknown."""
+        self._counter = counter
+        self._timeline = timeline
+        self._events = events
+        self._tick: int | None = None  # last counter value
+        self._clock_s = self._clock_index = 0.0
+        self._stuck = 0  # samples since the counter last advanced
+
+    def resume(self, tick: int, tick_step: float) -> None:
+        """Continue from the last counter value before a restart of the program.
+
+        Parameters
+        ----------
+        tick : int
+            Last counter value.
+        tick_step : float
+            Ticks per sample.
+        """
+        self._tick = tick
+        self.typical_step.update(np.array([round(tick_step)]))
+
+    def interrupt(self) -> None:
+        """Forget the last counter value, because samples without a counter value have arrived."""
+        self._tick = None
+
+    def count_missing(self, samples: SampleBlock, paused: bool) -> Ints:
+        """Return the number of missing samples [n] before each row.
+
+        Parameters
+        ----------
+        samples : SampleBlock
+            Samples with their arrival times and counter values.
+        paused : bool
+            True if the link was closed before these samples.
+        """
+        counter, arrived_ns = self._counter, int(samples.t_ns[-1])
+        first = self._tick is None
+        previous = int(samples.ticks[0]) if self._tick is None else self._tick
+        steps = np.empty(len(samples), np.int64)
+        steps[0] = samples.ticks[0] - previous % counter.modulus
+        np.subtract(samples.ticks[1:], samples.ticks[:-1], out=steps[1:])
+        steps %= counter.modulus
+        self.typical_step.update(steps)
+        tick_step = self._ticks_per_sample()
+        if not first:
+            steps[0] += counter.modulus * self._hidden_wraps(steps, tick_step, arrived_ns, paused)
+        self._tick = int(samples.ticks[-1])
+        waited = self._find_stuck_counter(samples, steps[1:] if first else steps)
+        missing = np.zeros(len(samples), np.int64)
+        if tick_step is not None:
+            counted = np.rint(np.minimum(steps / tick_step, MAX_GAP_SAMPLES)).astype(np.int64)
+            missing = np.maximum(counted - 1 - waited, 0)
+        unseen = self._timeline.missing_since_arrival(arrived_ns, len(samples)) if first and paused else 0
+        if not steps.any():  # a stuck counter shows nothing
+            missing[0] = max(samples.lost, unseen)
+        elif self._has_jumped(missing, steps, arrived_ns):
+            self._discard_jump(samples, missing, steps, first)
+        if first:
+            missing[0] = max(samples.lost, unseen)
+        if counter.tick_s is not None:
+            self._clock_s += float(steps.sum()) * counter.tick_s
+            self._clock_index += len(samples) + int(missing.sum())
+            self.clock_line.add(self._clock_index, self._clock_s)
+        return missing
+
+    def _discard_jump(self, samples: SampleBlock, missing: Ints, steps: Ints, first: bool) -> None:
+        """Report a jump of the counter, and correct ``missing`` and ``steps`` by the arrival time."""
+        arrived_ns, ahead = int(samples.t_ns[-1]), int(steps.max())
+        modulus = self._counter.modulus
+        elapsed_s = (arrived_ns - self._timeline.arrived_ns) / NS_PER_S
+        moved = f"back by {modulus - ahead}" if 2 * ahead > modulus else f"ahead by {ahead}"
+        text = f"the counter jumped {moved} ticks within {elapsed_s:.3f} s"
+        self._events.report("clock_jumped", int(samples.t_ns[0]), text)
+        self.clock_line = ArrivalRegression()
+        at = int(np.argmax(steps))
+        missing[at] = steps[at] = 0
+        if self._has_jumped(missing, steps, arrived_ns):  # more than one jump: no step is reliable
+            missing[:] = 0
+        if not first:
+            missing[at] = self._timeline.missing_since_arrival(arrived_ns, len(samples) + int(missing.sum()))
+
+    def _ticks_per_sample(self) -> float | None:
+        """Return the ticks per sample; None if they are unknown."""
+        seen, rate_hz = self.typical_step.mean, self._timeline.nominal_hz
+        if self._counter.tick_s is None or rate_hz is None:
+            return seen
+        nominal = 1.0 / (rate_hz * self._counter.tick_s)
+        # the counter overrides a nominal rate that is far off
+        return nominal if seen is None or abs(seen - nominal) < 0.5 * nominal else seen
+
+    def _hidden_wraps(self, steps: Ints, tick_step: float | None, arrived_ns: int, paused: bool) -> int:
+        """Return how often a short counter wrapped unseen during a pause of the link or a delay not caught up."""
+        if tick_step is None:
+            return 0
+        counter, timeline = self._counter, self._timeline
+        by_ticks_hz = 1.0 / (tick_step * counter.tick_s) if counter.tick_s else timeline.assumed_hz
+        rate_hz = timeline.line.rate_hz() or by_ticks_hz
+        if rate_hz is None:
+            return 0
+        turn = counter.modulus / tick_step  # samples
+        counted = int(np.rint(steps / tick_step).sum())
+        if paused:
+            timeline.forget_delay()
+            elapsed_s = (arrived_ns - timeline.arrived_ns) / NS_PER_S
+            turns = max(0, round((elapsed_s * rate_hz - counted) / turn))
+        else:
+            turns = round(timeline.gap_from_delay(arrived_ns, counted, turn / 2.0) / turn)
+        return turns if turns * counter.modulus < MAX_STEP_TICKS else 0
+
+    def _find_stuck_counter(self, samples: SampleBlock, steps: Ints) -> Ints:
+        """Return the number of samples [n] that arrived with a stuck counter, at the row where it advances again."""
+        before = self._stuck
+        if not before and steps.all():
+            return np.zeros(len(samples), np.int64)
+        moved = np.flatnonzero(steps)
+        self._stuck = before + len(steps) if moved.size == 0 else len(steps) - 1 - int(moved[-1])
+        if before < MIN_STUCK_SAMPLES <= self._stuck:
+            text = f"the counter stopped at {samples.ticks[-1]}"
+            self._events.report("clock_jumped", int(samples.t_ns[-1]), text)
+        waited = np.zeros(len(samples), np.int64)
+        if moved.size:
+            at = moved + len(samples) - len(steps)
+            waited[at] = np.diff(moved, prepend=-1 - before) - 1
+        return np.where(waited >= MIN_STUCK_SAMPLES, waited, 0)
+
+    def _has_jumped(self, missing: Ints, steps: Ints, arrived_ns: int) -> bool:
+        """Return True if more samples are missing than can have been sent in the elapsed time of the host.
+
+        The time begins at the earliest time at which the last sample can have been taken. Its arrival time is not used,
+        as the sample may have waited in a buffer until the reading process got processor time.
+        """
+        counter, timeline = self._counter, self._timeline
+        period_s = timeline.bound.period_s or timeline.certain_period_s()
+        lost = float(missing.sum(dtype=np.float64))
+        lasted_s = lost / MAX_RATE_HZ
+        if period_s is not None:
+            lasted_s = max(lost * (1.0 - PERIOD_TOLERANCE) * period_s, lasted_s)
+        elif counter.tick_s is not None:
+            lasted_s = max(float(steps.sum(dtype=np.float64)) * counter.tick_s, lasted_s)
+        elif 2 * int(steps.max()) > counter.modulus:  # a step of more than half the modulus is more likely a step back
+            return True
+        arrived_s = timeline.seconds(arrived_ns)
+        taken_s = timeline.bound.newest_s
+        return lasted_s > max(arrived_s - (arrived_s if taken_s is None else taken_s), 0.0) + JUMP_S
+
+
+class TypicalStep:
+    """Typical step of a counter: the mean of all steps near the median of the recent ones."""
+
+    def __init__(self) -> None:
+        self._recent: deque[int] = deque(maxlen=STEP_HISTORY)
+        self._sum = self._count = 0
+
+    @property
+    def mean(self) -> float | None:
+        """Ticks per sample; None until the counter has advanced."""
+        return self._sum / self._count if self._count else None
+
+    def update(self, steps: Ints) -> None:
+        """Update the typical step with the steps that are not zero."""
+        moved = steps[steps > 0]
+        self._recent.extend(moved[-STEP_HISTORY:].tolist())
+        near = self._near(moved)
+        self._add(near)
+        if near.size < moved.size:
+            recent = np.array(self._recent)
+            if 2 * self._near(recent).size < recent.size:  # most recent steps differ: start again
+                self._sum = self._count = 0
+                self._add(recent[np.abs(recent / np.median(recent) - 1.0) < STEP_TOLERANCE])
+
+    def _add(self, steps: Ints) -> None:
+        self._sum += int(steps.sum())
+        self._count += int(steps.size)
+
+    def _near(self, steps: Ints) -> Ints:
+        """Return the steps that are near the typical step."""
+        mean = self.mean
+        return steps[:0] if mean is None else steps[np.abs(steps / mean - 1.0) < STEP_TOLERANCE]

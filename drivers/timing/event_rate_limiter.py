@@ -1,0 +1,63 @@
+"""Rate limiter for events in sample time: one event of each kind per second, and a count of the others."""
+
+from typing import Final
+
+from drivers.sample import NS_PER_S, Event
+
+MIN_EVENT_INTERVAL_S: Final = 1.0
+"""Shortest time between two events of one kind."""
+
+
+class EventRateLimiter:
+    """Queue of events that passes at most one event of each kind in MIN_EVENT_INTERVAL_S of sample time.
+
+    The events that are held back are summed up in the next one.
+    """
+
+    def __init__(self) -> None:
+        self._events: list[Event] = []
+        self._last_ns: dict[str, int] = {}
+        self._held_back: dict[tuple[str, str], tuple[int, str, int]] = {}
+
+    def report(self, kind: str, t_ns: int, text: str, n: int = 0) -> None:
+        """Report an event.
+
+        Parameters
+        ----------
+        kind : str
+            Kind of the event.
+        t_ns : int
+            Time of the event in ns.
+        text : str
+            Text of the event. ``{n}`` is replaced by the sum of the counts of all events that were held back.
+        n : int
+            Count of this event.
+        """
+        key = (kind, text if "{n}" in text else "")
+        held = self._held_back.pop(key, None)
+        if "{n}" in text:
+            n += held[2] if held else 0
+        else:  # the first event is reported, and the others are counted
+            n = held[2] + 1 if held else 0
+            text = held[1] if held else text
+        self._held_back[key] = (t_ns, text, n)
+        self.release(t_ns)
+
+    def release(self, t_ns: int) -> None:
+        """Pass on the events that have been held back long enough at the time ``t_ns``."""
+        for (kind, what), (at_ns, text, n) in [*self._held_back.items()] if self._held_back else ():
+            if kind not in self._last_ns or abs(t_ns - self._last_ns[kind]) >= MIN_EVENT_INTERVAL_S * NS_PER_S:
+                del self._held_back[(kind, what)]
+                self._last_ns[kind] = t_ns
+                more = f", and {n} more events of this kind within one second" if n and "{n}" not in text else ""
+                self._events.append(Event(kind, at_ns, text.replace("{n}", str(n)) + more))
+
+    def take(self, ended: bool = False) -> list[Event]:
+        """Return the events since the last call. If ``ended`` is True, return the events that are held back, too."""
+        while ended and self._held_back:
+            self._last_ns.clear()
+            self.release(0)
+        if ended:
+            self._last_ns.clear()
+        events, self._events = self._events, []
+        return events

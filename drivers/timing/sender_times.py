@@ -1,0 +1,211 @@
+"""Order and gaps of samples whose times the sender gives.
+
+Times that a host has stamped are early or late by whole periods although no sample is missing. A step of the times is
+therefore a gap only if the other steps are regular. If the times are too coarse for a decision, every row stays in the
+order of arrival.
+
+If the times of one block form a steady sequence in another order, the rows are sorted. Times that only jitter are not
+sorted, because the order of arrival is then correct. A row that arrives after it was counted as missing is left out.
+"""
+
+from collections import deque
+from typing import Final
+
+import numpy as np
+
+from drivers.sample import NS_PER_S, Floats, Ints, SampleBlock
+from drivers.timing.arrival_regression import MIN_SPAN_S
+from drivers.timing.arrival_timeline import JUMP_S, MAX_GAP_SAMPLES, ArrivalTimeline, split_at_gaps
+from drivers.timing.duplicate_rows import SEARCH_ROWS, RowFilter
+from drivers.timing.event_rate_limiter import EventRateLimiter
+
+FORWARD_JUMP_S: Final = 3600.0
+"""A step of sender times beyond this time is reported as an event."""
+STEP_HISTORY: Final = 255
+"""Number of recent steps from which the typical deviation is determined."""
+STEP_TOLERANCE: Final = 0.25
+"""Tolerance as a fraction of a period. Times this close to a whole number of periods form a steady sequence."""
+CERTAIN_GAP_PERIODS: Final = 4.0
+"""A longer step is a gap even if it is not a whole number of periods."""
+MAX_LATENESS_RATIO: Final = 8.0
+"""A time is late, with no sample missing, up to this multiple of the upper quartile of the typical deviation."""
+MAX_PERIOD_NS: Final = float(1 << 54)
+"""Longest period of missing samples whose times are kept, 200 days, so that the times stay within int64."""
+
+
+class SenderTimes:
+    """Detector of gaps and of reordered rows in the times that the sender of one device gives.
+
+    Parameters
+    ----------
+    timeline : ArrivalTimeline
+        Line of sender time against sample index.
+    rows : RowFilter
+        Filter that removes rows and keeps their ``lost`` counts.
+    events : EventRateLimiter
+        Receiver of the events about jumps and reordered rows.
+    """
+
+    def __init__(self, timeline: ArrivalTimeline, rows: RowFilter, events: EventRateLimiter) -> None:
+        self.late_rows = 0
+        """Number of rows left out because they had been counted as missing."""
+        self._timeline = timeline
+        self._rows = rows
+        self._events = events
+        self._missing_t_ns: deque[int] = deque(maxlen=SEARCH_ROWS)  # times of samples that were counted as missing
+        self._went_back = False
+        self._steps_s: deque[float] = deque(maxlen=STEP_HISTORY)
+
+    def sort(self, samples: SampleBlock) -> SampleBlock | None:
+        """Sort the rows of a block by their times, and remove late rows. Return None if no row remains."""
+        t, last_ns = samples.t_ns, self._timeline.last_t_ns
+        in_order = t[0] >= last_ns and (len(t) == 1 or (np.diff(t) >= 0).all())
+        if not self._timeline.line.count or in_order:
+            return samples
+        period_s = self._period_s(np.diff(t))
+        if not period_s:
+            return samples
+        kept = self._remove_late_rows(samples, period_s) if self._missing_t_ns else samples
+        if kept is None:
+            return None
+        steps = np.diff(kept.t_ns)
+        order = None if (steps < -JUMP_S * NS_PER_S).any() else steady_order(kept.t_ns, period_s)
+        if order is None:
+            return kept
+        n = int((steps < 0).sum())
+        self._events.report("clock_jumped", int(kept.t_ns[-1]), "rows out of order: {n}; sorted by time", n)
+        return self._rows.select(kept, order)
+
+    def place(self, samples: SampleBlock) -> list[SampleBlock]:
+        """Return the samples with their own times. A new block begins where samples are missing."""
+        t, timeline = samples.t_ns, self._timeline
+        steps = np.empty(len(samples), np.int64)
+        steps[0] = t[0] - timeline.last_t_ns if timeline.line.count else 0
+        np.subtract(t[1:], t[:-1], out=steps[1:])
+        jumps = np.zeros(0, np.int64)
+        if int(steps.min()) < 0 or int(steps.max()) > FORWARD_JUMP_S * NS_PER_S:
+            self._report_jumps(t, steps)
+            jumps = np.flatnonzero((steps < -JUMP_S * NS_PER_S) | (steps > FORWARD_JUMP_S * NS_PER_S))
+        period_s = self._period_s(steps)
+        missing = self._count_missing(steps / NS_PER_S, period_s) if period_s else np.zeros(len(samples), np.int64)
+        missing[0] = max(int(missing[0]), samples.lost)
+        index = timeline.index + np.cumsum(missing + 1)
+        first = 0
+        if jumps.size:  # a line must not contain a jump
+            first = int(jumps[-1])
+            timeline.restart_line()
+        for row in (first, len(samples) - 1):
+            timeline.line.add(float(index[row]), timeline.seconds(int(t[row])))
+        timeline.index, timeline.last_t_ns = float(index[-1]), int(t[-1])
+        if period_s:
+            self._keep_missing_times(t, missing, period_s)
+        return split_at_gaps(samples, t, missing)
+
+    def _remove_late_rows(self, samples: SampleBlock, period_s: float) -> SampleBlock | None:
+        """Remove rows that were counted as missing; None if no row remains."""
+        distance_ns = np.abs(samples.t_ns[:, None] - np.array(self._missing_t_ns))
+        late = samples.t_ns < self._timeline.last_t_ns
+        late &= distance_ns.min(axis=1) < STEP_TOLERANCE * period_s * NS_PER_S
+        if not late.any():
+            return samples
+        filled = set(distance_ns[late].argmin(axis=1).tolist())
+        self._missing_t_ns = deque((t for i, t in enumerate(self._missing_t_ns) if i not in filled), maxlen=SEARCH_ROWS)
+        n = int(late.sum())
+        self.late_rows += n
+        text = "{n} samples arrived after they had been counted as missing, and are left out"
+        self._events.report("clock_jumped", int(samples.t_ns[-1]), text, n)
+        return self._rows.select(samples, np.flatnonzero(~late))
+
+    def _keep_missing_times(self, t: Ints, missing: Ints, period_s: float) -> None:
+        """Keep the times of samples that count as missing, because they may arrive later."""
+        period_ns = min(period_s * NS_PER_S, MAX_PERIOD_NS)
+        for row in np.flatnonzero((missing > 0) & (missing <= SEARCH_ROWS)).tolist():
+            before_ns = np.rint(np.arange(1, missing[row] + 1) * period_ns)
+            self._missing_t_ns.extend((t[row] - before_ns).astype(np.int64).tolist())
+
+    def _period_s(self, steps: Ints) -> float | None:
+        """Return the period for the search of gaps; None as long as all samples may be one burst of a late sender."""
+        if self._timeline.line.settled():
+            return self._timeline.line.period_s()
+        if self._timeline.assumed_hz:
+            return 1.0 / self._timeline.assumed_hz
+        return _typical_period_s(steps) if steps.sum() > MIN_SPAN_S * NS_PER_S else None
+
+    def _report_jumps(self, t: Ints, steps: Ints) -> None:
+        """Report times that went back or jumped ahead."""
+        back = steps < (-JUMP_S * NS_PER_S if self._went_back else 0.0)  # jitter back and forth is reported once
+        if back.any():
+            at = int(np.argmax(back))
+            self._events.report("clock_jumped", int(t[at]), f"time went back by {-steps[at] / NS_PER_S:.6g} s")
+            self._went_back = True
+        if (steps > FORWARD_JUMP_S * NS_PER_S).any():
+            at = int(np.argmax(steps))
+            self._events.report("clock_jumped", int(t[at]), f"time jumped ahead by {steps[at] / NS_PER_S:.6g} s")
+
+    def _count_missing(self, steps_s: Floats, period_s: float) -> Ints:
+        """Return the missing samples [n] before each row; all zero unless most steps are one period long.
+
+        A short gap must be a whole number of periods and longer than the typical deviation. No neighbouring step may
+        compensate it.
+        """
+        last_s = self._steps_s[-1] if self._steps_s else period_s
+        self._steps_s.extend(steps_s[-STEP_HISTORY:].tolist())
+        periods = steps_s / period_s
+        if periods.max() < 1.5:
+            return np.zeros(steps_s.size, np.int64)
+        before = np.concatenate([[last_s], steps_s[:-1]])
+        after = np.concatenate([steps_s[1:], [period_s]])
+        deviation = np.abs(np.array(self._steps_s) / period_s - 1.0)
+        if np.median(deviation) > STEP_TOLERANCE:
+            return np.zeros(steps_s.size, np.int64)
+        gap = np.rint(np.clip(periods, 0.0, MAX_GAP_SAMPLES)).astype(np.int64) - 1
+        late = (periods < CERTAIN_GAP_PERIODS) & (np.abs(periods - np.rint(periods)) > STEP_TOLERANCE)
+        late |= periods < 1.0 + max(0.5, MAX_LATENESS_RATIO * float(np.quantile(deviation, 0.75)))
+        late |= steps_s + np.minimum(before, after) < 2.5 * period_s
+        gap[late] = 0
+        return gap
+
+
+def steady_order(t_ns: Ints, period_s: float) -> Ints | None:
+    """Return the order in which sender times form a steady sequence.
+
+    Parameters
+    ----------
+    t_ns : array of int64, shape (n,)
+        Times in ns in order of arrival.
+    period_s : float
+        Sample period in s.
+
+    Returns
+    -------
+    array of int64, shape (n,), or None
+        Row number of each position. None if the times are in order already or form no steady sequence.
+
+    Examples
+    --------
+    >>> steady_order(np.array([0, 10, 30, 20, 40]) * 10**6, 0.01).tolist()
+    [0, 1, 3, 2, 4]
+    >>> steady_order(np.array([0, 10, 8, 20, 18]) * 10**6, 0.01) is None
+    True
+    """
+    if (np.diff(t_ns) >= 0).all():
+        return None
+    order = np.argsort(t_ns, kind="stable")
+    moved = np.flatnonzero(order != np.arange(len(order)))
+    steps = np.diff(t_ns[order]) / (NS_PER_S * period_s)
+    touched = np.unique(np.clip(np.concatenate([moved - 1, moved]), 0, len(steps) - 1))
+    whole = np.rint(steps[touched])
+    steady = (whole >= 1.0) & (np.abs(steps[touched] - whole) < STEP_TOLERANCE)
+    return order if bool(steady.all()) else None
+
+
+def _typical_period_s(steps: Ints) -> float | None:
+    """Estimate the period in s from the steps while it is unknown; None without a step forward.
+
+    The estimate is the median of steady steps, or the mean of other steps.
+    """
+    forward = steps[steps > 0] / NS_PER_S
+    if not forward.size:
+        return None
+    low, middle, high = np.quantile(forward, [0.1, 0.5, 0.9])
+    return float(middle if high - low < 2.0 * STEP_TOLERANCE * middle else forward.mean())

@@ -1,0 +1,93 @@
+"""Status report of one device: counts, latency, and a message about the most important problem."""
+
+import time
+
+from monitor.common.health import Health
+from monitor.daemon.latency_meter import LatencyMeter
+from monitor.daemon.result_publisher import ResultPublisher
+from monitor.daemon.ring_buffer import RingBuffer
+from monitor.daemon.window_restore import WindowRestore
+
+
+class DeviceStatus:
+    """Status report of one device. It reads the other parts of the device's worker and changes none of them.
+
+    Parameters
+    ----------
+    publisher : ResultPublisher
+        Publisher of the results, with the driver, the pipeline and the user limits.
+    ring : RingBuffer
+        Ring buffer of the device.
+    restore : WindowRestore
+        Restore of the window after a restart.
+    """
+
+    def __init__(self, publisher: ResultPublisher, ring: RingBuffer, restore: WindowRestore) -> None:
+        self.latency = LatencyMeter()
+        self._publisher = publisher
+        self._driver = publisher.driver
+        self._pipeline = publisher.pipeline
+        self._ring = ring
+        self._restore = restore
+        self._started_s = time.monotonic()
+
+    def health(self, states: dict[str, str], memory_bytes: int) -> Health:
+        """Return the present status of the device.
+
+        Parameters
+        ----------
+        states : dict of str to str
+            State of each output of the service, by its name.
+        memory_bytes : int
+            Resident memory of the process.
+        """
+        driver, clock, signal_monitor = self._driver, self._driver.clock, self._pipeline.signal_monitor
+        median_s, high_s = self.latency.take_quantiles()
+        return Health(
+            state=driver.state,
+            rate_hz=clock.measured_hz if driver.state == "running" else None,
+            received=driver.counts.received,
+            lost=driver.counts.lost,
+            bad=driver.counts.bad,
+            overflowed=self._ring.overflowed,
+            latency_p50_s=median_s,
+            latency_p99_s=high_s,
+            memory_bytes=memory_bytes,
+            outputs=dict(states),
+            text=self._text(),
+            uptime_s=time.monotonic() - self._started_s,
+            repeated=clock.repeated_rows,
+            late=clock.late_rows + driver.counts.late,
+            moving=signal_monitor is not None and signal_monitor.moving,
+            moved=signal_monitor.moved_samples if signal_monitor is not None else 0,
+            crossed=self._publisher.limits.crossed,
+        )
+
+    def _text(self) -> str:
+        """Return the status message of the device; empty if there is nothing to report."""
+        driver, ready = self._driver, self._pipeline.ready
+        if driver.state == "running":
+            if self._restore.active and ready.all.is_set():
+                return "the window is being rebuilt from the recording; no sample is lost"
+            if ready.progress:
+                lacking = "" if self._pipeline.can_fit else "no coefficients yet, "
+                return f"{ready.progress}; {lacking}no sample is lost"
+            if not self._pipeline.can_fit:
+                return "compiling the estimator; no coefficients yet, no sample is lost"
+        lacking = self._missing_estimate_text() if driver.state in ("running", "ended") else ""
+        if driver.text or driver.state != "running":
+            return f"{driver.text.rstrip('.')}; {lacking}" if lacking else driver.text
+        return lacking or driver.late_hint or self._publisher.timeline.offset_text()
+
+    def _missing_estimate_text(self) -> str:
+        """Return the reason why there are no coefficients; empty if there are coefficients, or will be."""
+        clock = self._driver.clock
+        measured_hz = clock.contradicted_hz
+        if measured_hz is not None:
+            return (
+                f"measured rate {measured_hz:.4g} Hz differs from the configured "
+                f"{self._publisher.device.rate_hz:g} Hz; coefficients are withheld: correct `rate` or remove it"
+            )
+        if self._pipeline.estimator is None and self._publisher.published and clock.rate_hz is None:
+            return "no estimate: the times of the samples do not show a rate; set `rate`"
+        return self._pipeline.refusal_reason

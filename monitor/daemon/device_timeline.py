@@ -1,0 +1,138 @@
+"""Timeline of the samples of one device: Unix time, present time, and events that wait for a time.
+
+The samples of a live sensor carry host monotonic times. ``SlewedClock`` converts these times to Unix time. The samples
+of a recording, or of a device that stamps its samples itself, carry Unix times. Such a timeline is unknown before the
+first sample, and the events of the device wait until then.
+"""
+
+import time
+from collections import deque
+from typing import Final
+
+from drivers.driver import Driver
+from drivers.sample import Event, Ints, SampleBlock
+from monitor.daemon.slewed_clock import MAX_SLEW_RATE, SlewedClock
+
+MAX_UNTIMED_EVENTS: Final = 100
+"""Largest number of events that wait for the time of the first sample. The oldest are dropped."""
+MIN_CLOCK_STEP_S: Final = 1.0
+"""Smallest step of the host clock, and smallest offset of the sample times from the host clock, that is reported."""
+
+
+class DeviceTimeline:
+    """Timeline of the samples of one device.
+
+    Parameters
+    ----------
+    driver : Driver
+        Driver of the device. Its state decides whether the present time advances with the host clock.
+    """
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self._replayed = driver.link.epoch == "unix"
+        self._clock = SlewedClock(time.monotonic_ns(), time.time_ns())
+        self._newest_ns: int | None = None  # time of the newest sample that was taken from the ring buffer
+        self._taken_ns = 0  # host monotonic time at which this sample was taken
+        self._events: list[Event] = []
+        self._untimed: deque[tuple[str, str]] = deque(maxlen=MAX_UNTIMED_EVENTS)  # kind and text
+
+    # --- conversion of times
+
+    def offset_ns(self, t_ns: int) -> int:
+        """Return the difference of Unix time and a time of the samples, in nanoseconds."""
+        return 0 if self._driver.times_are_unix else self._clock.offset_ns(t_ns)
+
+    def offsets_ns(self, samples: SampleBlock) -> Ints | int:
+        """Return the difference of Unix time and the time of each sample, int64 [n] or one number for all samples.
+
+        The Unix times increase even if the host clock was set back.
+        """
+        return 0 if self._driver.times_are_unix else self._clock.offsets_ns(samples.t_ns)
+
+    def unix_s(self, t_ns: int) -> float:
+        """Convert a sample time in nanoseconds to Unix time in seconds."""
+        return (t_ns + self.offset_ns(t_ns)) / 1e9
+
+    # --- present time
+
+    def set_newest(self, t_ns: int) -> None:
+        """Set the time of the newest sample that was taken from the ring buffer."""
+        self._newest_ns, self._taken_ns = t_ns, time.monotonic_ns()
+
+    def now_unix_s(self) -> float | None:
+        """Return the present time on the timeline of the device's samples, in Unix seconds.
+
+        Returns
+        -------
+        float or None
+            The time of the newest sample. While the device waits or is lost, the time advances from there with the host
+            clock. None if the samples bring their own times and no sample has arrived yet, because the host clock does
+            not show such a timeline.
+        """
+        now_ns = self._now_ns()
+        return None if now_ns is None else self.unix_s(now_ns)
+
+    def _now_ns(self) -> int | None:
+        """Return the present time on the timeline of the samples, in nanoseconds; None if it is unknown."""
+        newest_ns, now_ns = self._newest_ns, time.monotonic_ns()
+        if newest_ns is not None and (self._replayed or self._driver.state in ("running", "ended")):
+            return newest_ns
+        if not self._driver.times_are_unix:
+            return now_ns
+        if newest_ns is None:  # samples may wait in the ring buffer; only the first time is not ahead of them
+            return self._driver.first_t_ns
+        return newest_ns + now_ns - self._taken_ns
+
+    # --- events
+
+    def add_event(self, event: Event) -> None:
+        """Queue an event whose time is known."""
+        self._events.append(event)
+
+    def add_event_now(self, kind: str, text: str) -> None:
+        """Queue an event of the present moment. Its time is set as soon as the timeline is known.
+
+        Parameters
+        ----------
+        kind : str
+            Kind of the event, for example "recording_stopped".
+        text : str
+            Message of the event.
+        """
+        now_ns = self._now_ns()
+        if now_ns is None:
+            self._untimed.append((kind, text))
+        else:
+            self._events.append(Event(kind, now_ns, text))
+
+    def take_events(self) -> list[Event]:
+        """Return the queued events since the last call, except those that still wait for the timeline."""
+        now_ns = self._now_ns() if self._untimed else None
+        if now_ns is not None:
+            self._events += [Event(kind, now_ns, text) for kind, text in self._untimed]
+            self._untimed.clear()
+        events, self._events = self._events, []
+        return events
+
+    # --- host clock
+
+    def slew_to_host(self) -> None:
+        """Slew the Unix times towards the host clock, and queue an event if the host clock was set."""
+        now_ns = time.monotonic_ns()
+        step_s = self._clock.slew_to(now_ns, time.time_ns()) / 1e9
+        if abs(step_s) < MIN_CLOCK_STEP_S or self._driver.times_are_unix:
+            return
+        text = (
+            f"the host clock was set {'forward' if step_s > 0.0 else 'back'} by {abs(step_s):.6g} s; sample times "
+            f"follow by {MAX_SLEW_RATE * 3600.0:g} s per hour; restart imu-monitor to adopt the new time at once"
+        )
+        self._events.append(Event("clock_jumped", now_ns, text))
+
+    def offset_text(self) -> str:
+        """Return a message about the offset of the sample times from the host clock; empty if the offset is small."""
+        behind_s = 0.0 if self._driver.times_are_unix else self._clock.behind_ns / 1e9
+        if abs(behind_s) < MIN_CLOCK_STEP_S:
+            return ""
+        where = "behind" if behind_s > 0.0 else "ahead of"
+        return f"sample times are {abs(behind_s):.6g} s {where} the host clock, because the host clock was set"

@@ -1,0 +1,184 @@
+"""Publication of the results of one device: passes each result that is due to all outputs.
+
+The main loop calls the outputs in order. No output blocks: each has a queue, or drops data.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from drivers.driver import Driver
+from drivers.errors import NotReady
+from drivers.sample import Event, SampleBlock, merge_contiguous_blocks
+from monitor.daemon.device_timeline import DeviceTimeline
+from monitor.daemon.operations.limits import LimitMonitor
+from monitor.daemon.output import Output
+from monitor.daemon.pipeline import DevicePipeline
+from monitor.daemon.schedule import Schedule
+from monitor.drift.compensation.live_compensation import LiveCompensation
+from monitor.estimation.detection.model_agreement import ModelAgreement
+from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.estimate import Estimate
+from monitor.settings.loading import Device
+
+MAX_BATCH_S: Final = 0.1
+"""Longest time that samples are collected before they are published as one batch."""
+TOTAL_INTERVAL_S: Final = 0.1
+"""Shortest interval between two steps of the total and Hadamard deviations."""
+TOTAL_CPU_SHARE: Final = 0.005
+"""Share of one processor that the total and Hadamard deviations may use for a device."""
+INTERPRETED_REFIT_S: Final = 1.0
+"""Minimum time between fits while their kernels are interpreted, because the compilation needs the processors."""
+
+
+class ResultPublisher:
+    """Publisher of the results of one device.
+
+    Parameters
+    ----------
+    device : Device
+        Settings of the device.
+    driver : Driver
+        Driver of the device, which counts the received samples.
+    pipeline : DevicePipeline
+        Pipeline that computes the results.
+    limits : LimitMonitor
+        User limits on the coefficients.
+    outputs : sequence of Output
+        Receivers of the results.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        driver: Driver,
+        pipeline: DevicePipeline,
+        limits: LimitMonitor,
+        outputs: Sequence[Output],
+    ) -> None:
+        self.device = device
+        self.driver = driver
+        self.timeline = DeviceTimeline(driver)
+        self.pipeline = pipeline
+        self.limits = limits
+        self.outputs = outputs
+        self.schedule = Schedule()
+        self.latest: Estimate | None = None
+        """Newest estimate; None before the first."""
+        self.published = 0
+        """Number of samples handed to the outputs."""
+        self.withholds_coefficients = False
+        """True while coefficients are not published, because the sample rate is in doubt."""
+        self._agreement = ModelAgreement()
+        self._batch: list[SampleBlock] = []  # samples that were taken and not published yet
+        self._refitted = False  # True if the fit was updated since the last publication
+
+    def events(self, events: Sequence[Event]) -> None:
+        """Publish events."""
+        for event in events:
+            for output in self.outputs:
+                output.event(self.device.name, self._unix_s(event.t_ns), self._received, event)
+
+    def samples(self, blocks: Sequence[SampleBlock]) -> bool:
+        """Collect new samples, and publish the collected batch if it is due; return True if it was published."""
+        self._batch += blocks
+        interval_s = min(self.device.publish_s, MAX_BATCH_S)
+        if not self._batch or not self.schedule.claim("samples", interval_s):
+            return False
+        batch, self._batch = self._batch, []
+        compensation = self.pipeline.compensation
+        for samples in merge_contiguous_blocks(batch):
+            self.published += len(samples)
+            offsets_ns = self.timeline.offsets_ns(samples)
+            for output in self.outputs:
+                output.samples(self.device.name, self.published, samples, offsets_ns)
+            if compensation is not None and np.isfinite(samples.values[:, :3]).any():
+                self._compensated(compensation, samples)
+        return True
+
+    def estimate(self) -> bool:
+        """Update the fit and publish the estimate if they are due; return True if the estimate was published."""
+        self._refit()
+        if self.latest is None or not self._refitted or not self.schedule.claim("publish", self.device.publish_s):
+            return False
+        self._refitted = False
+        for output in self.outputs:
+            output.estimate(self.device.name, self._unix_s(self.latest.t_ns), self.latest)
+        if self.pipeline.model_in_force is not None:
+            self._model_gap(self.pipeline.model_in_force.compare(self.latest))
+        self.events(self.limits.update(self.latest))
+        return True
+
+    def slow_statistics(self) -> None:
+        """Compute one step of the total and Hadamard deviations, and publish them when they are complete."""
+        estimator = self.pipeline.estimator
+        if estimator is None or not self.pipeline.ready.all.is_set() or not self.schedule.is_due("total"):
+            return
+        begun_s = time.perf_counter()
+        deviations = estimator.step_slow_statistics()
+        used_s = time.perf_counter() - begun_s
+        self.schedule.postpone("total", max(TOTAL_INTERVAL_S, used_s / TOTAL_CPU_SHARE))
+        if deviations is not None:
+            unix_s = self._unix_s(self.pipeline.newest_ns)
+            for output in self.outputs:
+                output.total(self.device.name, unix_s, self._received, *deviations)
+
+    def thermal_intervals(self) -> None:
+        """Publish the thermal intervals that were completed since the last call."""
+        for interval in self.pipeline.take_thermal_intervals():
+            for output in self.outputs:
+                output.thermal(self.device.name, self._unix_s(interval.t_ns), self._received, interval)
+
+    @property
+    def _received(self) -> int:
+        return self.driver.counts.received
+
+    def _unix_s(self, t_ns: int) -> float:
+        return self.timeline.unix_s(t_ns)
+
+    def _compensated(self, live: LiveCompensation, samples: SampleBlock) -> None:
+        """Publish the samples without gyroscope drift, and the state of the drift compensation."""
+        at = 0
+        while at < len(samples):
+            piece = samples[at : at + live.compensator.samples_to_interval_end]
+            at += len(piece)
+            compensated = live.update(piece)
+            self.pipeline.update_drift_models()
+            offsets_ns = self.timeline.offsets_ns(compensated)
+            for output in self.outputs:
+                output.compensated(self.device.name, self.published - len(samples) + at, compensated, offsets_ns)
+        for drift in live.take():
+            for output in self.outputs:
+                output.drift(self.device.name, self._unix_s(drift.t_ns), drift)
+
+    def _refit(self) -> None:
+        """Update the fit and the newest estimate, if a refit is due."""
+        # a refit at every sample needs no interval here; ``get`` empties the per-sample history, so it is called only
+        # for a publication
+        interval_s = self.device.refit_s or self.device.publish_s
+        pipeline = self.pipeline
+        if pipeline.estimator is None or not pipeline.advanced or not self.schedule.claim("refit", interval_s):
+            return
+        fitted = pipeline.can_fit
+        pipeline.advanced = not fitted  # a curve without coefficients is fitted as soon as the kernels are ready
+        try:
+            latest = pipeline.estimator.get(fitted=fitted)
+        except NotReady:
+            return
+        if pipeline.fits_slowly:
+            self.schedule.postpone("refit", INTERPRETED_REFIT_S)
+        self.latest = latest.without_coefficients() if self.withholds_coefficients else latest
+        self._refitted = True
+
+    def _model_gap(self, gap: ModelGap) -> None:
+        """Publish the comparison of the window with the model in force, and the events of the comparison."""
+        if self.withholds_coefficients:
+            gap = replace(gap, axes={})
+        events = self._agreement.update(gap)
+        gap = replace(gap, agrees=self._agreement.verdicts)
+        for output in self.outputs:
+            output.model_gap(self.device.name, self._unix_s(gap.t_ns), gap)
+        self.events(events)

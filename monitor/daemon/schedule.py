@@ -1,0 +1,50 @@
+"""Times at which the periodic tasks of a device are due."""
+
+from typing import Literal
+
+Task = Literal["refit", "publish", "samples", "total", "thermal"]
+
+
+class Schedule:
+    """Next run of each periodic task of one device, on the monotonic clock."""
+
+    def __init__(self) -> None:
+        self._next_s: dict[Task, float] = {}
+        self._now_s = 0.0
+        self._drain = False
+
+    def begin_round(self, now_s: float, drain: bool) -> None:
+        """Set the time of the present round of the main loop.
+
+        Parameters
+        ----------
+        now_s : float
+            Present time on the monotonic clock, in seconds.
+        drain : bool
+            True if all results are published in this round, because the device stops.
+        """
+        self._now_s, self._drain = now_s, drain
+
+    def is_due(self, task: Task) -> bool:
+        """Return True if the time of a task has come."""
+        return self._now_s >= self._next_s.get(task, 0.0)
+
+    def claim(self, task: Task, interval_s: float) -> bool:
+        """Return True if a task is to run in this round, and schedule its next run.
+
+        Parameters
+        ----------
+        task : Task
+            Name of the task.
+        interval_s : float
+            Interval between two runs in seconds.
+        """
+        if not self.is_due(task):
+            return self._drain
+        # keep the period, but do not catch up after a pause
+        self._next_s[task] = max(self._next_s.get(task, 0.0) + interval_s, self._now_s + 0.5 * interval_s)
+        return True
+
+    def postpone(self, task: Task, delay_s: float) -> None:
+        """Do not run a task within ``delay_s`` seconds from the begin of this round."""
+        self._next_s[task] = max(self._next_s.get(task, 0.0), self._now_s + delay_s)
