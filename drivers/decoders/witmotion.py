@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from typing import Annotated, ClassVar, Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from drivers.decoders.base import (
     NEED_MORE,
@@ -30,7 +31,7 @@ from drivers.decoders.base import (
     chunk_per_sample,
     quantize,
 )
-from drivers.quantities import FULL_SCALE, check_settings
+from drivers.quantities import FULL_SCALE
 from drivers.sample import ArrivalTiming, Chunk, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
@@ -52,17 +53,17 @@ The sample with the fewest packets counts, since packets of other types are sent
 TEMPERATURE: Final = {"wt901": (1.0 / 100.0, 0.0), "jy61": (1.0 / 340.0, 36.53)}
 
 
-class Settings(DecoderSettings, frozen=True):
+class Settings(DecoderSettings):
     """Keys of ``[device.driver.decoder_options]``."""
 
-    packet: Literal["uart", "bluetooth"] = "uart"
-    """Packet format. uart: 11-byte packets with a checksum; bluetooth: 20-byte packets without one."""
-    temperature: Literal["wt901", "jy61"] = "wt901"
-    """Temperature formula of the model family: raw / 100, or raw / 340 + 36.53 (JY61, BWT61)."""
-    accelerometer_range: Annotated[float, FULL_SCALE.meta] = 16.0
-    """Full scale of the accelerometer in g."""
-    gyro_range: Annotated[float, FULL_SCALE.meta] = 2000.0
-    """Full scale of the gyroscope in °/s."""
+    packet: Literal["uart", "bluetooth"] = Field(
+        "uart", description="packets of 11 bytes with a checksum, or of 20 bytes without one"
+    )
+    temperature: Literal["wt901", "jy61"] = Field(
+        "wt901", description="temperature formula of the model family: raw / 100, or raw / 340 + 36.53 (JY61, BWT61)"
+    )
+    accelerometer_range: Annotated[float, FULL_SCALE] = Field(16.0, description="full scale of the accelerometer in g")
+    gyro_range: Annotated[float, FULL_SCALE] = Field(2000.0, description="full scale of the gyroscope in °/s")
 
 
 class WitmotionDecoder:
@@ -273,12 +274,5 @@ def match_bluetooth(buffer: bytes, at: int) -> int:
 
 
 def build(settings: Settings) -> Decoder:
-    """Return a decoder with these settings.
-
-    Raises
-    ------
-    ConfigError
-        A full scale is out of range.
-    """
-    check_settings(settings)
+    """Return a decoder with these settings."""
     return WitmotionDecoder(settings)

@@ -10,6 +10,8 @@ import time
 from collections import deque
 from typing import Final, Literal
 
+from pydantic import Field
+
 from drivers.errors import LinkEnded, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.sample import Chunk
@@ -17,10 +19,10 @@ from drivers.sample import Chunk
 DEFAULT_DECODER: Final = ""
 
 
-class Settings(LinkSettings, frozen=True, kw_only=True):
+class Settings(LinkSettings):
     """Keys of the loopback link."""
 
-    carrier: Carrier = "bytes"
+    carrier: Carrier = Field("bytes", description="kind of data")
 
 
 class LoopbackLink:
