@@ -23,7 +23,7 @@ from typing import Final, NoReturn
 
 FOLDER: Final = os.path.dirname(os.path.abspath(__file__))
 PACKAGES: Final = ("monitor", "drivers")
-REQUIRED: Final = {"monitor": "cli/__init__.py", "drivers": "errors.py", "config": "defaults.toml"}
+REQUIRED: Final = {"monitor": "cli/__init__.py", "drivers": "errors.py", "config": "demo.toml"}
 """A file of each folder that a foreign folder of that name does not have."""
 DEBUG: Final = "--debug"
 FAILED: Final = 1

@@ -5,16 +5,8 @@ import pkgutil
 from collections.abc import Sequence
 from difflib import SequenceMatcher, get_close_matches
 from types import ModuleType
-from typing import Annotated
-
-import msgspec
 
 from drivers.errors import ConfigError
-
-FilePath = Annotated[str, msgspec.Meta(extra={"file": "exists"})]
-"""Settings key that names an existing file. A relative path is relative to the folder of the configuration file."""
-FileOrName = Annotated[str, msgspec.Meta(extra={"file": "or name"})]
-"""Settings key that names a file in the folder of the configuration file, or something shipped with the program."""
 
 
 def list_modules(package: ModuleType, suffix: str = "") -> tuple[str, ...]:

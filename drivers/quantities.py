@@ -5,19 +5,20 @@ these entry points checks its numbers against one of the quantities below. The c
 value that overflows, divides by zero or asks for more memory than exists. The ranges are wider than those of any known
 sensor or use. They are narrow enough that products, squares and quotients of the numbers stay finite.
 
-A field of a settings struct names its quantity in its type: ``Annotated[float, RATE_HZ.meta]``. ``find_out_of_range``
-reads the quantity from the type, and checks a value that msgspec has converted to that type.
+A field of a settings model names its quantity in its type: ``Annotated[float, RATE_HZ]``. pydantic then checks the
+number with ``Quantity.check``.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
-from typing import Any, Final, TypeVar
-
-import msgspec
-from msgspec import inspect
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from drivers.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pydantic import GetCoreSchemaHandler
+    from pydantic_core import CoreSchema
 
 Number = TypeVar("Number", int, float)
 
@@ -28,6 +29,8 @@ PREFIXES: Final = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
 """Factors and names of the prefixes, largest first."""
 MAX_WRITTEN_INTEGER: Final = 1 << 64
 """Largest integer that is written in a message. A larger one is described, since it may have thousands of digits."""
+MAX_QUOTED_CHARACTERS: Final = 60
+"""Maximum number of characters of a wrong value that a message quotes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +79,20 @@ class Quantity:
             ends = f"{_number_text(self.low, self.unit)} to {_number_text(self.high, self.unit)}"
         return f"{ends}, or 0" if self.zero else ends
 
-    @property
-    def meta(self) -> msgspec.Meta:
-        """Annotation for a field of this quantity, which ``find_out_of_range`` reads."""
-        return msgspec.Meta(extra={"quantity": self})
+    def __get_pydantic_core_schema__(self, source: Any, handler: "GetCoreSchemaHandler") -> "CoreSchema":
+        """Return the schema of pydantic for a field with the type ``Annotated[float, self]``."""
+        from pydantic_core import ValidationError, core_schema
+
+        kind = "a whole number" if source is int else "a number"
+
+        def check(value: Any, convert: Callable[[Any], Any]) -> Any:
+            try:
+                number = convert(value)
+            except ValidationError:
+                raise ConfigError(f"expected {kind} from {self.range_text()}, got {format_value(value)}") from None
+            return self.check(number)
+
+        return core_schema.no_info_wrap_validator_function(check, handler(source))
 
 
 # --- time and rates
@@ -157,65 +170,22 @@ FIT_NUMBER: Final = Quantity("", 0.0, 1e30, signed=True)
 TEMPERATURE_C: Final = Quantity("°C", -273.15, 2_000.0)
 
 
-def find_out_of_range(value: Any, kind: Any) -> Iterator[tuple[str, str]]:
-    """Find the numbers in a value that are outside the range of the quantity named in its type.
+def format_value(value: object) -> str:
+    """Return a value as TOML writes it. A list or table is named, and a long text is cut.
 
-    Parameters
-    ----------
-    value
-        Value that ``msgspec.convert`` returned for the type ``kind``.
-    kind
-        Type of a field of a struct. Unions, containers and structs are searched.
-
-    Yields
-    ------
-    tuple of str
-        Place in the value, such as ".gx", "[2]" or "", and a text with the number and the supported range.
+    >>> format_value(True), format_value("x"), format_value([1, 2])
+    ('true', '"x"', 'a list')
     """
-    yield from _out_of_range(value, inspect.type_info(kind), "")
-
-
-def describe_range_errors(settings: msgspec.Struct) -> Iterator[str]:
-    """Yield a line for each number of a struct that is out of range. The line begins with the name of the key."""
-    for field in msgspec.structs.fields(settings):
-        for place, text in find_out_of_range(getattr(settings, field.name), field.type):
-            yield f"{field.encode_name}{place}: {text}"
-
-
-def check_settings(settings: msgspec.Struct) -> None:
-    """Check every number of a struct against the quantities named in the types of its fields.
-
-    Raises
-    ------
-    ConfigError
-        Numbers are outside the supported ranges, one line for each. A line begins with the name of the key.
-    """
-    if wrong := list(describe_range_errors(settings)):
-        raise ConfigError(*wrong)
-
-
-def _out_of_range(value: Any, info: inspect.Type, place: str) -> Iterator[tuple[str, str]]:
-    """Search a value recursively according to the type information of msgspec."""
-    if isinstance(info, inspect.Metadata):
-        quantity = (info.extra or {}).get("quantity")
-        if isinstance(quantity, Quantity) and isinstance(value, int | float) and not isinstance(value, bool):
-            try:
-                quantity.check(value)
-            except ConfigError as error:
-                yield place, str(error)
-        yield from _out_of_range(value, info.type, place)
-    elif isinstance(info, inspect.UnionType):
-        for one in info.types:
-            yield from _out_of_range(value, one, place)
-    elif isinstance(info, inspect.CollectionType) and isinstance(value, list | tuple | frozenset | set):
-        for i, one in enumerate(value):
-            yield from _out_of_range(one, info.item_type, f"{place}[{i}]")
-    elif isinstance(info, inspect.DictType) and isinstance(value, Mapping):
-        for key, one in value.items():
-            yield from _out_of_range(one, info.value_type, f"{place}.{key}")
-    elif isinstance(info, inspect.StructType) and isinstance(value, info.cls):
-        for field in info.fields:
-            yield from _out_of_range(getattr(value, field.name), field.type, f"{place}.{field.encode_name}")
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        ellipsis = "…" if len(value) > MAX_QUOTED_CHARACTERS else ""
+        return f'"{value[:MAX_QUOTED_CHARACTERS]}{ellipsis}"'
+    if isinstance(value, list | tuple | dict):
+        return "a table" if isinstance(value, dict) else "a list"
+    if isinstance(value, int) and abs(value) > MAX_WRITTEN_INTEGER:
+        return "an integer of more than 64 bits"
+    return str(value)[:MAX_QUOTED_CHARACTERS]
 
 
 def _number_text(value: float, unit: str) -> str:

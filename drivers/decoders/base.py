@@ -1,9 +1,9 @@
 """Interface of a decoder, and the functions that decoders share. Decoders convert bytes to samples and do no I/O.
 
 A decoder module ``drivers/decoders/<protocol>.py`` defines ``Settings`` and ``build(settings) -> Decoder``.
-``Settings`` is a msgspec struct with the keys of ``[device.driver.decoder_options]``, all of which are listed in
-``config/defaults.toml``. ``build`` raises one ``ConfigError`` with a line for each mistake. The line begins with the
-key: "scale.gx: ...".
+``Settings`` is a pydantic model with the keys of ``[device.driver.decoder_options]``. ``build`` raises one
+``ConfigError`` with a line for each mistake that the model does not find. The line begins with the key:
+"signals.gx: ...".
 
 ``feed`` never raises an exception for bad bytes. A frame that fails its check is left out and counted in ``bad``. The
 next block counts it in ``lost``, so that its place in time stays empty.
@@ -15,7 +15,6 @@ from collections.abc import Callable, Hashable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, Final, Protocol, TypeVar, runtime_checkable
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +23,7 @@ from drivers.sample import ArrivalTiming as ArrivalTiming  # noqa: PLC0414 - re-
 from drivers.sample import CounterTiming as CounterTiming  # noqa: PLC0414 - re-exported for decoders
 from drivers.sample import SenderTiming as SenderTiming  # noqa: PLC0414 - re-exported for decoders
 from drivers.sample import Timing as Timing  # noqa: PLC0414 - re-exported for decoders
+from drivers.settings_model import SettingsModel
 
 MAX_GYRO_RAD_S: Final = 1000.0
 """Largest plausible angular rate in rad/s. The widest range of MEMS gyroscopes is 4000 °/s, which is 70 rad/s."""
@@ -37,8 +37,8 @@ TEMPERATURE_LIMITS_C: Final = (-100.0, 300.0)
 Bytes = NDArray[np.uint8]
 
 
-class DecoderSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """Base class of the settings of decoders. Unknown keys are errors."""
+class DecoderSettings(SettingsModel):
+    """Base class of the settings of decoders."""
 
 
 class Decoder(Protocol):

@@ -43,7 +43,7 @@ GID_BYTES: Final = 16  # the last bytes of both layouts
 BYTE_ORDERS: Final = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
 
-class Settings(DecoderSettings, frozen=True):
+class Settings(DecoderSettings):
     """Settings of the decoder. There are no keys, since the message contains everything."""
 
 

@@ -19,7 +19,7 @@ MAX_GAP_SAMPLES: Final = 1_000_000_000
 """Largest gap in samples. A larger jump of the count, eleven days at 1 kHz, indicates another count and not a loss."""
 
 
-class Settings(DecoderSettings, frozen=True):
+class Settings(DecoderSettings):
     """Settings of the decoder. There are no keys, since the message contains everything."""
 
 

@@ -22,6 +22,7 @@ from collections.abc import Iterator
 from typing import Annotated, Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from drivers.decoders.base import (
     NEED_MORE,
@@ -37,8 +38,9 @@ from drivers.decoders.base import (
     quantize,
 )
 from drivers.errors import ConfigError
-from drivers.quantities import RATE_HZ, describe_range_errors
+from drivers.quantities import RATE_HZ
 from drivers.sample import Chunk, CounterTiming, Floats, Ints, SampleBlock, Timing
+from drivers.settings_model import Conflict, WordOr, checked_by
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
@@ -76,23 +78,37 @@ BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
 """Each byte with its bits in reverse order. It converts the CRC to the reflected CRC of zlib."""
 
 
-class Settings(DecoderSettings, frozen=True):
+def _check_identifier(identifier: int) -> None:
+    """Raise ConfigError if no datagram begins with this byte."""
+    if identifier not in IDENTIFIERS:
+        known = ", ".join(f"0x{one:02X}" for one in sorted(IDENTIFIERS))
+        raise ConfigError(f"{identifier}; possible are {known}")
+
+
+class Settings(DecoderSettings):
     """Keys of ``[device.driver.decoder_options]``."""
 
-    accelerometer_range: Literal["2g", "5g", "10g", "30g", "80g"] = "10g"
-    """Range of the installed accelerometers, which determines the scale."""
-    gyro_output: Literal["rate", "increment"] = "rate"
-    """Output of the gyro. rate: angular rate or its mean in °/s; increment: angle of one sample in °."""
-    accelerometer_output: Literal["acceleration", "increment"] = "acceleration"
-    """Output of the accelerometer. acceleration: acceleration or its mean in g; increment: velocity of one sample in
-    m/s.
-    """
-    rate: Annotated[float, RATE_HZ.meta] | None = None
-    """Sample rate in Hz, which is needed if an output is an increment."""
-    identifier: int | Literal["auto"] = "auto"
-    """First byte of the datagrams, such as 0x93. With auto, it is taken from the first datagram with a correct CRC."""
-    crlf: bool = False
-    """True if ``encode`` ends datagrams with CR LF. Both forms are read."""
+    accelerometer_range: Literal["2g", "5g", "10g", "30g", "80g"] = Field(
+        "10g", description="range of the installed accelerometers, which determines the scale"
+    )
+    gyro_output: Literal["rate", "increment"] = Field(
+        "rate", description="angular rate or its mean in °/s, or the angle of one sample in °"
+    )
+    accelerometer_output: Literal["acceleration", "increment"] = Field(
+        "acceleration", description="acceleration or its mean in g, or the velocity of one sample in m/s"
+    )
+    rate: Annotated[float, RATE_HZ] | None = Field(
+        None, examples=[500.0], description="sample rate in Hz, which is needed if an output is an increment"
+    )
+    identifier: Annotated[
+        int | Literal["auto"], WordOr({"auto": "auto"}, Annotated[int, checked_by(_check_identifier)])
+    ] = Field("auto", description="first byte of the datagrams, such as 0x93; auto takes it from the first datagram")
+    crlf: bool = Field(False, description="true: a simulated sensor ends datagrams with CR LF; both can be read")
+
+    def conflicts(self) -> Iterator[Conflict]:
+        """Yield a conflict if an increment cannot be converted to a rate."""
+        if "increment" in (self.gyro_output, self.accelerometer_output) and self.rate is None:
+            yield Conflict("rate", 'missing; an output of "increment" needs the sample rate in Hz')
 
 
 class Stim300Decoder(FrameStreamDecoder):
@@ -220,23 +236,5 @@ def has_valid_crc(frame: bytes) -> bool:
 
 
 def build(settings: Settings) -> Decoder:
-    """Return a decoder with these settings.
-
-    Raises
-    ------
-    ConfigError
-        The identifier is unknown, or the rate is missing.
-    """
-    if wrong := list(_problems(settings)):
-        raise ConfigError(*wrong)
+    """Return a decoder with these settings."""
     return Stim300Decoder(settings)
-
-
-def _problems(settings: Settings) -> Iterator[str]:
-    """Yield a line for each mistake in the settings."""
-    yield from describe_range_errors(settings)
-    if settings.identifier != "auto" and settings.identifier not in IDENTIFIERS:
-        known = ", ".join(f"0x{identifier:02X}" for identifier in sorted(IDENTIFIERS))
-        yield f"identifier: {settings.identifier}; possible are auto, {known}"
-    if "increment" in (settings.gyro_output, settings.accelerometer_output) and settings.rate is None:
-        yield 'rate: missing; an output of "increment" needs the sample rate in Hz'

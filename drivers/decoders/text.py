@@ -12,11 +12,11 @@ becomes ``12``. The first line is therefore left out without being counted as ba
 ``first_line = "keep"``. For this reason ``encode`` puts a line end before the first line of a block.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, ClassVar, Final, Literal
 
-import msgspec
 import numpy as np
+from pydantic import AfterValidator, Field
 
 from drivers import units
 from drivers.decoders.base import (
@@ -29,8 +29,9 @@ from drivers.decoders.base import (
 )
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError
-from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE, describe_range_errors
+from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE
 from drivers.sample import AXES, ArrivalTiming, Chunk, CounterTiming, Floats, Ints, SampleBlock, Timing
+from drivers.settings_model import ListOf, checked_by, one_of
 
 MAX_LINE_BYTES: Final = 4096
 """Maximum length of a line in bytes. A longer text without a line end is noise and is dropped."""
@@ -47,33 +48,74 @@ UNWRAPPED_TICKS: Final = 1 << 62
 """Modulus of a clock that does not wrap, in ticks: 146 years of nanoseconds."""
 
 
-class Settings(DecoderSettings, frozen=True):
+def _check_columns(columns: tuple[str, ...]) -> None:
+    """Raise ConfigError with a line for each mistake in the columns."""
+    given = [name for name in columns if name != SKIP]
+    wrong = [f'unknown column "{name}"{format_choices(name, COLUMNS)}' for name in given if name not in COLUMNS]
+    if len(given) != len(set(given)):
+        wrong.append("a name is given twice")
+    if not set(given) & set(AXES):
+        wrong.append(f"none of {', '.join(AXES)} is given")
+    if {"t", "counter"} <= set(given):
+        wrong.append('give one of t and counter, and "-" for the other')
+    if wrong:
+        raise ConfigError(*wrong)
+
+
+def _unit(look_up: Callable[[str], object], axis: str) -> AfterValidator:
+    """Return a validator of a unit, whose message also says how raw counts are converted."""
+
+    def check(unit: str) -> None:
+        try:
+            look_up(unit)
+        except ConfigError as error:
+            counts = f"name one of these units, and the size of a count: scale = {{ {axis} = 0.0305 }}"
+            raise ConfigError(f"{error}; for raw counts {counts}") from error
+
+    return checked_by(check)
+
+
+def _check_delimiter(delimiter: str) -> None:
+    """Raise ConfigError if a text cannot separate the fields of a line."""
+    if not delimiter or not delimiter.isascii() or set(delimiter) & set("\r\n"):
+        raise ConfigError(f"{delimiter!r}; it is auto, or ASCII text within a line")
+
+
+class Settings(DecoderSettings):
     """Keys of ``[device.driver.decoder_options]``."""
 
-    columns: tuple[str, ...]
-    """Content of each column: gx gy gz ax ay az temperature t counter, or - to skip it."""
-    delimiter: str = "auto"
-    """Text between two fields, or auto. " " separates by any number of blanks."""
-    gyro_unit: str = "rad/s"
-    """Unit of gx gy gz: rad/s, mrad/s, deg/s, ..."""
-    accel_unit: str = "m/s²"
-    """Unit of ax ay az: m/s², g, mg, ..."""
-    temperature_unit: str = "°C"
-    """Unit of the temperature: °C, K, °F."""
-    scale: dict[str, Annotated[float, SCALE.meta]] = msgspec.field(default_factory=dict)
-    """Factor of a column before its unit is applied, as gx = 0.0305 for raw counts."""
-    comment: str = "#"
-    """Prefix of lines to skip; "" = none."""
-    header: Annotated[int, HEADER_LINES.meta] = 0
-    """Number of lines to skip after the link was opened."""
-    first_line: Literal["drop", "keep"] = "drop"
-    """Handling of the first line. Use keep if the link always starts at the beginning of a line."""
-    nmea: bool = False
-    """True if lines have the form $fields*CC."""
-    time_unit: Literal["s", "ms", "us", "ns"] = "s"
-    """Unit of the t column, which is the clock of the device."""
-    counter_modulus: Annotated[int, COUNTER_MODULUS.meta] = 1 << 32
-    """Counts after which the counter column starts again at 0."""
+    columns: Annotated[ListOf[str], checked_by(_check_columns)] = Field(
+        examples=[["gx", "gy", "gz", "ax", "ay", "az"]],
+        description="content of each column: gx gy gz ax ay az temperature t counter, - to skip a column",
+    )
+    delimiter: Annotated[str, checked_by(_check_delimiter)] = Field(
+        "auto",
+        description='text between two fields, " " = any number of blanks; auto: comma, semicolon, tab or blanks',
+    )
+    gyro_unit: Annotated[str, _unit(units.rate_factor, "gx")] = Field(
+        "rad/s", description="unit of gx gy gz: rad/s, mrad/s, deg/s, dps, deg/h, ..."
+    )
+    accel_unit: Annotated[str, _unit(units.acceleration_factor, "ax")] = Field(
+        "m/s²", description="unit of ax ay az: m/s², g, mg, ..."
+    )
+    temperature_unit: Annotated[str, _unit(units.temperature_scale, "temperature")] = Field(
+        "°C", description="unit of the temperature: °C, K, °F"
+    )
+    scale: dict[Annotated[str, one_of(COLUMNS)], Annotated[float, SCALE]] = Field(
+        {},
+        examples=[{"gx": 0.0305}],
+        description="factor of a column before its unit is applied, such as the size of a raw count; absent: 1",
+    )
+    comment: str = Field("#", description='lines that begin with this text are skipped; "" = none')
+    header: Annotated[int, HEADER_LINES] = Field(0, description="number of lines to skip after the link was opened")
+    first_line: Literal["drop", "keep"] = Field(
+        "drop", description="drop: the first line after the link was opened is skipped, since its start may be missing"
+    )
+    nmea: bool = Field(False, description="true: lines have the form $fields*CC with a checksum")
+    time_unit: Literal["s", "ms", "us", "ns"] = Field("s", description="unit of column t, the clock of the device")
+    counter_modulus: Annotated[int, COUNTER_MODULUS] = Field(
+        1 << 32, description="counts after which column counter starts again at 0"
+    )
 
 
 class TextDecoder:
@@ -304,43 +346,5 @@ def _timing(settings: Settings) -> Timing:
 
 
 def build(settings: Settings) -> Decoder:
-    """Return a decoder with these settings.
-
-    Raises
-    ------
-    ConfigError
-        Some settings are wrong, one line for each.
-    """
-    if wrong := list(_problems(settings)):
-        raise ConfigError(*wrong)
+    """Return a decoder with these settings."""
     return TextDecoder(settings)
-
-
-def _problems(settings: Settings) -> Iterator[str]:
-    """Yield a line for each mistake in the settings."""
-    given = [name for name in settings.columns if name != SKIP]
-    for name in given:
-        if name not in COLUMNS:
-            yield f'columns: unknown column "{name}"{format_choices(name, COLUMNS)}'
-    if len(given) != len(set(given)):
-        yield "columns: a name stands there twice"
-    if not set(given) & set(AXES):
-        yield f"columns: none of {', '.join(AXES)} is there"
-    if {"t", "counter"} <= set(given):
-        yield 'columns: give one of t and counter, and "-" for the other'
-    for name in settings.scale:
-        if name not in COLUMNS:
-            yield f"scale.{name}: unknown column{format_choices(name, COLUMNS)}"
-    yield from describe_range_errors(settings)
-    for key, look_up, axis in (
-        ("gyro_unit", units.rate_factor, "gx"),
-        ("accel_unit", units.acceleration_factor, "ax"),
-        ("temperature_unit", units.temperature_scale, "temperature"),
-    ):
-        try:
-            look_up(getattr(settings, key))
-        except ConfigError as error:
-            counts = f"name one of these units, and the size of a count: scale = {{ {axis} = 0.0305 }}"
-            yield f"{key}: {error}; for raw counts {counts}"
-    if not settings.delimiter or not settings.delimiter.isascii() or set(settings.delimiter) & set("\r\n"):
-        yield f"delimiter: {settings.delimiter!r}; it is auto, or ASCII text within a line"

@@ -17,6 +17,7 @@ import binascii
 from typing import Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from drivers.decoders.base import (
     NEED_MORE,
@@ -46,11 +47,12 @@ GYRO: Final = "{:+010.6f}"  # rad/s
 ACCEL: Final = "{:+07.3f}"  # m/s²
 
 
-class Settings(DecoderSettings, frozen=True):
+class Settings(DecoderSettings):
     """Keys of ``[device.driver.decoder_options]``."""
 
-    sentence: Literal["auto", "VNIMU", "VNYMR"] = "auto"
-    """Sentence to read. With auto, the first of the two that arrives is read."""
+    sentence: Literal["auto", "VNIMU", "VNYMR"] = Field(
+        "auto", description="sentence to read; auto reads the first of the two that arrives"
+    )
 
 
 class VectornavAsciiDecoder(FrameStreamDecoder):

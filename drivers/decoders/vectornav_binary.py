@@ -20,6 +20,7 @@ from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from drivers.decoders.base import (
     NEED_MORE,
@@ -59,13 +60,13 @@ TimeStartup is an unsigned 64-bit count of ns. 62 bits last 146 years and fit in
 """
 
 
-class Settings(DecoderSettings, frozen=True):
+class Settings(DecoderSettings):
     """Keys of ``[device.driver.decoder_options]``."""
 
-    compensated: bool = False
-    """True if the rates and accelerations corrected by the on-board filter are used when a message contains both."""
-    clock: Literal["time_startup", "arrival"] = "time_startup"
-    """Source of the sample times: TimeStartup (ns, by the device), or arrival times if messages do not contain it."""
+    compensated: bool = Field(
+        False, description="true: if a message contains both, use the values that the on-board filter has corrected"
+    )
+    clock: Literal["time_startup", "arrival"] = Field("time_startup", description="source of the sample times")
 
 
 @lru_cache(maxsize=256)

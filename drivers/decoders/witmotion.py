@@ -16,6 +16,7 @@ the header of the next packet follows it. Samples are therefore delayed by one p
 from typing import Annotated, Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from drivers.decoders.base import (
     NEED_MORE,
@@ -29,7 +30,7 @@ from drivers.decoders.base import (
     chunk_per_sample,
     quantize,
 )
-from drivers.quantities import FULL_SCALE, check_settings
+from drivers.quantities import FULL_SCALE
 from drivers.sample import ArrivalTiming, Chunk, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
@@ -55,17 +56,17 @@ Sources: WT901 data sheet v20-0702, BWT61CL data sheet v20-0630.
 """
 
 
-class Settings(DecoderSettings, frozen=True):
+class Settings(DecoderSettings):
     """Keys of ``[device.driver.decoder_options]``."""
 
-    packet: Literal["uart", "bluetooth"] = "uart"
-    """Packet format. uart: 11-byte packets with a checksum; bluetooth: 20-byte packets without one."""
-    temperature: Literal["wt901", "jy61"] = "wt901"
-    """Temperature formula of the model family: raw / 100, or raw / 340 + 36.53 (JY61, BWT61)."""
-    accelerometer_range: Annotated[float, FULL_SCALE.meta] = 16.0
-    """Full scale of the accelerometer in g."""
-    gyro_range: Annotated[float, FULL_SCALE.meta] = 2000.0
-    """Full scale of the gyroscope in °/s."""
+    packet: Literal["uart", "bluetooth"] = Field(
+        "uart", description="packets of 11 bytes with a checksum, or of 20 bytes without one"
+    )
+    temperature: Literal["wt901", "jy61"] = Field(
+        "wt901", description="temperature formula of the model family: raw / 100, or raw / 340 + 36.53 (JY61, BWT61)"
+    )
+    accelerometer_range: Annotated[float, FULL_SCALE] = Field(16.0, description="full scale of the accelerometer in g")
+    gyro_range: Annotated[float, FULL_SCALE] = Field(2000.0, description="full scale of the gyroscope in °/s")
 
 
 class WitmotionDecoder(FrameStreamDecoder):
@@ -233,12 +234,5 @@ def _match_bluetooth(buffer: bytes, at: int) -> int:
 
 
 def build(settings: Settings) -> Decoder:
-    """Return a decoder with these settings.
-
-    Raises
-    ------
-    ConfigError
-        A full scale is out of range.
-    """
-    check_settings(settings)
+    """Return a decoder with these settings."""
     return WitmotionDecoder(settings)

@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 import numpy as np
+from pydantic import Field
 
 from drivers.decoders.base import (
     NEED_MORE,
@@ -55,15 +56,18 @@ SIZES: Final = (4, 4, 6, 8)
 """Size of one number in bytes, by the two low bits of a DID."""
 
 
-class Settings(DecoderSettings, frozen=True):
+class Settings(DecoderSettings):
     """Keys of ``[device.driver.decoder_options]``."""
 
-    clock: Literal["sample_time_fine", "packet_counter", "arrival"] = "sample_time_fine"
-    """Source of the sample times: SampleTimeFine (0.1 ms), PacketCounter (one per packet), or arrival times."""
-    high_rate: bool = False
-    """True if the HR items 0x4040 and 0x8040 are read instead of 0x4020 and 0x8020."""
-    format: Format = "float32"
-    """Number format that ``encode`` writes. All four formats can be read."""
+    clock: Literal["sample_time_fine", "packet_counter", "arrival"] = Field(
+        "sample_time_fine", description="source of the sample times"
+    )
+    high_rate: bool = Field(
+        False, description="true: read the high-rate items 0x4040 and 0x8040 instead of 0x4020 and 0x8020"
+    )
+    format: Format = Field(
+        "float32", description="number format that a simulated sensor writes; all four formats can be read"
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,10 +1,10 @@
 """Interface of a link. A link moves bytes and does not interpret them.
 
 A link module ``drivers/links/<name>_link.py`` defines ``Settings``, ``build(settings) -> Link`` and
-``DEFAULT_DECODER``. ``Settings`` is a msgspec struct with the keys of the link in ``[device.driver]``.
+``DEFAULT_DECODER``. ``Settings`` is a pydantic model with the keys of the link in ``[device.driver]``.
 ``DEFAULT_DECODER`` is the name of a decoder, or "" if the user must choose one. Nothing is opened before ``open`` is
-called. ``build`` raises one ``ConfigError`` with a line for each mistake in the settings. The line begins with the key:
-"speed: ...". Every key is listed in ``config/defaults.toml``.
+called. ``build`` raises one ``ConfigError`` with a line for each mistake that the model does not find. The line begins
+with the key: "interface: ...".
 """
 
 import threading
@@ -13,11 +13,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Annotated, Literal, Protocol, runtime_checkable
 
-import msgspec
+from pydantic import Field
 
 from drivers.errors import LinkLost
 from drivers.quantities import SILENCE_S
 from drivers.sample import Chunk
+from drivers.settings_model import SettingsModel
 
 Carrier = Literal["bytes", "frames", "messages"]
 """Kind of data of a link: "bytes" is a stream without boundaries (serial). "frames" is one CAN frame per chunk.
@@ -25,11 +26,12 @@ Carrier = Literal["bytes", "frames", "messages"]
 """
 
 
-class LinkSettings(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class LinkSettings(SettingsModel):
     """Keys that all links have."""
 
-    silence: Annotated[float, SILENCE_S.meta] = 3.0
-    """Time without a byte in s after which the link is opened again; 0 = never."""
+    silence: Annotated[float, SILENCE_S] = Field(
+        3.0, description="time without data in s after which the link is opened again; 0 = never"
+    )
 
 
 class Link(Protocol):

@@ -24,14 +24,15 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
-import msgspec
+from pydantic import Field, SkipValidation
 
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.quantities import BIT_RATE, check_settings
+from drivers.quantities import BIT_RATE, format_value
 from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
+from drivers.settings_model import checked_by
 
 if TYPE_CHECKING:
     import can
@@ -75,18 +76,32 @@ BUS_OFF: Final = 0x40
 ID_MASK: Final = 0x1FFF_FFFF
 
 
-class Settings(LinkSettings, frozen=True, kw_only=True):
+def _check_channel(channel: object) -> None:
+    """Raise ConfigError if a channel is neither a text nor a number."""
+    if not isinstance(channel, str | int) or isinstance(channel, bool):
+        raise ConfigError(f"expected text in quotes or a whole number, got {format_value(channel)}")
+
+
+class Settings(LinkSettings):
     """Keys of a CAN link."""
 
-    interface: str = "socketcan"
-    channel: str | int = "can0"
-    bitrate: Annotated[int, BIT_RATE.meta] | None = None
-    """Bit rate in bit/s. For socketcan it is set with the interface: ip link set can0 up type can bitrate 500000."""
-    fd: bool = False
-    data_bitrate: Annotated[int, BIT_RATE.meta] | None = None
-    receive_own_messages: bool = False
-    options: dict[str, Any] = msgspec.field(default_factory=dict)
-    """Additional keys of python-can's Bus for this interface."""
+    interface: str = Field(
+        "socketcan", description="interface of python-can: socketcan, slcan, pcan, udp_multicast, virtual, ..."
+    )
+    channel: Annotated[str | int, SkipValidation, checked_by(_check_channel)] = Field(
+        "can0", description="name or number of the bus, as python-can names it for this interface"
+    )
+    bitrate: Annotated[int, BIT_RATE] | None = Field(
+        None,
+        examples=[500_000],
+        description="bit rate; absent: as the interface is set, e.g. by ip link set can0 up type can bitrate 500000",
+    )
+    fd: bool = Field(False, description="CAN FD")
+    data_bitrate: Annotated[int, BIT_RATE] | None = Field(
+        None, examples=[2_000_000], description="bit rate of the data phase of CAN FD; absent: as the interface is set"
+    )
+    receive_own_messages: bool = Field(False, description="true: receive frames that this process sends, too")
+    options: dict[str, Any] = Field({}, description="additional keys of python-can's Bus for this interface")
 
 
 class CanLink(PolledLink):
@@ -290,9 +305,8 @@ def build(settings: Settings) -> Link:
     Raises
     ------
     ConfigError
-        python-can does not know the interface or is not installed, or a number is out of range.
+        If python-can is not installed or does not know the interface.
     """
-    check_settings(settings)
     check_extra("can", "a CAN bus")
     from can.interfaces import VALID_INTERFACES
 

@@ -27,14 +27,17 @@ from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import IO, Annotated, Any, Final, Literal, cast
 
+from pydantic import Field
+
 from drivers import file_access
-from drivers.discovery import FilePath, format_choices
+from drivers.discovery import format_choices
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError, describe_error
 from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.quantities import BYTE_RATE, RATE_HZ, REPLAY_SPEED, describe_range_errors
+from drivers.quantities import BYTE_RATE, RATE_HZ, REPLAY_SPEED
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, segment
 from drivers.sample import Chunk
+from drivers.settings_model import FilePath, WordOr
 from drivers.zenoh.sample_message import encode_samples
 
 DEFAULT_DECODER: Final = "samples"
@@ -56,7 +59,7 @@ DAMAGE_ERRORS: Final = (
 """Exceptions, in addition to ValueError, that readers raise where a file is truncated or damaged."""
 
 PACES: Final = {"recorded": 1.0, "max": float("inf")}
-"""Values of ``speed`` that are words: seconds of the file per second."""
+"""Values of ``speed`` that are words, with the factor that they stand for."""
 
 Kind = Literal["recording", "log", "capture", "raw"]
 TimedChunk = tuple[float, Chunk]
@@ -68,32 +71,37 @@ DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log":
 """Decoder of each kind of file if the settings name none; "" if the settings must name one."""
 
 
-class Settings(LinkSettings, frozen=True, kw_only=True):
+class Settings(LinkSettings):
     """Keys of a replay."""
 
-    path: FilePath
-    speed: str | Annotated[float, REPLAY_SPEED.meta] = "recorded"
-    """Speed of the replay: "recorded", "max", or a factor (10 = ten times as fast)."""
-    rate: Annotated[float, RATE_HZ.meta] | None = None
-    """Sample rate in Hz for a recording with neither t nor fs."""
-    bytes_per_second: Annotated[float, BYTE_RATE.meta] | None = None
-    """Pace of captured bytes, a tenth of the baud rate.
-
-    If it is absent, bytes are delivered as fast as they are read.
-    """
-    channel: str | None = None
-    """Channel of a CAN log to replay. If it is absent, all channels are replayed."""
+    path: FilePath = Field(
+        examples=["recording.csv"], description="recording, CAN log, file of captured bytes, or folder of segments"
+    )
+    speed: Annotated[float, WordOr(PACES, Annotated[float, REPLAY_SPEED])] = Field(
+        1.0, examples=["recorded"], description="recorded, max, or a factor: 10 = ten times as fast as recorded"
+    )
+    rate: Annotated[float, RATE_HZ] | None = Field(
+        None, examples=[100.0], description="sample rate in Hz for a recording without times"
+    )
+    bytes_per_second: Annotated[float, BYTE_RATE] | None = Field(
+        None,
+        examples=[11_520.0],
+        description="pace of captured bytes, a tenth of the baud rate; absent: as fast as they are read",
+    )
+    channel: str | None = Field(
+        None, examples=["1"], description="channel of a CAN log that is replayed; absent: all channels"
+    )
 
 
 class ReplayLink(PolledLink):
     """Replay of one file, which starts from the beginning each time it is opened."""
 
-    def __init__(self, settings: Settings, kind: Kind, pace: float) -> None:
+    def __init__(self, settings: Settings, kind: Kind) -> None:
         super().__init__(f"replay of {settings.path}")
         self._settings = settings
         self._path = file_access.expand_user(settings.path)
         self._kind: Kind = kind
-        self._pace = pace  # seconds of the file per second; inf = no waiting
+        self._pace = settings.speed  # seconds of the file per second; inf = no waiting
         self.carrier: Carrier = _raw_carrier(self._path) if kind == "raw" else CARRIERS[kind]
         self.epoch: Literal["monotonic", "unix"] = "monotonic" if kind == "capture" else "unix"
         self.default_decoder = DEFAULT_DECODERS[kind]
@@ -313,20 +321,14 @@ def build(settings: Settings) -> Link:
     Raises
     ------
     ConfigError
-        The speed is invalid, or the file cannot be replayed.
+        If the file cannot be replayed.
     """
     path = file_access.expand_user(settings.path)
-    wrong = list(_problems(settings))
-    try:
-        _check_path(path)
-        kind = _detect_kind(path)
-        if kind == "log":
-            check_extra("can", "a CAN log")
-    except ConfigError as error:
-        wrong = [*error.lines, *wrong]
-    if wrong:
-        raise ConfigError(*wrong)
-    return ReplayLink(settings, kind, _pace(settings.speed))
+    _check_path(path)
+    kind = _detect_kind(path)
+    if kind == "log":
+        check_extra("can", "a CAN log")
+    return ReplayLink(settings, kind)
 
 
 def _check_path(path: Path) -> None:
@@ -339,15 +341,3 @@ def _check_path(path: Path) -> None:
         return
     except OSError as error:
         raise ConfigError(f'path "{path}": {error.strerror or error}') from error
-
-
-def _problems(settings: Settings) -> Iterator[str]:
-    """Yield a line for each mistake in the settings."""
-    yield from describe_range_errors(settings)
-    if isinstance(settings.speed, str) and settings.speed not in PACES:
-        yield f'speed: "{settings.speed}"; possible are recorded, max, or a factor without quotes'
-
-
-def _pace(speed: str | float) -> float:
-    """Return the seconds of the file that pass per second; 0 for an unknown word."""
-    return PACES.get(speed, 0.0) if isinstance(speed, str) else speed

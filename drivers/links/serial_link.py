@@ -18,15 +18,17 @@ import errno
 import importlib.util
 import os
 import time
-from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+
+from pydantic import Field
 
 from drivers.credential_masking import mask_secrets
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.quantities import BIT_RATE, READ_TIMEOUT_S, describe_range_errors
+from drivers.quantities import BIT_RATE, READ_TIMEOUT_S
 from drivers.sample import Chunk
+from drivers.settings_model import checked_by
 
 if TYPE_CHECKING:
     import serial
@@ -39,21 +41,38 @@ SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
 """URL schemes that are part of pyserial."""
 
 
-class Settings(LinkSettings, frozen=True, kw_only=True):
+def _check_port(port: str) -> None:
+    """Raise ConfigError for an empty port, or a URL with an unknown scheme."""
+    scheme, found, _ = port.partition("://")
+    if not port:
+        raise ConfigError('empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")')
+    if found and scheme.lower() not in SCHEMES and not _has_handler(scheme.lower()):
+        raise ConfigError(f'"{port}" has an unknown kind of URL "{scheme}"{format_choices(scheme, SCHEMES)}')
+
+
+def _check_stop_bits(number: float) -> None:
+    """Raise ConfigError if no port has this number of stop bits."""
+    if number not in STOP_BITS:
+        raise ConfigError(f"{number:g}; possible are 1, 1.5, 2")
+
+
+class Settings(LinkSettings):
     """Keys of a serial link."""
 
-    port: str
-    """Device or URL: /dev/ttyUSB0, COM3, socket://host:port, rfc2217://host:port, hwgrep://REGEX."""
-    baudrate: Annotated[int, BIT_RATE.meta] = 115200
-    bytesize: Literal[5, 6, 7, 8] = 8
-    parity: Literal["N", "E", "O", "M", "S"] = "N"
-    stopbits: float = 1.0
-    rtscts: bool = False
-    xonxoff: bool = False
-    exclusive: bool = True
-    """True if other programs are prevented from reading the same port, where the system supports this."""
-    read_timeout: Annotated[float, READ_TIMEOUT_S.meta] = 0.01
-    """Time in s that bytes may wait for more bytes; at most 0.1."""
+    port: Annotated[str, checked_by(_check_port)] = Field(
+        examples=["/dev/ttyUSB0"],
+        description="device, or URL of pyserial: /dev/ttyUSB0, COM3, socket://host:port, rfc2217://host:port",
+    )
+    baudrate: Annotated[int, BIT_RATE] = Field(115200, description="baud rate")
+    bytesize: Literal[5, 6, 7, 8] = Field(8, description="data bits")
+    parity: Literal["N", "E", "O", "M", "S"] = Field("N", description="none, even, odd, mark or space")
+    stopbits: Annotated[float, checked_by(_check_stop_bits)] = Field(1.0, description="stop bits: 1, 1.5 or 2")
+    rtscts: bool = Field(False, description="hardware flow control")
+    xonxoff: bool = Field(False, description="software flow control")
+    exclusive: bool = Field(True, description="true: other programs cannot open the port")
+    read_timeout: Annotated[float, READ_TIMEOUT_S] = Field(
+        0.01, description="time in s that received bytes may wait for more bytes"
+    )
 
 
 class SerialLink(PolledLink):
@@ -168,28 +187,8 @@ def _list_ports() -> str:
 
 
 def build(settings: Settings) -> Link:
-    """Return the link of these settings without opening it.
-
-    Raises
-    ------
-    ConfigError
-        The URL scheme is unknown, the number of stop bits is invalid, or a number is out of range.
-    """
-    if wrong := list(_problems(settings)):
-        raise ConfigError(*wrong)
+    """Return the link of these settings without opening it."""
     return SerialLink(settings)
-
-
-def _problems(settings: Settings) -> Iterator[str]:
-    """Yield a line for each mistake in the settings."""
-    scheme, found, _ = settings.port.partition("://")
-    if not settings.port:
-        yield 'port: empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")'
-    elif found and scheme.lower() not in SCHEMES and not _has_handler(scheme.lower()):
-        yield f'port: "{settings.port}" has an unknown kind of URL "{scheme}"{format_choices(scheme, SCHEMES)}'
-    if settings.stopbits not in STOP_BITS:
-        yield f"stopbits: {settings.stopbits:g}; possible are 1, 1.5, 2"
-    yield from describe_range_errors(settings)
 
 
 def _has_handler(scheme: str) -> bool:

@@ -19,13 +19,13 @@ import time
 from collections import deque
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-import msgspec
+from pydantic import Field
 
 from drivers.credential_masking import mask_secrets
-from drivers.discovery import FilePath
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.sample import Chunk
+from drivers.settings_model import FilePath, ListOf
 from drivers.zenoh.connection_errors import explain_refusals
 from drivers.zenoh.session import DEFAULT_CONFIGURATION, configuration, endpoints, format_error
 
@@ -39,20 +39,27 @@ MAX_QUEUED_BYTES: Final = 128_000_000
 """Maximum size of all messages that wait to be read: twice the longest message that a session accepts."""
 
 
-class Settings(LinkSettings, frozen=True, kw_only=True):
+class Settings(LinkSettings):
     """Keys of a zenoh link."""
 
-    key: str
-    """Key expression, such as "imu/bench-1/samples" or "0/imu/data/sensor_msgs::msg::dds_::Imu_/**"."""
-    mode: Literal["peer", "client"] | None = None
-    """Mode of the session. If it is absent, the mode is that of the file. Without a mode in the file, the session is a
-    client for one endpoint and a peer otherwise.
-    """
-    connect: list[str] = msgspec.field(default_factory=list)
-    """Endpoints to connect to, such as "tcp/127.0.0.1:7447"."""
-    listen: list[str] = msgspec.field(default_factory=list)
-    config: FilePath = ""
-    """zenoh JSON5 file for all other settings (TLS, access control). The keys above take precedence."""
+    key: str = Field(
+        examples=["imu/bench-1/samples"],
+        description='key expression, such as "0/imu/data/sensor_msgs::msg::dds_::Imu_/**" for ROS 2',
+    )
+    mode: Literal["peer", "client"] | None = Field(
+        None,
+        examples=["client"],
+        description="mode of the session; absent: as in the file, else client of one endpoint, otherwise peer",
+    )
+    connect: ListOf[str] = Field((), examples=[["tcp/127.0.0.1:7447"]], description="endpoints to connect to")
+    listen: ListOf[str] = Field(
+        (), examples=[["tcp/127.0.0.1:7460"]], description="endpoints for publishers that connect to this process"
+    )
+    config: FilePath = Field(
+        "",
+        examples=["zenoh.json5"],
+        description="zenoh file for all other settings (TLS, access control); the keys above take precedence",
+    )
 
 
 class ZenohLink:

@@ -145,7 +145,7 @@ def view(
     from monitor.settings import loading
 
     try:
-        loading.viewer_mode(mode)
+        loading.check_viewer_mode(mode)
     except ConfigError as error:
         raise ConfigError(f"--viewer: {error}") from None
     keys = tuple(dict.fromkeys(detail_key(device, keyexpr) for device in detail))
@@ -181,30 +181,26 @@ def with_history(config: "Config", history_s: float | None) -> "Config":
     """
     import dataclasses
 
-    import msgspec
-
     if history_s is None:
         return config
     if config.storage is None or not config.storage.history:
-        raise ConfigError("--history: none is kept; [storage] folder says where it would be")
-    return dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, history=history_s))
+        raise ConfigError("--history: there is no history to show; add folder to [storage]")
+    return dataclasses.replace(config, viewer=config.viewer.model_copy(update={"history": history_s}))
 
 
 def _with_viewer(config: "Config", viewer: str | None) -> "Config":
     """Return the configuration with another viewer mode; None keeps the mode."""
     import dataclasses
 
-    import msgspec
-
     from monitor.settings import loading
 
     if viewer is None:
         return config
     try:
-        mode = loading.viewer_mode(viewer)
+        loading.check_viewer_mode(viewer)
     except ConfigError as error:
         raise ConfigError(f"--viewer: {error}") from None
-    return dataclasses.replace(config, viewer=msgspec.structs.replace(config.viewer, mode=mode))
+    return dataclasses.replace(config, viewer=config.viewer.model_copy(update={"mode": viewer}))
 
 
 @contextlib.contextmanager

@@ -40,7 +40,7 @@ def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature
     ConfigError
         If the text is not valid, with one line for each mistake.
     """
-    tables = toml_text.format_tables(text)
+    tables = toml_text.parse_toml(text)
     mistakes: list[str] = []
     rate_hz = tables.pop("sample_rate", None)
     if rate_hz is not None:

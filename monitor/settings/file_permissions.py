@@ -17,7 +17,7 @@ SECRET_BYTES = 1_000_000
 """A larger file is no configuration, and not looked through."""
 
 
-def changeable(path: Path) -> str:
+def describe_write_access(path: Path) -> str:
     """Why a file may not be trusted: anyone may write it, or put another in its place; "" where it may."""
     real = real_path(path)
     if _others(real, stat.S_IWOTH):
@@ -28,7 +28,7 @@ def changeable(path: Path) -> str:
     return ""
 
 
-def exposed(path: Path, secret: bool | None = None) -> str:
+def describe_exposed_secret(path: Path, secret: bool | None = None) -> str:
     """A file with a secret that anyone may read; "" where there is none, or nobody else may.
 
     Args:

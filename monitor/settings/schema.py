@@ -1,190 +1,396 @@
-"""The tables of a configuration file: which keys there are, of what kind, and what holds where one is absent.
+"""Models of the tables of a configuration file: keys, types with ranges, defaults and descriptions.
 
-What a value means, and whether values fit each other, is for ``settings`` to say. Links and decoders bring tables of
-their own.
+``[device.driver]`` is in ``driver_settings``. The models hold the converted values: "1h" in the file is 3600.0 here.
 """
 
+import os
+import re
+from collections.abc import Iterator
+from fnmatch import fnmatch
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
-import msgspec
+from pydantic import AfterValidator, Field, Strict, ValidationInfo, model_validator
 
-from drivers import quantities
-from drivers.links.base import LinkSettings
+from drivers import discovery, file_access, quantities
+from drivers.decoders.base import Decoder
+from drivers.driver import AxisMap, parse_axis_map
+from drivers.errors import ConfigError
+from drivers.links.base import Link
+from drivers.quantities import DAY_S, Quantity
+from drivers.sample import AXES, EVENT_KINDS
+from drivers.settings_model import Conflict, ListOf, ReadAs, SettingsModel, WordOr, checked_by, one_of
+from monitor.common.config_files import model_path
 from monitor.common.topics import ENDPOINT
+from monitor.settings.driver_settings import Driver, VirtualTable, read_driver
+from monitor.settings.field_types import (
+    DURATION_FROM_TEXT,
+    Address,
+    Duration,
+    Endpoint,
+    RelativePath,
+    ZenohKey,
+    check_memory,
+    check_viewer_mode,
+    period_or,
+)
 
-Coefficient = Annotated[float, quantities.COEFFICIENT.meta]
-Duration = Annotated[float, quantities.DURATION_S.meta]
-Port = Annotated[int, quantities.PORT.meta]
-Share = Annotated[float, quantities.FRACTION.meta]
-ZenohKey = Annotated[
-    str,
-    msgspec.Meta(
-        pattern=r"^[^/*$?#]+(/[^/*$?#]+)*$",
-        description='a zenoh key such as "site/alarms", without * $ ? # and with text between slashes',
-    ),
-]
+WINDOW_SAMPLES: Final = (100, 10_000_000)
+"""Smallest and largest number of samples in the window."""
+MAX_WINDOW_S: Final = 40 * DAY_S
+"""Longest window if the sample rate is not configured."""
+THERMAL_INTERVAL_SAMPLES: Final = 8
+"""Minimum number of samples in a thermal interval. Their scatter gives the uncertainty of their mean."""
+THERMAL_INTERVAL_S: Final = Quantity("s", 1e-6, DAY_S)
+SEGMENT_LENGTH_S: Final = Quantity("s", 10.0, DAY_S)
+DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
+AXIS_PATTERNS: Final = (*AXES, "g*", "a*", "*")
 
-
-class _Table(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One table of the file."""
-
-
-class DeviceTable(_Table, frozen=True, kw_only=True):
-    """``[[device]]``."""
-
-    name: str
-    driver: dict[str, Any]
-    rate: Annotated[float, quantities.RATE_HZ.meta] | None = None
-    window: Duration | str = 3600.0
-    tau: Literal["octave", "decade10"] | list[Annotated[float, quantities.AVERAGING_TIME_S.meta]] = "octave"
-    refit: str = "10 Hz"
-    publish: str = "10 Hz"
-    motion: Literal["tell", "leave out"] = "tell"
-    alarms_per_day: Annotated[float, quantities.ALARMS_PER_DAY.meta] = 0.033
-    """False alarms of changed noise to bear; 0 = do not look."""
-    restart: bool = True
-    model: str | None = None
-    """The model in force: path of a model file, or the name of one in the shipped ``config/models``."""
-    compensate: bool = True
-    """Take the gyros' drift out of a copy of the samples."""
-    thermal_interval: Duration | str = "10min"
-    """Of the means that are held against temperature; "off": they are not."""
-    reconcile_folder: Path | None = None
-    """Where the reports of ``command/reconcile`` are kept; None: they are not."""
-    axes: dict[str, str] = {}
-    limit: list[dict[str, Any]] = []
+Coefficient = Annotated[float, quantities.COEFFICIENT]
 
 
-class LimitTable(_Table, frozen=True, kw_only=True):
-    """``[[device.limit]]``: what a coefficient must not pass; one of the three bounds at least."""
+def select_axes(pattern: str, _: object = None) -> tuple[str, ...]:
+    """Return the axes of a name, or of "g*", "a*" or "*".
 
-    axes: str
-    letter: Literal["Q", "N", "B", "K", "R"]
-    above: Coefficient | None = None
-    """SI unit of letter and axis, as in a model file."""
-    below: Coefficient | None = None
-    times_model: Annotated[float, quantities.NOISE_RATIO.meta] | None = None
-    """Too much is so many times what the model in force says."""
-    hold: Duration | str = "1min"
-    """It has to be beyond, or back, for so long."""
-
-
-class FaultsTable(_Table, frozen=True, kw_only=True):
-    """``[device.driver.faults]``: what goes wrong on the way from a simulated sensor, all of it drawn from its seed."""
-
-    lost: Share = 0.0
-    """Share of samples that are never sent; their count goes on."""
-    repeated: Share = 0.0
-    """Share of samples that are sent twice."""
-    flipped: Share = 0.0
-    """Share of samples one bit of which is flipped."""
-    cut: Share = 0.0
-    """Share of samples whose frame ends before it is whole."""
-    jitter: Annotated[float, quantities.JITTER_S.meta] = 0.0
-    """s: each burst is held back by a random time of up to so much."""
-    unplugged: Share = 0.0
-    """Chance at each sample that the cable is pulled before it."""
-    unplugged_for: Duration = 2.0
-    """s of the sensor's time until it is put back."""
-    clock: Annotated[float, quantities.CLOCK_RATIO.meta] = 1.0
-    """True rate over the rate that the sensor's clock and settings claim."""
-
-
-class VirtualTable(LinkSettings, frozen=True, kw_only=True):
-    """Keys of ``link = "virtual"``: a simulated IMU that speaks a real wire format over a real link.
-
-    The decoder says which: a stream of bytes over a pseudo-terminal, CAN frames over a bus of python-can in this
-    process, messages over zenoh on loopback.
+    >>> select_axes("g*"), select_axes("az")
+    (('gx', 'gy', 'gz'), ('az',))
     """
-
-    model: str = "consumer-mems"
-    """Path of a model file, or the name of one in the shipped ``config/models``."""
-    seed: Annotated[int, quantities.SEED.meta] = 1
-    speed: Annotated[float, quantities.SIMULATION_SPEED.meta] = 1.0
-    """Times real time."""
-    effect: tuple[str, ...] = ()
-    """Effects that the sensor takes on while it runs: "gz.sinusoidal:amplitude=1e-3,frequency=17"."""
-    effect_at: Annotated[float, quantities.DELAY_S.meta] = 90.0
-    """s of the sensor's time; by then changes are looked for."""
-    faults: FaultsTable = FaultsTable()
+    if pattern not in AXIS_PATTERNS:
+        raise ConfigError(f'"{pattern}"{discovery.format_choices(pattern, AXIS_PATTERNS)}')
+    return tuple(axis for axis in AXES if fnmatch(axis, pattern))
 
 
-class ZenohTable(_Table, frozen=True, kw_only=True):
-    """``[zenoh]``."""
+class Limit(SettingsModel):
+    """``[[device.limit]]``: bounds of one noise coefficient."""
 
-    mode: Literal["peer", "client", "router", "none"] | None = "peer"
-    listen: tuple[str, ...] | None = (ENDPOINT,)
-    """These two are None where a zenoh file is named and they are not given beside it: then the file's hold."""
-    connect: tuple[str, ...] = ()
-    config: Path | None = None
-    prefix: ZenohKey = "imu"
+    axes: Annotated[tuple[str, ...], ReadAs(str, select_axes)] = Field(
+        examples=["g*"], description='gx ... az, "g*", "a*" or "*"'
+    )
+    letter: Literal["Q", "N", "B", "K", "R"] = Field(examples=["N"], description="noise coefficient")
+    above: Coefficient | None = Field(
+        None, examples=[2.0e-4], description="upper bound in the SI unit of the coefficient, as in a model file"
+    )
+    below: Coefficient | None = Field(
+        None, examples=[1.0e-5], description="lower bound in the SI unit of the coefficient, as in a model file"
+    )
+    times_model: Annotated[float, quantities.NOISE_RATIO] | None = Field(
+        None, examples=[1.5], description="instead of above: upper bound as a multiple of the model in force"
+    )
+    hold_s: Duration = Field(
+        60.0,
+        alias="hold",
+        examples=["1min"],
+        description="time for which the coefficient must be beyond the bound, or within the bounds again",
+    )
 
-
-class ViewerTable(_Table, frozen=True, kw_only=True):
-    """``[viewer]``."""
-
-    mode: str = "auto"
-    port: Port = 9876
-    web_port: Port = 9090
-    memory: str = "256MiB"
-    history: Duration | str | None = None
-    """Of what is kept, shown when the view opens; None: nothing."""
-
-
-class StorageTable(_Table, frozen=True, kw_only=True):
-    """``[storage]``: what is kept on disk; without a folder nothing is."""
-
-    folder: Path | None = None
-    record: bool = True
-    """Samples as received and decoded, in segments."""
-    raw: bool = False
-    """The bytes as they came too, so that a decoder's fault can be replayed."""
-    segment: Duration | str = "1h"
-    keep: Duration | str = "30d"
-    """Segments older than this are deleted."""
-    disk_share: Annotated[float, quantities.POSITIVE_SHARE.meta] = 0.9
-    """The oldest segments are deleted while more than this share of the disk is taken."""
-    history: bool = True
-    """Results, events and status, thinned with age."""
+    def conflicts(self) -> Iterator[Conflict]:
+        """Yield a conflict if there is no bound, or if the bounds exclude each other."""
+        bounds = ("above", "below", "times_model")
+        if self.above is None and self.below is None and self.times_model is None:
+            yield Conflict("", "no bound; add above, below or times_model", bounds)
+        if self.above is not None and self.times_model is not None:
+            yield Conflict("", "above and times_model are the same bound; leave one out", bounds)
+        if self.above is not None and self.below is not None and self.below >= self.above:
+            yield Conflict("", f"below {self.below:g} must be less than above {self.above:g}", bounds)
 
 
-class HookTable(_Table, frozen=True, kw_only=True):
-    """``[[hook]]``: what an event sets off, a command or a message."""
-
-    on: list[str]
-    """Kinds of events; "*" is every one."""
-    devices: list[str] = []
-    """Names; none: all."""
-    command: list[str] = []
-    """A program's path and its arguments, never a shell's line; the event comes as JSON on standard input."""
-    key: ZenohKey | None = None
-    """Of zenoh, where the event is put as JSON."""
-    timeout: Duration | str = "30s"
-    """After which the command is killed, with all that it started."""
+def _check_name(name: str) -> None:
+    if not DEVICE_NAME.fullmatch(name):
+        raise ConfigError(f'"{name}"; letters, digits, - and _ are possible')
 
 
-class MetricsTable(_Table, frozen=True, kw_only=True):
+def _model_in_force(name: str, folder: Path | None) -> Path:
+    return model_path(name, folder or Path())
+
+
+class Device(SettingsModel):
+    """``[[device]]``: one device. Nothing is open."""
+
+    name: Annotated[str, checked_by(_check_name)] = Field(
+        examples=["bench-1"], description="letters, digits, - and _; unique, since it is part of every zenoh key"
+    )
+    driver: Annotated[Driver, ReadAs(dict[str, Any], read_driver)] = Field(
+        examples=[{"link": "virtual"}], description="link and decoder"
+    )
+    rate_hz: Annotated[float, quantities.RATE_HZ] | None = Field(
+        None, alias="rate", examples=[100.0], description="nominal sample rate in Hz; absent: found from the data"
+    )
+    window_s: Duration = Field(3600.0, alias="window", examples=["1h"], description="length of the sliding window")
+    tau: Annotated[
+        Literal["octave", "decade10"] | tuple[float, ...],
+        WordOr({"octave": "octave", "decade10": "decade10"}, ListOf[Annotated[float, quantities.AVERAGING_TIME_S]]),
+    ] = Field("octave", description="averaging times: a grid, or a list of seconds")
+    refit_s: Annotated[float, period_or("every sample")] = Field(
+        0.1,
+        alias="refit",
+        examples=["10 Hz"],
+        description='rate at which the coefficients are fitted, or "every sample"',
+    )
+    publish_s: Annotated[float, period_or("every block")] = Field(
+        0.1, alias="publish", examples=["10 Hz"], description='rate at which results are published, or "every block"'
+    )
+    motion: Literal["tell", "leave out"] = Field(
+        "tell",
+        description="tell: report motion; leave out: exclude motion from the noise, which delays samples by 0.5 s",
+    )
+    alarms_per_day: Annotated[float, quantities.ALARMS_PER_DAY] = Field(
+        0.033, description="accepted false alarms of changed noise per day, of all axes together; 0 = no detection"
+    )
+    restart: bool = Field(True, description="true: the fit of an axis starts again after its noise has changed")
+    model: Annotated[Path | None, ReadAs(str, _model_in_force)] = Field(
+        None,
+        examples=["consumer-mems"],
+        description="model in force, with which the samples are compared: a model file, or name of a shipped model",
+    )
+    compensate: bool = Field(True, description="true: also publish the samples without the drift of the gyroscopes")
+    thermal_s: Annotated[
+        float | None, WordOr({"off": None}, Annotated[float, THERMAL_INTERVAL_S, DURATION_FROM_TEXT])
+    ] = Field(
+        600.0,
+        alias="thermal_interval",
+        examples=["10min"],
+        description='averaging time of the bias for the comparison with temperature, or "off"',
+    )
+    reconcile_folder: RelativePath | None = Field(
+        None, examples=["reports"], description="folder for the reports of command/reconcile; absent: they are not kept"
+    )
+    axes: Annotated[AxisMap, ReadAs(dict[str, str], lambda table, folder: parse_axis_map(table))] = Field(
+        AxisMap(),
+        examples=[{axis: axis for axis in AXES}],
+        description='mounting of the sensor: axis of the output = axis of the sensor, as in gx = "-gy"',
+    )
+    limits: ListOf[Limit] = Field((), alias="limit", description="bounds of the coefficients")
+
+    @property
+    def link(self) -> Link | VirtualTable:
+        """Link of the device, or the settings of a simulated sensor."""
+        return self.driver.link
+
+    @property
+    def decoder(self) -> Decoder:
+        """Decoder of the device."""
+        return self.driver.decoder
+
+    @property
+    def silence_s(self) -> float:
+        """Time without data in s after which the link is opened again; 0 = never."""
+        return self.driver.silence_s
+
+    @property
+    def leave_out_motion(self) -> bool:
+        """True if motion is excluded from the noise."""
+        return self.motion == "leave out"
+
+    def conflicts(self) -> Iterator[Conflict]:
+        """Yield a conflict for each length that does not match the sample rate, and for a limit without a model."""
+        if text := self._window_problem():
+            yield Conflict("window", text, ("rate",))
+        if text := self._tau_problem():
+            yield Conflict("tau", text, ("window", "rate"))
+        shortest_s = THERMAL_INTERVAL_SAMPLES / (self.rate_hz or float("inf"))
+        if self.thermal_s is not None and self.thermal_s < shortest_s:
+            text = f"{self.thermal_s:g} s; possible are {shortest_s:g} s ({THERMAL_INTERVAL_SAMPLES} samples) to 1 d"
+            yield Conflict("thermal_interval", text, ("rate",))
+        for i, limit in enumerate(self.limits):
+            if limit.times_model is not None and self.model is None:
+                yield Conflict(f"limit[{i}].times_model", "the device has no model in force; add model", ("model",))
+
+    def _window_problem(self) -> str:
+        """Return why the window is too short or too long; "" if it is possible."""
+        if self.rate_hz is None:
+            return f"{self.window_s:g} s; at most {MAX_WINDOW_S:g} s" if self.window_s > MAX_WINDOW_S else ""
+        low, high = WINDOW_SAMPLES
+        samples = self.window_s * self.rate_hz
+        if low <= samples <= high:
+            return ""
+        return (
+            f"{self.window_s:g} s at {self.rate_hz:g} Hz are {samples:.0f} samples; "
+            f"possible are {low} to {high}: {low / self.rate_hz:g} to {high / self.rate_hz:g} s"
+        )
+
+    def _tau_problem(self) -> str:
+        """Return why no averaging time of a list is possible; "" if one is. They are rounded to whole samples."""
+        shortest_s = 1.0 / self.rate_hz if self.rate_hz else 0.0
+        if isinstance(self.tau, str) or any(0.5 * shortest_s < one <= 0.5 * self.window_s for one in self.tau):
+            return ""
+        low = f"{shortest_s:g} s, one sample," if self.rate_hz else "one sample"
+        return f"none of {list(self.tau)} s lies between {low} and {self.window_s / 2:g} s, half the window"
+
+
+class ZenohTable(SettingsModel):
+    """``[zenoh]``: session of the daemon. mode and listen are None if only the file of ``config`` sets them."""
+
+    mode: Literal["peer", "client", "router", "none"] | None = Field("peer", description="mode of the session")
+    listen: ListOf[Endpoint] | None = Field(
+        (ENDPOINT,), description="endpoints on which the daemon listens; if they are in use, any free port"
+    )
+    connect: ListOf[Endpoint] = Field(
+        (), examples=[["tcp/127.0.0.1:7447"]], description="routers or daemons to which the daemon connects"
+    )
+    config: RelativePath | None = Field(
+        None, examples=["zenoh.json5"], description="zenoh file for all other settings (TLS, access control)"
+    )
+    prefix: ZenohKey = Field("imu", description="keys are <prefix>/<device>/...")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _prefer_file(cls, table: Any, info: ValidationInfo) -> Any:
+        """Leave mode and listen to the zenoh file if the table names one."""
+        if info.context is None or not isinstance(table, dict) or "config" not in table:
+            return table
+        return {"mode": None, "listen": None, **table}
+
+    def conflicts(self) -> Iterator[Conflict]:
+        """Yield a conflict if a client does not know a router."""
+        if self.mode == "client" and not self.connect and self.config is None:
+            text = 'empty, but a client needs a router, e.g. ["tcp/127.0.0.1:7447"]'
+            yield Conflict("connect", text, ("mode", "config"))
+
+
+def _viewer_mode(mode: str, info: ValidationInfo) -> str:
+    """Return the mode of the viewer, with the whole path of a file."""
+    check_viewer_mode(mode)
+    folder = info.context.folder if info.context else None
+    return str(folder / file_access.expand_user(mode)) if folder and mode.endswith(".rrd") else mode
+
+
+class ViewerTable(SettingsModel):
+    """``[viewer]``: live view."""
+
+    mode: Annotated[str, AfterValidator(_viewer_mode)] = Field(
+        "auto", description="auto, native, web, none, or a file ending in .rrd"
+    )
+    port: Annotated[int, quantities.PORT] = Field(9876, description="TCP port of the viewer's data, on loopback")
+    web_port: Annotated[int, quantities.PORT] = Field(9090, description="TCP port of the viewer's page, on loopback")
+    memory: Annotated[str, checked_by(check_memory)] = Field(
+        "256MiB", description="memory for past data; the oldest data are dropped first"
+    )
+    history: Duration | None = Field(
+        None, examples=["1d"], description="part of the history in [storage] that is shown when the view opens"
+    )
+
+
+class Storage(SettingsModel):
+    """``[storage]``: samples and results that are kept on disk."""
+
+    folder: RelativePath = Field(
+        Path(),
+        examples=["/var/lib/imu-monitor"],
+        description="folder; absent: nothing is kept, and a restart begins with an empty window",
+    )
+    record: bool = Field(
+        True, description="keep samples in segments that every command reads; needs imu-monitor[arrow]"
+    )
+    raw: bool = Field(False, description="also keep the received bytes, so that decoding can be repeated")
+    segment_s: Annotated[float, SEGMENT_LENGTH_S, DURATION_FROM_TEXT] = Field(
+        3600.0, alias="segment", examples=["1h"], description="length of one file"
+    )
+    keep_s: Duration = Field(
+        30 * DAY_S, alias="keep", examples=["30d"], description="age at which segments are deleted"
+    )
+    disk_share: Annotated[float, quantities.POSITIVE_SHARE] = Field(
+        0.9, description="used share of the disk above which the oldest segments are deleted"
+    )
+    history: bool = Field(True, description="keep results, events and status for years, thinned with age")
+
+    def conflicts(self) -> Iterator[Conflict]:
+        """Yield a conflict if segments are deleted before they are complete."""
+        if self.keep_s < self.segment_s:
+            text = f"{self.keep_s:g} s is shorter than a segment of {self.segment_s:g} s"
+            yield Conflict("keep", text, ("segment",))
+
+
+def _program(words: tuple[str, ...], folder: Path | None) -> tuple[str, ...]:
+    """Return a program and its arguments. A relative path begins at the folder of the configuration file."""
+    if not words:
+        return ()
+    if "/" not in words[0]:
+        raise ConfigError(f'"{words[0]}" is no path; write where the program is, e.g. "/usr/bin/{words[0]}"')
+    if any("\0" in word for word in words):
+        raise ConfigError("a word with a NUL character cannot be passed to a program")
+    path = (folder or Path()) / file_access.expand_user(words[0])
+    if not file_access.is_file(path):
+        raise ConfigError(f"{path}: no such file")
+    if not os.access(path, os.X_OK):
+        raise ConfigError(f"{path}: not executable; chmod +x it")
+    return (str(path), *words[1:])
+
+
+def _check_events(kinds: frozenset[str]) -> None:
+    if not kinds:
+        raise ConfigError('empty; write kinds of events, or ["*"]')
+
+
+class Hook(SettingsModel):
+    """``[[hook]]``: a command or a message for certain events."""
+
+    on: Annotated[frozenset[Annotated[str, one_of((*EVENT_KINDS, "*"))]], Strict(False), checked_by(_check_events)] = (
+        Field(examples=[["limit_crossed", "link_lost"]], description='kinds of events, or ["*"]')
+    )
+    devices: Annotated[frozenset[str], Strict(False)] = Field(
+        frozenset(), examples=[["bench-1"]], description="names of devices; absent: all"
+    )
+    command: Annotated[tuple[str, ...], ReadAs(ListOf[str], _program)] = Field(
+        (),
+        examples=[["/usr/local/bin/tell", "--loud"]],
+        description="program with arguments, without a shell; the event is JSON on standard input",
+    )
+    key: ZenohKey | None = Field(
+        None, examples=["site/alarms"], description="zenoh key on which the event is published as JSON"
+    )
+    timeout_s: Duration = Field(
+        30.0, alias="timeout", examples=["30s"], description="time after which the command and its children are killed"
+    )
+
+    def conflicts(self) -> Iterator[Conflict]:
+        """Yield a conflict if the hook has no action."""
+        if not self.command and self.key is None:
+            yield Conflict("", "nothing to do; add command or key", ("command", "key"))
+
+
+class MetricsTable(SettingsModel):
     """``[metrics]``: numbers for Prometheus."""
 
-    listen: str | None = None
-    """Host and port; None: nothing listens."""
+    listen: Address | None = Field(
+        None,
+        examples=["127.0.0.1:9464"],
+        description="host and port; absent: the service does not listen; needs imu-monitor[metrics]",
+    )
 
 
-class LogTable(_Table, frozen=True, kw_only=True):
-    """``[log]``."""
+class LogTable(SettingsModel):
+    """``[log]``: messages of the service."""
 
-    level: Literal["debug", "info", "warning", "error"] = "info"
-    format: Literal["text", "json"] = "text"
+    level: Literal["debug", "info", "warning", "error"] = Field("info", description="least important level to write")
+    format: Literal["text", "json"] = Field("text", description="format of the lines")
 
 
-class FileTable(_Table, frozen=True, kw_only=True):
-    """The whole file."""
+class ConfigFile(SettingsModel):
+    """Whole configuration file."""
 
-    device: list[dict[str, Any]] = []
-    zenoh: dict[str, Any] = {}
-    viewer: dict[str, Any] = {}
-    storage: dict[str, Any] = {}
-    hook: list[dict[str, Any]] = []
-    metrics: dict[str, Any] = {}
-    log: dict[str, Any] = {}
+    devices: ListOf[Device] = Field((), alias="device", description="devices")
+    zenoh: ZenohTable = Field(ZenohTable(), description="zenoh session of the daemon")
+    viewer: ViewerTable = Field(ViewerTable(), description="live view")
+    storage: Storage = Field(Storage(), description="samples and results that are kept on disk")
+    hooks: ListOf[Hook] = Field((), alias="hook", description="actions for events")
+    metrics: MetricsTable = Field(MetricsTable(), description="numbers for Prometheus")
+    log: LogTable = Field(LogTable(), description="messages of the service")
+
+    def conflicts(self) -> Iterator[Conflict]:
+        """Yield the conflicts between tables."""
+        names = [device.name for device in self.devices]
+        places = tuple(f"device[{i}].name" for i in range(len(names)))
+        if not names:
+            yield Conflict("device", "there is none; add [[device]] with name and driver")
+        for name in dict.fromkeys(name for name in names if names.count(name) > 1):
+            same = [place for place, one in zip(places, names, strict=True) if one == name]
+            yield Conflict(same[-1], f'{len(same)} devices are named "{name}"; names must be unique', tuple(same))
+        for i, hook in enumerate(self.hooks):
+            for name in sorted(hook.devices - set(names)):
+                yield Conflict(f"hook[{i}].devices", f'"{name}"{discovery.format_choices(name, names)}', places)
+            if hook.key is not None and self.zenoh.mode == "none":
+                text = 'zenoh.mode is "none", so the message cannot be published'
+                yield Conflict(f"hook[{i}].key", text, ("zenoh.mode",))
+        if self.viewer.history is not None and not (self.storage.history and self.storage.folder != Path()):
+            text = "there is no history to show; add folder to [storage]"
+            yield Conflict("viewer.history", text, ("storage",))

@@ -1,6 +1,6 @@
-"""TOML text -> tables, for configurations and models; what is wrong with it is a ConfigError of one line.
+"""Parser of TOML text for configurations and noise models.
 
-Numbers are those that TOML promises: whole ones within 64 bits, so that none is too large for what follows.
+Integers are limited to 64 bits, the range that the TOML standard guarantees.
 """
 
 import tomllib
@@ -11,27 +11,29 @@ from drivers.errors import ConfigError
 MAX_INTEGER: Final = 1 << 63
 
 
-def format_tables(text: str) -> dict[str, Any]:
-    """The tables of the text.
+def parse_toml(text: str) -> dict[str, Any]:
+    """Return the tables of a TOML text.
 
-    >>> format_tables("a = 1")
+    >>> parse_toml("a = 1")
     {'a': 1}
 
-    Raises:
-        ConfigError: it is no TOML, is nested too deep, or holds a number beyond 64 bits
+    Raises
+    ------
+    ConfigError
+        If the text is not TOML, is nested too deep, or contains an integer of more than 64 bits.
     """
     try:
         found = tomllib.loads(text)
         _check(found)
     except RecursionError as error:
         raise ConfigError("not TOML: nested too deep") from error
-    except ValueError as error:  # of a number of thousands of digits, or a date that is none, too
+    except ValueError as error:  # also for a number of thousands of digits or an invalid date
         raise ConfigError(f"not TOML: {error}") from error
     return found
 
 
 def _check(value: Any) -> None:
     if isinstance(value, int) and not -MAX_INTEGER <= value < MAX_INTEGER:
-        raise ValueError("a whole number beyond 64 bits")
+        raise ValueError("an integer of more than 64 bits")
     for one in value.values() if isinstance(value, dict) else value if isinstance(value, list) else ():
         _check(one)

@@ -7,8 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final, ParamSpec, TypeVar
 
-import msgspec
-
 from drivers.errors import ConfigError
 from monitor.common import config_files
 from monitor.common.config_files import CONFIG_FOLDER
@@ -50,13 +48,15 @@ def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_a
         "effect": tuple(effects) or None,
         "effect_at": effect_at_s,
     }
-    table = msgspec.structs.replace(table, **{key: value for key, value in given.items() if value is not None})
+    table = table.model_copy(update={key: value for key, value in given.items() if value is not None})
     rate_hz = _for_option("--sensor", read_model, Path(table.model)).sample_rate_hz or DEFAULT_RATE_HZ
     for text in effects:
         _for_option("--effect", parse_effects, text)
     window_s = min(device.window_s, loading.WINDOW_SAMPLES[1] / rate_hz)
     # the sensor's own model is in force, so that the viewer shows when the sensor no longer agrees with it
-    device = replace(device, link=table, rate_hz=rate_hz, window_s=window_s, model=Path(table.model))
+    driver = replace(device.driver, link=table)
+    update = {"driver": driver, "rate_hz": rate_hz, "window_s": window_s, "model": Path(table.model)}
+    device = device.model_copy(update=update)
     return replace(config, devices=(device,), path=None)
 
 

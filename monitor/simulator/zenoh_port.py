@@ -30,7 +30,7 @@ class ZenohPort:
 
     def __init__(self, silence_s: float) -> None:
         self._endpoint = f"tcp/127.0.0.1:{_free_port()}"
-        self.link = zenoh_link.build(zenoh_link.Settings(key=KEY, connect=[self._endpoint], silence=silence_s))
+        self.link = zenoh_link.build(zenoh_link.Settings(key=KEY, connect=(self._endpoint,), silence=silence_s))
         self._session: zenoh.Session | None = None
         self._publisher: Any = None
         self._plugging = threading.Lock()

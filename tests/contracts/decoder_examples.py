@@ -10,10 +10,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from drivers import decoders, discovery
 from drivers.decoders.base import Decoder
+from drivers.settings_model import read_settings
 
 DEGREE = math.pi / 180.0
 G = 9.80665
@@ -69,7 +68,7 @@ class Example:
             (folder / "imu.dbc").write_text(CAN_DATABASE)
             settings["file"] = str(folder / "imu.dbc")
         module = importlib.import_module(f"{decoders.__name__}.{self.name}")
-        decoder: Decoder = module.build(msgspec.convert(settings, module.Settings))
+        decoder: Decoder = module.build(read_settings(module.Settings, settings))
         return decoder
 
 

@@ -7,7 +7,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from types import SimpleNamespace
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -17,6 +16,7 @@ from drivers.decoders import samples as samples_decoder
 from drivers.driver import MAX_UNDECODED_BYTES, AxisMap, Driver, parse_axis_map
 from drivers.errors import ConfigError
 from drivers.sample import NO_TICK, Chunk, make_block
+from drivers.settings_model import read_settings
 from drivers.timing.sample_clock import SampleClock
 from drivers.zenoh.sample_message import encode_samples
 from tests.support.loopback_link import LoopbackLink
@@ -295,7 +295,7 @@ APART = "frames of one sample arrive 8 ms apart, more than window = 0.005 s: inc
 
 def can_rig(late, n=500):
     """A driver that has read ``n`` samples of two CAN frames each, 20 ms a sample; in the late samples 8 ms apart."""
-    decoder = dbc.build(msgspec.convert({"file": "j1939_imu", "signals": SIGNALS, "window": 0.005}, dbc.Settings))
+    decoder = dbc.build(read_settings(dbc.Settings, {"file": "j1939_imu", "signals": SIGNALS, "window": 0.005}))
     rig = Rig(decoder, 50.0)
     index = np.arange(n)
     sent = decoder.encode(make_block(index * 20_000_000, np.tile([0.0, 0.0, 0.1, 0.0, 0.0, 9.81], (n, 1))))

@@ -34,7 +34,6 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-import msgspec
 import numpy as np
 
 from drivers.recordings import save_samples
@@ -320,10 +319,10 @@ def yesterday(out: Path, folder: Path) -> Path:
     config = demo_config()
     (device,) = config.devices
     remember(folder / "kept" / FILE_NAME, device.name, time.time())
-    zenoh = msgspec.structs.replace(config.zenoh, mode="none")
-    storage = loading.Storage(folder / "kept", record=False)
+    zenoh = config.zenoh.model_copy(update={"mode": "none"})
+    storage = loading.Storage(folder=folder / "kept", record=False)
     with window() as (port, shoot):
-        viewer = msgspec.structs.replace(config.viewer, mode="native", port=port, history=86_400.0)
+        viewer = config.viewer.model_copy(update={"mode": "native", "port": port, "history": 86_400.0})
         with running(replace(config, zenoh=zenoh, viewer=viewer, storage=storage)) as service:
             until(lambda: fitted(service), 240.0)
             time.sleep(SHOWN_S)
@@ -371,9 +370,9 @@ def effect(out: Path, _: Path) -> Path:
     """The demo, whose sensor has begun to vibrate."""
     path = out / "demo-effect.png"
     config = demo_config(effects=[VIBRATION])
-    zenoh = msgspec.structs.replace(config.zenoh, mode="none")
+    zenoh = config.zenoh.model_copy(update={"mode": "none"})
     with window() as (port, shoot):
-        viewer = msgspec.structs.replace(config.viewer, mode="native", port=port)
+        viewer = config.viewer.model_copy(update={"mode": "native", "port": port})
         with running(replace(config, zenoh=zenoh, viewer=viewer)) as service:
             (sensor,) = [device.link for device in config.devices]
             assert isinstance(sensor, loading.VirtualTable)

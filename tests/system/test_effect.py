@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import msgspec
 import pytest
 from structlog.testing import capture_logs
 
@@ -37,8 +36,9 @@ def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
     assert isinstance(device.link, VirtualTable)
     # messages carry the sensor's own time, so that an event tells when it is by the sensor's clock
     decoder = samples.build(samples.Settings())
-    fast = replace(device, link=msgspec.structs.replace(device.link, speed=SPEED), decoder=decoder)
-    quiet = msgspec.structs.replace(config.zenoh, mode="none"), msgspec.structs.replace(config.viewer, mode="none")
+    link = device.link.model_copy(update={"speed": SPEED})
+    fast = device.model_copy(update={"driver": replace(device.driver, link=link, decoder=decoder)})
+    quiet = config.zenoh.model_copy(update={"mode": "none"}), config.viewer.model_copy(update={"mode": "none"})
     service = Service(replace(config, devices=(fast,), zenoh=quiet[0], viewer=quiet[1]))
     caught = Watching()
     caught.service = service

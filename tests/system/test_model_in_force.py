@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 import zenoh
 
@@ -41,9 +40,10 @@ def watched(zenoh_table: ZenohTable, effects: tuple[str, ...] = (), folder: Path
     config = demo_config(effects=effects, effect_at_s=AT_S)
     (device,) = config.devices
     assert isinstance(device.link, VirtualTable)
-    fast = msgspec.structs.replace(device.link, speed=SPEED)
-    device = replace(device, link=fast, model=MODEL, reconcile_folder=folder)
-    viewer = msgspec.structs.replace(config.viewer, mode="none")
+    fast = device.link.model_copy(update={"speed": SPEED})
+    update = {"driver": replace(device.driver, link=fast), "model": MODEL, "reconcile_folder": folder}
+    device = device.model_copy(update=update)
+    viewer = config.viewer.model_copy(update={"mode": "none"})
     return replace(config, devices=(device,), zenoh=zenoh_table, viewer=viewer)
 
 

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Bytes, Decoder, Timing
 from drivers.decoders.dbc.database import Database
-from drivers.decoders.dbc.join import COLUMNS, Message, Sample, SampleAssembler
-from drivers.decoders.dbc.settings import Settings, SignalSettings
+from drivers.decoders.dbc.join import Message, Sample, SampleAssembler
+from drivers.decoders.dbc.settings import COLUMNS, Settings, SignalSettings
 from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock
 
 __all__ = ["DbcDecoder", "Settings", "SignalSettings", "build"]

@@ -14,15 +14,12 @@ import drivers
 from drivers import file_access, units
 from drivers.decoders.base import ArrivalTiming, CounterTiming, Timing
 from drivers.decoders.dbc.bits import SignalBits
-from drivers.decoders.dbc.join import COLUMNS, Column, Message
-from drivers.decoders.dbc.settings import Settings, SignalSettings
-from drivers.discovery import format_choices, format_suggestion
+from drivers.decoders.dbc.join import Column, Message
+from drivers.decoders.dbc.settings import COLUMNS, TEMPERATURE, Settings, SignalSettings
+from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.extras import check_extra
-from drivers.quantities import describe_range_errors
-from drivers.sample import AXES
 
-TEMPERATURE: Final = "temperature"
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
 SHIPPED_PREFIX: Final = "shipped:"
 MAX_COUNTER_BITS: Final = 62
@@ -45,7 +42,7 @@ class Database:
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
-        self._errors = list(_problems(settings))
+        self._errors: list[str] = []
         self._used: dict[str, Message] = {}
         self._timing: Timing = ArrivalTiming()
         with self._collecting():
@@ -76,7 +73,7 @@ class Database:
         s = self._settings
         for axis, entry in s.signals.items():
             with self._collecting():
-                self._add_axis(axis, _signal_settings(axis, entry))
+                self._add_axis(axis, entry)
         if s.valid:
             with self._collecting():
                 message, signal = self._find_signal("valid", s.valid)
@@ -109,8 +106,6 @@ class Database:
 
     def _add_axis(self, axis: str, entry: SignalSettings) -> None:
         """Find the signal of an axis."""
-        if axis not in COLUMNS:
-            raise ConfigError(f"signals.{axis}: unknown axis{format_choices(axis, COLUMNS)}")
         message, signal = self._find_signal(f"signals.{axis}", entry.signal)
         factor, offset = self._conversion_to_si(axis, entry, signal)
         bits = self._signal_bits(message, signal)
@@ -194,26 +189,6 @@ class Database:
             float(signal.offset),
             indicators=not_available and signal.length >= 8 and not signal.is_signed and not signal.is_float,
         )
-
-
-def _problems(settings: Settings) -> Iterator[str]:
-    """Yield a line for each mistake in the settings that does not depend on the database."""
-    if not settings.signals:
-        yield 'signals: empty; it maps axes to signals: gz = "Message.Signal"'
-    elif set(settings.signals) == {TEMPERATURE}:
-        yield f"signals: no axis but temperature; axes are {', '.join(AXES)}"
-    if settings.join == "counter" and not settings.counter:
-        yield 'counter: missing; join = "counter" needs counter = "Message.Signal"'
-    yield from describe_range_errors(settings)
-
-
-def _signal_settings(axis: str, entry: str | SignalSettings) -> SignalSettings:
-    """Return the settings of a signal from its short or long form."""
-    if isinstance(entry, SignalSettings):
-        return entry
-    if entry.startswith("-"):
-        return SignalSettings(entry[1:], factor=-1.0)
-    return SignalSettings(entry)
 
 
 def _locate(file: str) -> Path:

@@ -26,7 +26,6 @@ from drivers.decoders.dbc.bits import SignalBits
 from drivers.decoders.dbc.settings import Settings
 from drivers.sample import AXES, EXTENDED_ID, NO_TICK
 
-COLUMNS: Final = (*AXES, "temperature")
 PAUSE_HISTORY: Final = 15
 """Number of pauses per message over which the median is computed."""
 MIN_PAUSES: Final = 3

@@ -1,43 +1,85 @@
 """Settings of the ``dbc`` decoder."""
 
-from typing import Annotated, Literal
+from collections.abc import Iterator
+from typing import Annotated, Any, Final, Literal
 
-import msgspec
+from pydantic import BeforeValidator, Field
 
 from drivers.decoders.base import DecoderSettings
-from drivers.discovery import FileOrName
-from drivers.quantities import DELAY_S, SCALE, SOURCE_ADDRESS, TICK_S
+from drivers.errors import ConfigError
+from drivers.quantities import DELAY_S, SCALE, SOURCE_ADDRESS, TICK_S, format_value
+from drivers.sample import AXES
+from drivers.settings_model import Conflict, FileOrName, SettingsModel, one_of
+
+TEMPERATURE: Final = "temperature"
+COLUMNS: Final = (*AXES, TEMPERATURE)
 
 
-class SignalSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class SignalSettings(SettingsModel):
     """Description of one signal, if a name alone is not sufficient."""
 
-    signal: str
-    unit: str = ""
-    """Unit of the signal. If it is absent, the unit of the DBC is used."""
-    factor: Annotated[float, SCALE.meta] = 1.0
-    """Factor that is applied last: a sign, or a correction."""
+    signal: str = Field(examples=["RateOfTurn.RateX"], description='"Message.Signal"')
+    unit: str = Field("", examples=["rad/s"], description="unit of the signal; absent: as the DBC says")
+    factor: Annotated[float, SCALE] = Field(
+        1.0, description="factor that is applied last: a sign, a correction, or the size of a raw count"
+    )
 
 
-class Settings(DecoderSettings, frozen=True, kw_only=True):
+def _signal(value: Any) -> Any:
+    """Return the table of a signal for its short form "Message.Signal" or "-Message.Signal"."""
+    if isinstance(value, str):
+        return {"signal": value.removeprefix("-"), "factor": -1.0 if value.startswith("-") else 1.0}
+    if not isinstance(value, dict | SignalSettings):
+        raise ConfigError(f"expected text in quotes or a table, got {format_value(value)}")
+    return value
+
+
+class Settings(DecoderSettings):
     """Keys of ``[device.driver.decoder_options]`` for a CAN database."""
 
-    file: FileOrName
-    """Path of a DBC file, or name of a shipped database: "j1939_imu", "canmod_gps", "xsens_mti", "bosch_mm7"."""
-    signals: dict[str, str | SignalSettings]
-    """Signal of each axis (gx … az, temperature): "Message.Signal", "-Message.Signal", or a table."""
-    valid: str = ""
-    """Signal that is 1 if the sample is valid."""
-    counter: str = ""
-    """"Message.Signal", or with join = "counter" the name of a signal that every message of a sample contains."""
-    tick: Annotated[float, TICK_S.meta] | None = None
-    """Length of a count in s. If it is absent, the counter counts samples."""
-    join: Literal["time", "counter"] = "time"
-    window: Annotated[float, DELAY_S.meta] = 0.0
-    """Time in s within which the frames of one sample arrive, at most half a sample period; 0 = any."""
-    partial: bool = False
-    j1939: bool | None = None
-    source: Annotated[int, SOURCE_ADDRESS.meta] | None = None
-    """J1939 source address, 0 to 255."""
-    not_available: bool | None = None
-    """True if the J1939 rule for unavailable values is used. If it is absent, the rule is used for J1939 messages."""
+    file: FileOrName = Field(
+        examples=["xsens_mti"],
+        description="path of a DBC file, or j1939_imu, j1939_imu_xyz, canmod_gps, xsens_mti, bosch_mm7",
+    )
+    signals: dict[Annotated[str, one_of(COLUMNS)], Annotated[SignalSettings, BeforeValidator(_signal)]] = Field(
+        examples=[{"gx": "RateOfTurn.RateX", "gy": "-RateOfTurn.RateY", "gz": {"signal": "RateOfTurn.RateZ"}}],
+        description='signal of each axis and of temperature: "Message.Signal", "-Message.Signal", or a table',
+    )
+    valid: str = Field("", examples=["Message.Signal"], description="signal that is 1 if the sample is valid")
+    counter: str = Field(
+        "",
+        examples=["SampleTime.SampleTimeFine"],
+        description='"Message.Signal"; with join = "counter" the name of a signal that every message of a sample has',
+    )
+    tick: Annotated[float, TICK_S] | None = Field(
+        None, examples=[1e-4], description="length of a count in s; absent: the counter counts samples"
+    )
+    join: Literal["time", "counter"] = Field(
+        "time", description="frames that make a sample: frames that arrive together, or frames with equal counts"
+    )
+    window: Annotated[float, DELAY_S] = Field(
+        0.0, description="time in s within which the frames of one sample arrive, at most half a sample period; 0 = any"
+    )
+    partial: bool = Field(
+        False, description="true: keep samples with missing frames; the axes of these frames are not measured"
+    )
+    j1939: bool | None = Field(
+        None, examples=[True], description="messages are identified by their parameter group; absent: as the DBC says"
+    )
+    source: Annotated[int, SOURCE_ADDRESS] | None = Field(
+        None, examples=[128], description="J1939 source address; absent: the first sender that is received"
+    )
+    not_available: bool | None = Field(
+        None,
+        examples=[True],
+        description="values in the top 2/256 of their range are not measured; absent: true for J1939 messages only",
+    )
+
+    def conflicts(self) -> Iterator[Conflict]:
+        """Yield a conflict if no axis is measured, or if samples are joined by a counter that is missing."""
+        if not self.signals:
+            yield Conflict("signals", 'empty; it maps axes to signals: gz = "Message.Signal"')
+        elif set(self.signals) == {TEMPERATURE}:
+            yield Conflict("signals", f"no axis but temperature; axes are {', '.join(AXES)}")
+        if self.join == "counter" and not self.counter:
+            yield Conflict("counter", 'missing; join = "counter" needs counter = "Message.Signal"', ("join",))

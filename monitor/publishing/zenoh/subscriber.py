@@ -317,7 +317,7 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
     """
     import zenoh
 
-    if file is not None and (line := file_permissions.changeable(file)):
+    if file is not None and (line := file_permissions.describe_write_access(file)):
         raise ConfigError(f"{file}: {line}")
     try:
         theirs = endpoints(configuration({}, file))

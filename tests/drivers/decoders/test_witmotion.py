@@ -8,6 +8,7 @@ import pytest
 from drivers.decoders.witmotion import Settings, build, encode_packet
 from drivers.errors import ConfigError
 from drivers.sample import ArrivalTiming, Chunk, SampleBlock, concatenate_blocks, make_block
+from drivers.settings_model import read_settings
 
 DEGREE, G = math.pi / 180.0, 9.80665
 ACCEL = bytes.fromhex("55 51 0A 00 EC FF 00 08 D0 09 7C")
@@ -131,4 +132,4 @@ def test_bluetooth_a_missing_byte_costs_one_sample() -> None:
 @pytest.mark.parametrize("key", ["accelerometer_range", "gyro_range"])
 def test_a_range_that_is_none(key: str) -> None:
     with pytest.raises(ConfigError, match=key):
-        build(Settings(**{key: 0.0}))
+        build(read_settings(Settings, {key: 0.0}))

@@ -16,7 +16,6 @@ from types import SimpleNamespace
 from typing import Any
 
 import can
-import msgspec
 import numpy as np
 import pytest
 
@@ -25,12 +24,13 @@ from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links import can_link
 from drivers.links.can_link import CanLink
 from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk, concatenate_blocks
+from drivers.settings_model import read_settings
 
 UNIQUE = itertools.count()
 
 
 def build(**keys: Any) -> CanLink:
-    link = can_link.build(msgspec.convert(keys, can_link.Settings))
+    link = can_link.build(read_settings(can_link.Settings, keys))
     assert isinstance(link, CanLink)
     return link
 
@@ -307,7 +307,7 @@ def test_an_adapter_that_garbles_a_line_goes_on() -> None:
 def test_from_the_bus_to_samples(peer: can.BusABC, channel: str) -> None:
     axes = {"gx": "RollRate", "gy": "PitchRate", "gz": "YawRate"}
     signals = {axis: f"AngularRateInformation.{name}" for axis, name in axes.items()}
-    decoder = dbc.build(msgspec.convert({"file": "j1939_imu", "signals": signals}, dbc.Settings))
+    decoder = dbc.build(read_settings(dbc.Settings, {"file": "j1939_imu", "signals": signals}))
     assert isinstance(decoder, dbc.DbcDecoder)
     link = build(interface="virtual", channel=channel)
     link.accept(decoder.addresses)

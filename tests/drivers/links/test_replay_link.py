@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import can
-import msgspec
 import numpy as np
 import pytest
 
@@ -15,12 +14,13 @@ from drivers.links import base, replay_link
 from drivers.links.base import Link
 from drivers.recordings import load_samples
 from drivers.sample import EXTENDED_ID, Chunk, concatenate_blocks
+from drivers.settings_model import read_settings
 
 FRAMES = [(0x9, False, bytes(range(8))), (0x0CF02AE2, True, b"\x00\x7d\x00\x7d\x00\x7d\x00\x05")] * 20
 
 
 def build(path: Path, speed: str | float = "max", **keys: Any) -> Link:
-    return replay_link.build(msgspec.convert({"path": str(path), "speed": speed, **keys}, replay_link.Settings))
+    return replay_link.build(read_settings(replay_link.Settings, {"path": str(path), "speed": speed, **keys}))
 
 
 def read_all(link: Link) -> tuple[list[Chunk], str]:

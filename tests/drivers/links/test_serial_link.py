@@ -10,18 +10,18 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 import serial
 
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links import serial_link
 from drivers.links.base import Link
+from drivers.settings_model import read_settings
 from tests.support.waiting import FOREVER_S, wait_for
 
 
 def build(**keys: Any) -> Link:
-    return serial_link.build(msgspec.convert(keys, serial_link.Settings))
+    return serial_link.build(read_settings(serial_link.Settings, keys))
 
 
 @pytest.fixture

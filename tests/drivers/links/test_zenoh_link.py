@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import pytest
 import zenoh
 
@@ -17,6 +16,7 @@ from drivers.errors import ConfigError, LinkUnavailable
 from drivers.links import zenoh_link
 from drivers.links.base import Link
 from drivers.sample import Chunk
+from drivers.settings_model import read_settings
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.zenoh_sessions import router as open_router
@@ -24,7 +24,7 @@ from tests.support.zenoh_sessions import session
 
 
 def build(**keys: Any) -> Link:
-    return zenoh_link.build(msgspec.convert(keys, zenoh_link.Settings))
+    return zenoh_link.build(read_settings(zenoh_link.Settings, keys))
 
 
 @pytest.fixture
@@ -115,7 +115,7 @@ def test_long_messages_that_nobody_reads_give_way(router: Any, endpoint: str) ->
 
 
 def configured(**keys: Any) -> Any:
-    return zenoh_link._configuration(msgspec.convert({"key": "k", **keys}, zenoh_link.Settings))
+    return zenoh_link._configuration(read_settings(zenoh_link.Settings, {"key": "k", **keys}))
 
 
 def test_a_session_starts_closed() -> None:

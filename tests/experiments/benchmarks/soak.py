@@ -143,7 +143,8 @@ def main() -> None:
         path.write_text(CONFIG.format(rate=wanted.rate, folder=Path(folder) / "store", keep=wanted.keep))
         wire = Wire(wanted.rate, round(wanted.days * 86400 * wanted.rate))
         config = loading.load(path)
-        device = dataclasses.replace(config.devices[0], link=wire)
+        (one,) = config.devices
+        device = one.model_copy(update={"driver": dataclasses.replace(one.driver, link=wire)})
         service = Service(dataclasses.replace(config, devices=(device,)))
         course, begun = Course(), time.monotonic()
         done = threading.Event()

@@ -243,7 +243,7 @@ def test_a_rate_that_is_not_configured_leaves_the_disk_unjudged(tmp_path: Path) 
 
 
 def test_room_is_judged_by_days(tmp_path: Path) -> None:
-    own = Storage(tmp_path, keep_s=30 * 86400.0, disk_share=0.9)
+    own = Storage(folder=tmp_path, keep_s=30 * 86400.0, disk_share=0.9)
     marks = [
         disk_space(own, 1e9, 100_000_000_000, free)[0] for free in (90_000_000_000, 25_000_000_000, 10_500_000_000)
     ]

@@ -4,21 +4,20 @@ import threading
 import time
 from dataclasses import replace
 
-import msgspec
 import numpy as np
 import pytest
 
 from drivers.decoders import dbc, samples, text, vectornav_binary
-from drivers.driver import AxisMap
 from drivers.errors import ConfigError
 from drivers.links import replay_link
 from drivers.sample import concatenate_blocks, make_block
+from drivers.settings_model import read_settings
 from monitor.daemon import device_worker
 from monitor.daemon.device_worker import DeviceWorker
 from monitor.daemon.pipeline import KernelReadiness
 from monitor.estimation.fit.coefficients import Status
 from monitor.settings import loading as settings
-from monitor.settings.loading import Device
+from monitor.settings.loading import Device, Driver
 from tests.support.loopback_link import LoopbackLink
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -82,17 +81,14 @@ class Rig:
     ):
         decoder = decoder or vectornav_binary.build(vectornav_binary.Settings())
         self.link = link or LoopbackLink()
-        device = Device(
-            "bench",
-            rate,
-            window_s,
-            tau,
-            refit_s,
-            publish_s,
-            self.link,
-            decoder,
-            AxisMap(),
-            0.0,
+        device = Device.model_construct(
+            name="bench",
+            rate_hz=rate,
+            window_s=window_s,
+            tau=tau,
+            refit_s=refit_s,
+            publish_s=publish_s,
+            driver=Driver(self.link, decoder, silence_s=0.0),
             model=model,
             thermal_s=thermal_s,
             compensate=compensate,
@@ -145,7 +141,7 @@ def test_drained_everything_is_out_and_the_estimate_covers_it():
 def test_a_running_device_whose_can_frames_are_late_says_so():
     signals = {"gz": "AngularRateInformation.YawRate", "az": "AccelerationSensor.VerticalAcceleration"}
     settings = {"file": "j1939_imu", "signals": signals, "window": 0.005}
-    decoder = dbc.build(msgspec.convert(settings, dbc.Settings))
+    decoder = dbc.build(read_settings(dbc.Settings, settings))
     rig = Rig(rate=50.0, decoder=decoder)
     sent = decoder.encode(make_block(np.arange(50) * 20_000_000, np.ones((50, 6))))
     for i, chunk in enumerate(sent):

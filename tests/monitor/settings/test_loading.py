@@ -1,39 +1,27 @@
 """Everything wrong with a file is told, each with its key and what would be right; what is shipped is right."""
 
-import itertools
 import json
-import re
-import tomllib
-from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import pytest
 
 import drivers.decoders
 import drivers.links
 from drivers import discovery
-from drivers.decoders.dbc.settings import SignalSettings
 from drivers.decoders.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
-from monitor.commands.check import check
 from monitor.common.config_files import CONFIG_FOLDER, model_path
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH
 from monitor.settings.loading import (
     WINDOW_SAMPLES,
-    DeviceTable,
-    LogTable,
-    ViewerTable,
     VirtualTable,
-    ZenohTable,
+    check_viewer_mode,
     load,
     period,
     read,
     seconds,
-    viewer_mode,
 )
-from monitor.settings.schema import FaultsTable, FileTable, HookTable, LimitTable, MetricsTable, StorageTable
 
 DRIVER = 'driver = { link = "serial", port = "/dev/null", decoder = "vectornav_ascii" }'
 
@@ -74,7 +62,7 @@ CASES = {
     ),
     "limit of no letter": (
         device() + LIMIT + 'axes = "gz"\nletter = "X"\nabove = 1.0',
-        ['device a: limit[0].letter: "X"; possible are B, K, N, Q, R'],
+        ['device a: limit[0].letter: "X"; possible are Q, N, B, K, R'],
     ),
     "limit without a letter": (
         device() + LIMIT + 'axes = "gz"\nabove = 1.0',
@@ -82,15 +70,15 @@ CASES = {
     ),
     "limit relative to nothing": (
         device() + LIMIT + 'axes = "gz"\nletter = "N"\ntimes_model = 1.5',
-        ["device a: limit[0].times_model: the device has no model to be relative to; add model"],
+        ["device a: limit[0].times_model: the device has no model in force; add model"],
     ),
     "limit said twice": (
         device('model = "consumer-mems"') + LIMIT + 'axes = "gz"\nletter = "N"\ntimes_model = 1.5\nabove = 1.0',
-        ["device a: limit[0]: above and times_model are two words for one bound; leave one out"],
+        ["device a: limit[0]: above and times_model are the same bound; leave one out"],
     ),
     "limits that cross": (
         device() + LIMIT + 'axes = "gz"\nletter = "N"\nbelow = 2.0\nabove = 1.0',
-        ["device a: limit[0]: below 2 is not under above 1: nothing lies between"],
+        ["device a: limit[0]: below 2 must be less than above 1"],
     ),
     "limit held for nothing": (
         device() + LIMIT + 'axes = "gz"\nletter = "N"\nabove = 1.0\nhold = "often"',
@@ -102,7 +90,7 @@ CASES = {
     ),
     "hook on what never happens": (
         device() + HOOK + 'on = ["limit_cross"]\nkey = "x"',
-        ['hook[0].on: "limit_cross"; possible are limit_crossed, limit_back, '],
+        ['hook[0].on[0]: "limit_cross"; possible are limit_crossed, limit_back, '],
     ),
     "hook of no device": (
         device() + HOOK + 'on = ["*"]\ndevices = ["b"]\nkey = "x"',
@@ -124,13 +112,13 @@ CASES = {
     ),
     "hook without zenoh": (
         device() + HOOK + 'on = ["*"]\nkey = "x"\n[zenoh]\nmode = "none"',
-        ['hook[0].key: zenoh.mode is "none", so nothing can be put there'],
+        ['hook[0].key: zenoh.mode is "none", so the message cannot be published'],
     ),
     "metrics nowhere": (
         device() + '[metrics]\nlisten = "9464"',
         ['metrics.listen: "9464" is no host and port; write "127.0.0.1:9464"'],
     ),
-    "unknown key": (device("windw = 60.0"), ['device[0].windw: unknown key; did you mean "window"?']),
+    "unknown key": (device("windw = 60.0"), ['device a: windw: unknown key; did you mean "window"?']),
     "unknown table": ("[zenho]\n" + device(), ['zenho: unknown key; did you mean "zenoh"?']),
     "unknown key of zenoh": (
         device() + '[zenoh]\nlisten_to = ["x"]',
@@ -148,13 +136,13 @@ CASES = {
     ),
     "wrong type": (
         device('rate = "fast"'),
-        ["device[0].rate: expected a number from 0.001 Hz to 1 MHz, or nothing, got"],
+        ['device a: rate: expected a number from 0.001 Hz to 1 MHz, got "fast"'],
     ),
-    "rate not above 0": (device("rate = 0"), ["device[0].rate: 0 Hz is outside the supported range 0.001 Hz to 1 MHz"]),
-    "rate not a number": (device("rate = nan"), ["device[0].rate: nan Hz is outside the supported range"]),
-    "rate without end": (device("rate = inf"), ["device[0].rate: inf Hz is outside the supported range"]),
+    "rate not above 0": (device("rate = 0"), ["device a: rate: 0 Hz is outside the supported range 0.001 Hz to 1 MHz"]),
+    "rate not a number": (device("rate = nan"), ["device a: rate: nan Hz is outside the supported range"]),
+    "rate without end": (device("rate = inf"), ["device a: rate: inf Hz is outside the supported range"]),
     "name missing": (f"[[device]]\n{DRIVER}", ["device[0].name: missing"]),
-    "driver missing": ('[[device]]\nname = "a"', ["device[0].driver: missing"]),
+    "driver missing": ('[[device]]\nname = "a"', ["device a: driver: missing"]),
     "no device": ("", ["device: there is none"]),
     "two of one name": (device() + device(), ['2 devices are named "a"; names must be unique']),
     "impossible name": (device(name="a/b"), ['device[0].name: "a/b"; letters']),
@@ -182,7 +170,7 @@ CASES = {
     ),
     "decoder that does not fit": (
         device(driver='driver = { link = "serial", port = "x", decoder = "ros2_imu" }'),
-        ["device a: driver.decoder: ros2_imu reads messages, link serial brings bytes: "],
+        ["device a: driver.decoder: ros2_imu reads messages, link serial provides bytes: possible are"],
     ),
     "options that are no table": (
         device(driver='driver = { link = "serial", port = "x", decoder = "text", decoder_options = 3 }'),
@@ -209,11 +197,11 @@ CASES = {
     "window without end": (device("window = inf"), ["window"]),
     "unknown tau": (
         device('tau = "octaves"'),
-        ['tau: "octaves"; possible are octave, decade10, or a list of num'],
+        ['tau: expected "octave", "decade10" or a list, got "octaves"'],
     ),
     "tau not above 0": (
         device("tau = [1.0, -1.0]"),
-        ["device[0].tau[1]: -1 s is outside the supported range 1 µs to 36525 d"],
+        ["device a: tau[1]: -1 s is outside the supported range 1 µs to 36525 d"],
     ),
     "impossible tau": (device("rate = 100\nwindow = 60\ntau = [100.0]"), ["device a: tau: none of [100.0] s lies"]),
     "no tau at all": (device("rate = 100\ntau = []"), ["device a: tau: "]),
@@ -263,13 +251,13 @@ CASES = {
     ),
     "viewer's history": (
         device() + '[viewer]\nhistory = "soon"',
-        ["viewer.history: none is kept; [storage] folder", 'viewer.history: "soon" is no duration'],
+        ['viewer.history: "soon" is no duration'],
     ),
     "viewer's memory": (device() + "[viewer]\nmemory = 3", ["viewer.memory: expected text in quotes, got 3"]),
     "zenoh's mode": (device() + '[zenoh]\nmode = "pear"', ['zenoh.mode: "pear"; possible are peer, ']),
     "zenoh's prefix": (device() + '[zenoh]\nprefix = "a/*"', ["zenoh.prefix: "]),
     "log": (device() + '[log]\nlevel = "loud"', ['log.level: "loud"; possible are info, debug, error, warning']),
-    "a device that is no table": ("device = 3", ["device: expected a list of tables, got 3"]),
+    "a device that is no table": ("device = 3", ["device: expected a list, got 3"]),
     "not TOML": ("[[device]\n", ["not TOML: "]),
 }
 
@@ -484,17 +472,17 @@ key = "##"
 hold = "often"
 """
     places = [
-        "device[0].rat",
+        "device[0].rat:",
         "device[0].name",
-        "device[0]: driver.port: missing",
-        "device[0]: driver.baudrate",
-        "device[0]: driver.decoder_options.header",
-        "device[0]: driver.decoder_options.columns: missing",
-        "device[0]: driver.decoder_options.gyro_unit",
+        "device[0].driver.port: missing",
+        "device[0].driver.baudrate",
+        "device[0].driver.decoder_options.header",
+        "device[0].driver.decoder_options.columns: missing",
+        "device[0].driver.decoder_options.gyro_unit",
         'device b: driver.link: "cam"; possible are can, ',
         "device b: driver.decoder_options.rate",
-        "device[2].windw",
-        "device[2].driver: missing",
+        "device c: windw",
+        "device c: driver: missing",
         "device c: limit[0].axes: missing",
         "device c: limit[0].letter: missing",
         "device c: limit[0].hold",
@@ -542,165 +530,6 @@ def test_examples_are_right(path):
     config, lines = read(path)
     assert [line for line in lines if "no such file" not in line] == []
     assert config is not None or lines
-
-
-HEADER = re.compile(r"(# )?(\[\[?)([\w.]+)\]\]? *(.*)")
-KEY = re.compile(r"(# )?(\w+) = (.*)")
-NOTHING = (None, "", (), [], {})
-"""Defaults that say nothing: the printed file has an example instead."""
-
-
-@dataclass
-class Printed:
-    """One table of the printed defaults."""
-
-    name: str  # "device.driver"
-    about: str  # what its header's comment says
-    commented: bool
-    keys: dict[str, object]
-    lines: list[str]  # without the marks of a comment
-
-
-def printed():
-    tables = [Printed("", "", False, {}, [])]
-    for line in (CONFIG_FOLDER / "defaults.toml").read_text("utf-8").splitlines():
-        if found := HEADER.fullmatch(line):
-            tables.append(Printed(found[3], found[4], found[1] is not None, {}, [line.removeprefix("# ")]))
-        elif found := KEY.fullmatch(line):
-            tables[-1].keys |= tomllib.loads(f"{found[2]} = {found[3]}")
-            tables[-1].lines.append(line.removeprefix("# "))
-            assert re.search(r" # \S.+", found[3]), f"no comment: {line}"
-    return tables
-
-
-def driver_of(link):
-    (table,) = [one for one in printed() if one.name == "device.driver" and one.keys["link"] == link]
-    return table
-
-
-def options_of(decoder):
-    """The tables of a decoder's options."""
-    tables = printed()
-    said = f'decoder = "{decoder}"'
-    (first,) = [i for i, one in enumerate(tables) if one.name == "device.driver.decoder_options" and said in one.about]
-    behind = itertools.takewhile(lambda one: one.name.startswith("device.driver.decoder_options."), tables[first + 1 :])
-    return [tables[first], *behind]
-
-
-def stands_whole(table, kind, own=()):
-    """Every key stands there, with its default where that says something; and no key that there is not."""
-    fields = {field.encode_name: field for field in msgspec.structs.fields(kind) if field.encode_name not in own}
-    assert table.keys.keys() - set(own) == fields.keys()
-    for name, field in fields.items():
-        default = field.default if field.default_factory is msgspec.NODEFAULT else field.default_factory()
-        if field.required:
-            assert any(line.startswith(f"{name} = ") and "# no default; " in line for line in table.lines), name
-        elif default not in NOTHING:
-            value = table.keys[name]
-            assert (tuple(value) if isinstance(default, tuple) else value) == default, name
-
-
-TABLES = {
-    "device": (DeviceTable, ("driver", "axes", "limit")),
-    "device.limit": (LimitTable, ()),
-    "device.driver.faults": (FaultsTable, ()),
-    "device.driver.decoder_options.signals.gz": (SignalSettings, ()),
-    "zenoh": (ZenohTable, ()),
-    "viewer": (ViewerTable, ()),
-    "storage": (StorageTable, ()),
-    "hook": (HookTable, ()),
-    "metrics": (MetricsTable, ()),
-    "log": (LogTable, ()),
-}
-LINKS = sorted({*discovery.list_modules(drivers.links, "_link"), "virtual"})
-WITH_KEYS = [
-    name
-    for name in discovery.list_modules(drivers.decoders)
-    if msgspec.structs.fields(discovery.import_module(drivers.decoders, name).Settings)
-]
-
-
-@pytest.mark.parametrize("name", TABLES)
-def test_the_printed_defaults_have_every_key_of_a_table(name):
-    (table,) = [one for one in printed() if one.name == name]
-    kind, own = TABLES[name]
-    stands_whole(table, kind, own)
-
-
-@pytest.mark.parametrize("link", LINKS)
-def test_the_printed_defaults_have_every_key_of_every_link(link):
-    kind = VirtualTable if link == "virtual" else discovery.import_module(drivers.links, link, "_link").Settings
-    table = driver_of(link)
-    keys = dict(table.keys)
-    if link == "virtual":
-        table.keys = {**keys, "faults": {}}  # a table of its own
-        stands_whole(table, kind, ("link", "decoder", "faults"))
-    else:
-        stands_whole(table, kind, ("link", "decoder"))
-    assert {"link", "decoder"} <= keys.keys()
-
-
-@pytest.mark.parametrize("decoder", WITH_KEYS)
-def test_the_printed_defaults_have_every_key_of_every_decoder(decoder):
-    first, *others = options_of(decoder)
-    first.keys |= {one.name.split(".")[3]: one.keys for one in others}
-    first.lines += [f"{one.name.split('.')[3]} = # {one.about.removeprefix('# ')}" for one in others]
-    stands_whole(first, discovery.import_module(drivers.decoders, decoder).Settings)
-
-
-def test_the_printed_defaults_have_every_table():
-    names = {one.name.split(".")[0] for one in printed()} - {""}
-    assert names == {field.encode_name for field in msgspec.structs.fields(FileTable)}
-    assert set(TABLES) - {one.name for one in printed()} == set()
-    says_so = "ros2_imu and samples (messages) have no keys" in (CONFIG_FOLDER / "defaults.toml").read_text("utf-8")
-    assert set(discovery.list_modules(drivers.decoders)) - set(WITH_KEYS) == {"ros2_imu", "samples"}
-    assert says_so
-
-
-def checks_well(folder, text):
-    """The lines of a table that is commented out are right where the mark of a comment is taken away."""
-    (folder / "recording.csv").write_text("t,gz\n0.00,0.1\n0.01,0.2\n")
-    (folder / "zenoh.json5").write_text("{}")
-    (folder / "my.toml").write_text(f'[[device]]\nname = "a"\nmodel = "consumer-mems"\n{text}\n', "utf-8")
-    config, lines = check(folder / "my.toml")
-    assert lines == []
-    assert config is not None
-
-
-@pytest.mark.parametrize("link", LINKS)
-def test_the_printed_table_of_a_link_passes_the_check(tmp_path, link):
-    lines = driver_of(link).lines
-    if driver_of(link).keys["decoder"] == "dbc":
-        lines += [line for one in options_of("dbc") for line in one.lines if not line.startswith("valid = ")]
-    if link == "virtual":
-        lines += [line for one in printed() if one.name == "device.driver.faults" for line in one.lines]
-    checks_well(tmp_path, "\n".join(lines))
-
-
-@pytest.mark.parametrize("decoder", WITH_KEYS)
-def test_the_printed_table_of_a_decoder_passes_the_check(tmp_path, decoder):
-    # no shipped database that has a counter has such a signal too
-    lines = [line for one in options_of(decoder) for line in one.lines if not line.startswith("valid = ")]
-    driver = f'[device.driver]\nlink = "virtual"\ndecoder = "{decoder}"\n'
-    checks_well(tmp_path, driver + "\n".join(lines))
-
-
-@pytest.mark.parametrize("name", ["device.limit", "hook"])
-def test_the_printed_tables_that_may_stand_several_times_pass_the_check(tmp_path, name):
-    (program,) = re.findall(r'command = \["([^"]+)"', (CONFIG_FOLDER / "defaults.toml").read_text("utf-8"))
-    (table,) = [one for one in printed() if one.name == name]
-    (tmp_path / "tell").write_text("#!/bin/sh\n")
-    (tmp_path / "tell").chmod(0o755)
-    text = "\n".join(table.lines).replace(program, "./tell").replace('"bench-1"', '"a"')
-    text = "\n".join(line for line in text.splitlines() if not line.startswith("times_model"))  # instead of above
-    checks_well(tmp_path, f"{DRIVER}\n{text}")
-
-
-def test_the_printed_defaults_pass_the_check():
-    config, lines = check(CONFIG_FOLDER / "defaults.toml")
-    assert lines == []
-    assert config is not None
-    assert config.devices[0].axes == AxisMap()
 
 
 def test_every_link_can_be_named():
@@ -753,18 +582,15 @@ def test_the_viewer_opens_on_so_much_of_what_is_kept(tmp_path):
     path.write_text(device() + '[viewer]\nhistory = "12h"\n[storage]\nfolder = "kept"\n')
     assert load(path).viewer.history == 43_200.0
     path.write_text(device() + '[viewer]\nhistory = "12h"\n[storage]\nfolder = "kept"\nhistory = false\n')
-    with pytest.raises(ConfigError, match="none is kept"):
+    with pytest.raises(ConfigError, match="there is no history to show"):
         load(path)
 
 
 def test_viewer_modes():
-    assert [viewer_mode(mode) for mode in ("auto", "native", "web", "none", "a.rrd")] == [
-        "auto",
-        "native",
-        "web",
-        "none",
-        "a.rrd",
-    ]
+    for mode in ("auto", "native", "web", "none", "a.rrd"):
+        check_viewer_mode(mode)
+    with pytest.raises(ConfigError, match='"nativ"; possible are native, '):
+        check_viewer_mode("nativ")
 
 
 def test_virtual_model_may_be_a_file_beside_the_configuration(tmp_path):
@@ -812,10 +638,13 @@ def test_the_interval_that_is_held_against_temperature(tmp_path, text, found):
 @pytest.mark.parametrize(
     ("text", "says"),
     [
-        ('thermal_interval = "none"', 'thermal_interval: "none" is neither a duration nor "off"'),
-        ("rate = 10.0\nthermal_interval = 0.5", "thermal_interval: 0.5 s; possible are 0.8 s (8 samples) to 86400 s"),
-        ('thermal_interval = "2d"', "thermal_interval: 172800 s; possible are 8 samples to 86400 s"),
-        ("thermal_interval = -3", "thermal_interval: -3 s is outside the supported range 1 µs to 36525 d"),
+        (
+            'thermal_interval = "none"',
+            'thermal_interval: "none" is no duration; write seconds, or "90s", "30min", "1h", "2d", or "off"',
+        ),
+        ("rate = 10.0\nthermal_interval = 0.5", "thermal_interval: 0.5 s; possible are 0.8 s (8 samples) to 1 d"),
+        ('thermal_interval = "2d"', "thermal_interval: 2 d is outside the supported range 1 µs to 1 d"),
+        ("thermal_interval = -3", "thermal_interval: -3 s is outside the supported range 1 µs to 1 d"),
     ],
 )
 def test_an_interval_that_cannot_be_says_why(tmp_path, text, says):

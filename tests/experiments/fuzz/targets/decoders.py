@@ -23,6 +23,7 @@ from drivers.decoders.dbc import DbcDecoder
 from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import Database
 from drivers.sample import AXES, EXTENDED_ID, NO_TICK, Chunk, CounterTiming, SampleBlock, make_block
+from drivers.settings_model import read_settings
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, EXAMPLES, NAMES, Example
 from tests.experiments.fuzz.checks import fed, seen
@@ -63,7 +64,7 @@ def samples_of(data: bytes, decoder: Decoder) -> SampleBlock:
 def _settings(name: str, i: int) -> Any:
     example = _examples(name)[i]
     module = importlib.import_module(f"drivers.decoders.{name}")
-    return module.build, msgspec.convert(dict(example.settings), module.Settings)
+    return module.build, read_settings(module.Settings, dict(example.settings))
 
 
 @cache
@@ -221,7 +222,7 @@ def _can(i: int) -> tuple[Any, DbcSettings, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.dbc"
         path.write_text(text or "")
-        settings = msgspec.convert({"file": str(path) if text else file, **keys}, DbcSettings)
+        settings = read_settings(DbcSettings, {"file": str(path) if text else file, **keys})
         database = Database(settings)
         return database.messages(), settings, database.timing()
 

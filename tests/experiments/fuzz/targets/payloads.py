@@ -227,7 +227,12 @@ def rate(data: bytes) -> None:
 def command_line(data: bytes) -> None:
     """Arguments that are more than a word."""
     text = _text(data)
-    for read in (options.tau, options.order, loading.viewer_mode, lambda word: options.duration("--window", word)):
+    for read in (
+        options.tau,
+        options.order,
+        loading.check_viewer_mode,
+        lambda word: options.duration("--window", word),
+    ):
         try:
             possible(read(text))
         except ConfigError as error:

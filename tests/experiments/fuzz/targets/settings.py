@@ -13,11 +13,10 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
-import msgspec
-
 from drivers.decoders import dbc
 from drivers.errors import ConfigError
 from drivers.sample import Chunk
+from drivers.settings_model import SettingsModel, read_settings
 from monitor.common import config_files
 from monitor.noise import model_file
 from monitor.noise.catalogue import read_model
@@ -140,8 +139,8 @@ def possible(value: Any) -> None:
     elif isinstance(value, Mapping):
         for one in value.values():
             possible(one)
-    elif isinstance(value, msgspec.Struct):
-        for name in value.__struct_fields__:
+    elif isinstance(value, SettingsModel):
+        for name in type(value).model_fields:
             possible(getattr(value, name))
     elif is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
@@ -319,7 +318,7 @@ def database(data: bytes) -> None:
     path.write_bytes(data)
     signals = CAN_SIGNALS if b"RateOfTurn" in data else SECOND_SIGNALS
     try:
-        decoder = dbc.build(msgspec.convert({"file": str(path), "signals": signals}, dbc.Settings))
+        decoder = dbc.build(read_settings(dbc.Settings, {"file": str(path), "signals": signals}))
     except ConfigError as error:
         one_line(error)
         return

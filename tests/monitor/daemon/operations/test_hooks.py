@@ -27,7 +27,9 @@ def program(folder: Path, text: str, name: str = "tell") -> str:
 def hook(
     *command: str, timeout_s: float = PATIENCE_S, on: str = "*", devices: tuple[str, ...] = (), key: str = ""
 ) -> Hook:
-    return Hook(frozenset({on}), frozenset(devices), command, key or None, timeout_s)
+    return Hook.model_construct(
+        on=frozenset({on}), devices=frozenset(devices), command=command, key=key or None, timeout_s=timeout_s
+    )
 
 
 class Running:

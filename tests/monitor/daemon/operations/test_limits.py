@@ -18,8 +18,8 @@ from monitor.settings.loading import Limit
 from tests.monitor.publishing.made import estimate as made
 
 RATE_HZ = 100.0
-N_ABOVE = Limit(("gz",), "N", 2e-4, None, None, 60.0)
-N_BELOW = Limit(("gz",), "N", None, 1e-4, None, 60.0)
+N_ABOVE = Limit(axes=("gz",), letter="N", above=2e-4, hold_s=60.0)
+N_BELOW = Limit(axes=("gz",), letter="N", below=1e-4, hold_s=60.0)
 
 
 def look(
@@ -112,7 +112,7 @@ def test_an_upper_bound_is_back_only_when_it_is_under_the_limit_itself() -> None
 
 def test_a_limit_relative_to_the_model_is_that_many_times_its_size() -> None:
     model = NoiseModel.from_toml('sample_rate = 100.0\n["g*".angle_random_walk]\nN = 1.0e-4')
-    relative = Limit(("gx", "gz"), "N", None, None, 1.5, 1.0)
+    relative = Limit(axes=("gx", "gz"), letter="N", times_model=1.5, hold_s=1.0)
     assert [(b.axis, b.limit, b.upper) for b in make_bounds([relative], model)] == [
         ("gx", pytest.approx(1.5e-4), True),
         ("gz", pytest.approx(1.5e-4), True),
@@ -120,9 +120,9 @@ def test_a_limit_relative_to_the_model_is_that_many_times_its_size() -> None:
     ((_, event),) = told(LimitMonitor([relative], model), [(float(t), 1.6e-4) for t in range(2)])
     assert event.text.endswith("its upper limit (1.5 times its model)")
     with pytest.raises(ConfigError, match=r"limit of K: times_model = 2, but the model in force has no K on gz"):
-        LimitMonitor([Limit(("gz",), "K", None, None, 2.0, 1.0)], model)
+        LimitMonitor([Limit(axes=("gz",), letter="K", times_model=2.0, hold_s=1.0)], model)
     with pytest.raises(ConfigError, match="no N on ax"):
-        LimitMonitor([Limit(AXES, "N", None, None, 2.0, 1.0)], model)
+        LimitMonitor([Limit(axes=AXES, letter="N", times_model=2.0, hold_s=1.0)], model)
 
 
 def test_new_limits_go_on_where_the_old_ones_were() -> None:

@@ -22,7 +22,7 @@ from monitor.daemon.device_worker import DeviceWorker
 from monitor.daemon.pipeline import KernelReadiness
 from monitor.daemon.storage import recorder as room
 from monitor.daemon.storage.recorder import Recorder, origin
-from monitor.settings.loading import Device, Storage
+from monitor.settings.loading import Device, Driver, Storage
 from tests.support.loopback_link import LoopbackLink
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -56,7 +56,7 @@ def _brisk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_value_counter_and_hole_comes_back(tmp_path: Path) -> None:
-    keeper = Recorder(Storage(tmp_path, segment_s=3.0), [SAMPLES])
+    keeper = Recorder(Storage(folder=tmp_path, segment_s=3.0), [SAMPLES])
     keeper.set_state("bench", DaemonState(RATE, (None, None, 5.0, None, None, None), 1.0))
     keeper.start()
     given = [rows(0, 150), rows(160, 150, lost=10), rows(310, 1), rows(311, 700)]
@@ -79,7 +79,7 @@ def test_every_value_counter_and_hole_comes_back(tmp_path: Path) -> None:
 
 
 def test_segments_that_have_ended_are_packed_and_say_the_same(tmp_path: Path) -> None:
-    keeper = Recorder(Storage(tmp_path, segment_s=5.0), [SAMPLES])
+    keeper = Recorder(Storage(folder=tmp_path, segment_s=5.0), [SAMPLES])
     keeper.start()
     given = [rows(first, 20) for first in range(0, 2000, 20)]
     for one in given:
@@ -97,7 +97,7 @@ def test_segments_that_have_ended_are_packed_and_say_the_same(tmp_path: Path) ->
 
 def test_raw_bytes_come_back_as_chunks(tmp_path: Path) -> None:
     of = SegmentMetadata("bench", "raw", carrier="bytes", decoder="text")
-    keeper = Recorder(Storage(tmp_path), [of])
+    keeper = Recorder(Storage(folder=tmp_path), [of])
     keeper.start()
     given = [Chunk(bytes([i] * (i + 1)), 1000 + i, address=i, attachment=b"a" * (i % 3)) for i in range(50)]
     keeper.chunks("bench", given, offset_ns=START_NS)
@@ -189,7 +189,7 @@ def disk():
 
 @pytest.mark.parametrize("why", [errno.ENOSPC, errno.EROFS, errno.EIO])
 def test_a_disk_that_fails_stops_the_recording_with_an_event_until_it_can_go_on(tmp_path, disk, why: int) -> None:
-    keeper = Recorder(Storage(tmp_path), [SAMPLES], Broken)
+    keeper = Recorder(Storage(folder=tmp_path), [SAMPLES], Broken)
     keeper.start()
     keeper.samples("bench", rows(0, 100), 0)
     wait_for(lambda: len(written(tmp_path / "bench")) == 1)
@@ -213,7 +213,7 @@ def test_a_disk_that_fails_stops_the_recording_with_an_event_until_it_can_go_on(
 
 def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, monkeypatch) -> None:
     monkeypatch.setattr(room, "MAX_QUEUE_BYTES", 500 * room.SAMPLE_BYTES)
-    keeper = Recorder(Storage(tmp_path), [SAMPLES], Broken)
+    keeper = Recorder(Storage(folder=tmp_path), [SAMPLES], Broken)
     keeper.start()
     for first in range(0, 20_000, 2000):
         disk.released.clear()
@@ -274,7 +274,7 @@ def test_the_oldest_of_all_devices_go_while_the_disk_is_too_full(tmp_path: Path,
 
 def test_a_disk_that_others_have_filled_stops_the_recording(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.95)
-    keeper = Recorder(Storage(tmp_path), [SAMPLES])
+    keeper = Recorder(Storage(folder=tmp_path), [SAMPLES])
     keeper.start()
     keeper.samples("bench", rows(0, 10), 0)
     wait_for(lambda: "95 % full" in keeper.state)
@@ -294,7 +294,10 @@ def station(folder: Path, keeper: Recorder, window_s: float = 30.0, axes: AxisMa
     for kernels in (ready.window, ready.fit, ready.all):
         kernels.set()
     link = LoopbackLink()
-    device = Device("bench", RATE, window_s, "octave", 0.1, 0.1, link, decoder, axes or AxisMap(), 0.0)
+    driver = Driver(link, decoder, silence_s=0.0)
+    device = Device.model_construct(
+        name="bench", rate_hz=RATE, window_s=window_s, axes=axes or AxisMap(), driver=driver
+    )
     return DeviceWorker(device, link, [], threading.Event(), ready, keeper)
 
 
@@ -305,7 +308,7 @@ def now_rows(first: int, n: int, wall_ns: int) -> SampleBlock:
 
 def lived(tmp_path: Path, tick_step: float | None = 1.0) -> DeviceWorker:
     """A station that has taken 60 s, recorded them, and died without a word."""
-    keeper = Recorder(Storage(tmp_path), [origin("bench", AxisMap())])
+    keeper = Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())])
     keeper.start()
     before = station(tmp_path, keeper)
     mono_ns = time.monotonic_ns()
@@ -323,7 +326,7 @@ def lived(tmp_path: Path, tick_step: float | None = 1.0) -> DeviceWorker:
 
 def test_the_window_after_a_restart_is_the_one_before(tmp_path: Path) -> None:
     before = lived(tmp_path)
-    keeper = Recorder(Storage(tmp_path), [origin("bench", AxisMap())])
+    keeper = Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())])
     after = station(tmp_path, keeper)
     after.restore.resume(keeper.tail("bench"))
     assert not after._can_take()  # new samples wait
@@ -346,7 +349,7 @@ def test_the_window_after_a_restart_is_the_one_before(tmp_path: Path) -> None:
 
 
 def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path: Path) -> None:
-    keeper = Recorder(Storage(tmp_path), [origin("bench", AxisMap())])
+    keeper = Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())])
     keeper.start()
     before = station(tmp_path, keeper)
     mono_ns = time.monotonic_ns()
@@ -360,7 +363,7 @@ def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path:
             all_written(keeper)
     wait_for(lambda: sum(len(piece.samples) for piece in written(tmp_path / "bench")) == 6000)
     keeper.close(PATIENCE_S)
-    after = station(tmp_path, Recorder(Storage(tmp_path), [origin("bench", AxisMap())]))
+    after = station(tmp_path, Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())]))
     after.restore.resume(after._recorder.tail("bench"))
     after.rebuild()
     old, new = before.pipeline.estimator.get(), after.pipeline.estimator.get()
@@ -373,7 +376,7 @@ def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path:
 def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: Path, tick_step) -> None:
     begun_s = time.monotonic()
     lived(tmp_path, tick_step)
-    keeper = Recorder(Storage(tmp_path), [origin("bench", AxisMap())])
+    keeper = Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())])
     after = station(tmp_path, keeper)
     after.start()
     try:
@@ -406,11 +409,11 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
     ids=["another mounting", "longer ago than the window", "the clock was set back"],
 )
 def test_what_the_samples_cannot_go_on_from_begins_anew(tmp_path, axes, older_s: float, reason) -> None:
-    keeper = Recorder(Storage(tmp_path), [origin("bench", AxisMap())])
+    keeper = Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())])
     keeper.start()
     keeper.samples("bench", rows(0, 3000, start_ns=time.time_ns() - int((older_s + 30.0) * 1e9)), 0)
     keeper.close(PATIENCE_S)
-    after = station(tmp_path, Recorder(Storage(tmp_path), [origin("bench", axes)]), axes=axes)
+    after = station(tmp_path, Recorder(Storage(folder=tmp_path), [origin("bench", axes)]), axes=axes)
     after.restore.resume(after._recorder.tail("bench"))
     after.rebuild()
     assert after.pipeline.estimator is None
@@ -423,7 +426,7 @@ def test_files_that_are_no_segments_are_passed_over(tmp_path: Path) -> None:
     lived(tmp_path)
     (tmp_path / "bench" / segment.segment_name(900, 1.8e9)).write_bytes(b"no stream at all")
     (tmp_path / "bench" / segment.segment_name(901, 1.8e9)).write_bytes(b"")
-    after = station(tmp_path, Recorder(Storage(tmp_path), [origin("bench", AxisMap())]))
+    after = station(tmp_path, Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())]))
     after.restore.resume(after._recorder.tail("bench"))
     after.rebuild()
     assert after.pipeline.estimator.filled == 3000
@@ -442,7 +445,7 @@ def rows_of_all(folder: Path) -> tuple[np.ndarray, int]:
 
 def test_two_recorders_on_one_folder_lose_nothing_and_keep_nothing_twice(tmp_path: Path) -> None:
     """Both receive the same samples; the times of the second are 3 ms late."""
-    first, second = (Recorder(Storage(tmp_path, segment_s=10.0), [SAMPLES]) for _ in range(2))
+    first, second = (Recorder(Storage(folder=tmp_path, segment_s=10.0), [SAMPLES]) for _ in range(2))
     for one in (first, second):
         one.set_state("bench", DaemonState(RATE))
     first.start()
@@ -479,7 +482,7 @@ def test_a_second_recorder_without_counts_goes_on_by_time_and_says_what_is_missi
         one = rows(first, n)
         return make_block(one.t_ns.copy(), one.values.copy(), one.temperature_c.copy())
 
-    first, second = (Recorder(Storage(tmp_path), [SAMPLES]) for _ in range(2))
+    first, second = (Recorder(Storage(folder=tmp_path), [SAMPLES]) for _ in range(2))
     first.set_state("bench", DaemonState(RATE))
     first.start()
     first.samples("bench", uncounted(0, 100), 0)
@@ -499,7 +502,7 @@ def test_a_second_recorder_without_counts_goes_on_by_time_and_says_what_is_missi
 
 def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.1)
-    first = Recorder(Storage(tmp_path), [SAMPLES])
+    first = Recorder(Storage(folder=tmp_path), [SAMPLES])
     first.start()
     first.samples("bench", rows(0, 100), 0)
     wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
@@ -509,7 +512,7 @@ def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.99)
     monkeypatch.setattr(first, "_delete_old", lambda: None)
     before = sorted(path.name for path in tmp_path.rglob("*"))
-    second = Recorder(Storage(tmp_path, keep_s=10.0, segment_s=10.0), [SAMPLES])
+    second = Recorder(Storage(folder=tmp_path, keep_s=10.0, segment_s=10.0), [SAMPLES])
     second.start()
     second.samples("bench", rows(0, 100), 0)
     wait_for(lambda: "in use" in second.state)
@@ -523,7 +526,7 @@ def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
 def test_raw_bytes_of_two_recorders_are_kept_once(tmp_path: Path) -> None:
     of = SegmentMetadata("bench", "raw", carrier="frames", decoder="dbc")
     given = [Chunk(bytes([i]), START_NS + i, address=i) for i in range(100)]
-    first, second = (Recorder(Storage(tmp_path), [of]) for _ in range(2))
+    first, second = (Recorder(Storage(folder=tmp_path), [of]) for _ in range(2))
     first.start()
     first.chunks("bench", given[:60], 0)
     wait_for(lambda: bool(segment.list_segments(tmp_path / "bench" / "raw")))
@@ -571,7 +574,7 @@ def rename_folder(path: Path) -> None:
 @pytest.mark.parametrize("tamper", [delete, rename, cut, append, put_another, remove_folder, rename_folder])
 def test_a_file_that_is_changed_while_it_is_written_is_noticed_and_another_begun(tmp_path: Path, tamper) -> None:
     folder = tmp_path / "store" / "bench"
-    keeper = Recorder(Storage(tmp_path / "store"), [SAMPLES])
+    keeper = Recorder(Storage(folder=tmp_path / "store"), [SAMPLES])
     keeper.start()
     keeper.samples("bench", rows(0, 100), 0)
     wait_for(lambda: bool(segment.list_segments(folder)))
@@ -602,7 +605,7 @@ def test_a_file_that_is_changed_while_it_is_written_is_noticed_and_another_begun
 
 
 def test_the_folder_of_one_device_can_go_while_another_is_recorded(tmp_path: Path) -> None:
-    keeper = Recorder(Storage(tmp_path), [SAMPLES, SegmentMetadata("other", "samples")])
+    keeper = Recorder(Storage(folder=tmp_path), [SAMPLES, SegmentMetadata("other", "samples")])
     keeper.start()
     for at in range(0, 300, 100):
         keeper.samples("bench", rows(at, 100), 0)
@@ -618,7 +621,7 @@ def test_the_folder_of_one_device_can_go_while_another_is_recorded(tmp_path: Pat
 
 @pytest.mark.parametrize("kind", ["fifo", "directory", "loop"])
 def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kind: str) -> None:
-    keeper = Recorder(Storage(tmp_path), [SAMPLES])
+    keeper = Recorder(Storage(folder=tmp_path), [SAMPLES])
     keeper.start()
     keeper.samples("bench", rows(0, 100), 0)
     wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
@@ -632,7 +635,7 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
                 path.mkdir()
             case _:
                 path.symlink_to(path.name)
-    again = Recorder(Storage(tmp_path, keep_s=1.0, segment_s=1.0), [SAMPLES])
+    again = Recorder(Storage(folder=tmp_path, keep_s=1.0, segment_s=1.0), [SAMPLES])
     tail = again.tail("bench")
     assert tail is not None
     assert tail.newest.samples.ticks[-1] == 99
@@ -646,7 +649,7 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
 
 def test_something_else_in_place_of_the_folder_is_said_until_it_is_gone(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "store")
-    keeper = Recorder(Storage(tmp_path / "store"), [SAMPLES])
+    keeper = Recorder(Storage(folder=tmp_path / "store"), [SAMPLES])
     keeper.start()
     keeper.samples("bench", rows(0, 100), 0)
     said = f"{tmp_path / 'store'}: is a FIFO, not a folder; recording stopped, trying again"
@@ -660,7 +663,7 @@ def test_something_else_in_place_of_the_folder_is_said_until_it_is_gone(tmp_path
 def test_a_folder_that_cannot_be_used_costs_only_what_has_no_room_in_memory(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(room, "MAX_QUEUE_BYTES", 500 * room.SAMPLE_BYTES)
     (tmp_path / "store").write_text("in the way")
-    keeper = Recorder(Storage(tmp_path / "store"), [SAMPLES])
+    keeper = Recorder(Storage(folder=tmp_path / "store"), [SAMPLES])
     keeper.start()
     wait_for(lambda: "is a file, not a folder" in keeper.state)
     for at in range(0, 1000, 100):

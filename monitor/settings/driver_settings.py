@@ -1,0 +1,219 @@
+"""Table ``[device.driver]``: it names a link and a decoder, whose modules bring the models of their keys.
+
+Only the modules of the named link and decoder are imported. A simulated sensor (``link = "virtual"``) is described
+here. It is created by ``monitor.simulator``, which is in a higher layer.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Annotated, Any, Final
+
+from pydantic import AfterValidator, Field, ValidationInfo
+
+import drivers.decoders
+import drivers.links
+from drivers import discovery, quantities
+from drivers.decoders.base import AddressFilter, Decoder
+from drivers.errors import ConfigError
+from drivers.links.base import AddressFilteringLink, Link, LinkSettings
+from drivers.quantities import format_value
+from drivers.settings_model import (
+    CheckedTable,
+    Conflict,
+    ListOf,
+    Problem,
+    SettingsModel,
+    TableError,
+    check_table,
+    describe_keys,
+)
+from monitor.common.config_files import model_path
+from monitor.settings.field_types import Duration
+
+VIRTUAL: Final = "virtual"
+"""Name of the link of a simulated sensor."""
+VIRTUAL_DECODER: Final = "vectornav_binary"
+"""Default decoder of a simulated sensor."""
+
+Share = Annotated[float, quantities.FRACTION]
+
+
+class FaultsTable(SettingsModel):
+    """``[device.driver.faults]``: faults between a simulated sensor and the link. The seed determines all of them."""
+
+    lost: Share = Field(0.0, description="share of samples that are not sent; the counter of the sensor continues")
+    repeated: Share = Field(0.0, description="share of samples that are sent twice")
+    flipped: Share = Field(0.0, description="share of samples with one flipped bit")
+    cut: Share = Field(0.0, description="share of samples whose frame ends too early")
+    jitter: Annotated[float, quantities.JITTER_S] = Field(
+        0.0, description="longest random delay of a burst of bytes in s"
+    )
+    unplugged: Share = Field(0.0, description="probability at each sample that the cable is pulled before it")
+    unplugged_for: Duration = Field(
+        2.0, description="time in s, on the clock of the sensor, until the cable is plugged in again"
+    )
+    clock: Annotated[float, quantities.CLOCK_RATIO] = Field(
+        1.0, description="true sample rate divided by the rate that the sensor states"
+    )
+
+    def conflicts(self) -> Iterator[Conflict]:
+        """Yield a conflict if the shares of faulty samples add up to more than 1."""
+        if self.lost + self.repeated + self.flipped + self.cut > 1.0:
+            text = "lost, repeated, flipped and cut are shares of all samples: their sum is at most 1"
+            yield Conflict("", text, ("lost", "repeated", "flipped", "cut"))
+
+
+def _model_file(name: str, info: ValidationInfo) -> str:
+    """Return the path of a noise model for its name in a configuration file."""
+    return str(model_path(name, info.context.folder or Path())) if info.context else name
+
+
+class VirtualTable(LinkSettings):
+    """Keys of ``link = "virtual"``: a simulated IMU that sends a real wire format over a real link.
+
+    The decoder determines the link: bytes over a pseudo-terminal, CAN frames over a bus of python-can in this process,
+    or messages over zenoh on loopback.
+    """
+
+    model: Annotated[str, AfterValidator(_model_file)] = Field(
+        "consumer-mems", validate_default=True, description="path of a model file, or name of a shipped model"
+    )
+    seed: Annotated[int, quantities.SEED] = Field(1, description="seed of the random numbers: same seed, same samples")
+    speed: Annotated[float, quantities.SIMULATION_SPEED] = Field(1.0, description="speed relative to real time")
+    effect: ListOf[str] = Field(
+        (),
+        examples=[["gz.sinusoidal:amplitude=1e-3,frequency=17"]],
+        description="effects that begin while the sensor runs",
+    )
+    effect_at: Annotated[float, quantities.DELAY_S] = Field(
+        90.0, description="time in s, on the clock of the sensor, at which the effects begin"
+    )
+    faults: FaultsTable = Field(FaultsTable(), description="faults of the transmission")
+
+
+@dataclass(frozen=True, slots=True)
+class Driver:
+    """Link and decoder of a device. Nothing is open."""
+
+    link: Link | VirtualTable
+    decoder: Decoder
+    silence_s: float = 3.0  # time without data after which the link is opened again; 0 = never
+
+
+def link_settings(name: str) -> type[LinkSettings]:
+    """Return the model of the keys of a link.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such link. The text lists all links, the most similar one first.
+    """
+    if name == VIRTUAL:
+        return VirtualTable
+    if name not in link_names():
+        raise ConfigError(f'"{name}"{discovery.format_choices(name, link_names())}')
+    settings: type[LinkSettings] = discovery.import_module(drivers.links, name, "_link").Settings
+    return settings
+
+
+def link_names() -> tuple[str, ...]:
+    """Return the names of all links of a configuration file."""
+    return tuple(sorted({*discovery.list_modules(drivers.links, "_link"), VIRTUAL}))
+
+
+def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
+    """Return link and decoder of a table ``[device.driver]``.
+
+    Parameters
+    ----------
+    table
+        Keys and values, as TOML gives them.
+    folder
+        Folder at which relative paths begin.
+
+    Raises
+    ------
+    TableError
+        If the table has mistakes. ``partial`` is the ``VirtualTable`` of a simulated sensor.
+    """
+    keys = dict(table)
+    name, decoder_name, options = keys.pop("link", None), keys.pop("decoder", ""), keys.pop("decoder_options", {})
+    problems: list[Problem] = []
+    link: Link | VirtualTable | None = None
+    carrier, silence_s = "", 0.0
+    if not isinstance(name, str) or name not in link_names():
+        said = "missing" if name is None else format_value(name)
+        problems.append(Problem("link", f"{said}{discovery.format_choices(str(name or ''), link_names())}"))
+    else:
+        module = None if name == VIRTUAL else discovery.import_module(drivers.links, name, "_link")
+        checked = check_table(link_settings(name), keys, folder)
+        link = checked.value if isinstance(checked.value, VirtualTable) else _build(module, checked)
+        problems += checked.problems
+        carrier = "" if module is None else getattr(link, "carrier", "") or _carrier_of(module)
+        default = VIRTUAL_DECODER if module is None else getattr(link, "default_decoder", module.DEFAULT_DECODER)
+        decoder_name = decoder_name or default
+        silence_s = checked.value.silence if checked.value is not None else 0.0
+    decoder = None
+    if name in link_names() or decoder_name:
+        decoder = _read_decoder(decoder_name, options, folder, (str(name), carrier), problems)
+    if problems or link is None or decoder is None:
+        raise TableError(problems, link if isinstance(link, VirtualTable) else None)
+    if isinstance(link, AddressFilteringLink) and isinstance(decoder, AddressFilter):
+        link.accept(decoder.addresses)
+    return Driver(link, decoder, silence_s)
+
+
+def _read_decoder(
+    name: object, options: object, folder: Path | None, link: tuple[str, str], problems: list[Problem]
+) -> Decoder | None:
+    """Return the decoder for a link with a name and a carrier. Append the problems; None if there are any."""
+    known = discovery.list_modules(drivers.decoders)
+    if not isinstance(name, str) or name not in known:
+        said = format_value(name) if name else "missing"
+        problems.append(Problem("decoder", f"{said}{discovery.format_choices(str(name), known)}"))
+        return None
+    module = discovery.import_module(drivers.decoders, name)
+    if not isinstance(options, dict):
+        problems.append(Problem("decoder_options", f"expected a table, got {format_value(options)}"))
+        return None
+    checked = check_table(module.Settings, options, folder)
+    decoder: Decoder | None = _build(module, checked)
+    problems += (problem.below("decoder_options") for problem in checked.problems)
+    link_name, carrier = link
+    if carrier and _carrier_of(module) not in ("", carrier):
+        fitting = ", ".join(
+            one for one in known if _carrier_of(discovery.import_module(drivers.decoders, one)) == carrier
+        )
+        text = f"{name} reads {_carrier_of(module)}, link {link_name} provides {carrier}: possible are {fitting}"
+        problems.append(Problem("decoder", text))
+    return decoder
+
+
+def _build(module: ModuleType | None, checked: CheckedTable[Any]) -> Any:
+    """Return the link or decoder of a module; None if its settings are wrong. Add the mistakes that ``build`` finds."""
+    if checked.value is None or module is None:
+        return None
+    keys = describe_keys(type(checked.value))
+    if any(problem.place in keys and keys[problem.place].is_required() for problem in checked.problems):
+        return None
+    sound = not checked.problems
+    try:
+        built = module.build(checked.value)
+    except ConfigError as error:
+        for line in error.lines:
+            place, _, text = line.partition(": ")
+            if re.split(r"[.\[]", place)[0] in keys:
+                checked.add(place, text)
+            else:
+                checked.problems.append(Problem("", line))
+        return None
+    return built if sound else None
+
+
+def _carrier_of(module: ModuleType) -> str:
+    """Return the kind of data that a link provides or a decoder reads; "" if its settings decide."""
+    kinds = [one for one in vars(module).values() if isinstance(one, type) and one.__module__ == module.__name__]
+    return next((str(kind.carrier) for kind in kinds if hasattr(kind, "carrier")), "")

@@ -1,0 +1,142 @@
+"""Types of the keys of a configuration file that are no plain numbers: durations, rates, paths, keys and addresses."""
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Final, NamedTuple
+
+from pydantic import BeforeValidator
+
+from drivers import file_access
+from drivers.discovery import format_choices
+from drivers.errors import ConfigError
+from drivers.quantities import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, format_value
+from drivers.settings_model import ReadAs, checked_by
+from monitor.common.topics import ENDPOINT
+
+UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+"""Length of each unit of a duration in s."""
+DURATION_TEXT: Final = re.compile(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([a-z]*)\s*")
+RATE_TEXT: Final = re.compile(r"\s*([0-9.]+)\s*Hz\s*")
+ENDPOINT_TEXT: Final = re.compile(r"[a-z]+/.+")
+ZENOH_KEY: Final = re.compile(r"[^/*$?#]+(/[^/*$?#]+)*")
+ADDRESS_TEXT: Final = re.compile(r"(\[[0-9a-fA-F:]+\]|[\w.-]+):([0-9]{1,5})", re.ASCII)
+VIEWER_MODES: Final = ("auto", "native", "web", "none")
+SIZE_TEXT: Final = re.compile(r"([0-9]{1,20}(?:\.[0-9]{1,20})?)\s*(?:([kMGT]?)(i?)B|%)")
+
+
+class Metrics(NamedTuple):
+    """Address on which the service answers Prometheus."""
+
+    host: str
+    port: int
+
+
+def seconds(value: float | str) -> float:
+    """Return a duration in s: a number of seconds, or a text such as "90s", "30min", "1h", "2d".
+
+    >>> seconds("30min"), seconds(3600), seconds("1.5 h")
+    (1800.0, 3600.0, 5400.0)
+    """
+    return DURATION_S.check(float(_seconds(value)))
+
+
+def period(value: str, always: str) -> float:
+    """Return the time between two runs in s for a rate such as "10 Hz"; 0 for the word that means each time.
+
+    Parameters
+    ----------
+    value
+        Rate, or the word.
+    always
+        Word that means each time.
+
+    >>> period("10 Hz", "every sample"), period("every sample", "every sample")
+    (0.1, 0.0)
+    """
+    if value == always:
+        return 0.0
+    match = RATE_TEXT.fullmatch(value)
+    rate_hz = _positive_number(match[1]) if match else 0.0
+    if not rate_hz > 0.0:
+        raise ConfigError(f'{format_value(value)} is no rate; write "10 Hz" or "{always}"')
+    return 1.0 / UPDATE_RATE_HZ.check(rate_hz)
+
+
+def period_or(always: str) -> ReadAs:
+    """Return the annotation of a period in s that is a rate in the file, or the word that means each time."""
+    return ReadAs(str, lambda value, folder: period(value, always))
+
+
+def check_memory(size: str) -> None:
+    """Raise ConfigError for a text that is no memory limit of the viewer.
+
+    >>> check_memory("256MiB"), check_memory("25%")
+    (None, None)
+    """
+    match = SIZE_TEXT.fullmatch(size)
+    if match is None:
+        raise ConfigError(f'{format_value(size)} is no size; write "256MiB", "1GB" or "25%"')
+    number, prefix, binary = match.groups()
+    if size.endswith("%"):
+        PERCENT.check(float(number))
+    else:
+        SIZE_BYTES.check(float(number) * (1024.0 if binary else 1000.0) ** ("", *"kMGT").index(prefix))
+
+
+def check_viewer_mode(mode: str) -> None:
+    """Raise ConfigError for an unknown mode of the viewer."""
+    if mode not in VIEWER_MODES and not mode.endswith(".rrd"):
+        raise ConfigError(f'"{mode}"{format_choices(mode, VIEWER_MODES)}, or a file ending in .rrd')
+
+
+def _seconds(value: Any) -> Any:
+    """Convert the text of a duration to s. Values of other types are left to the check of the number."""
+    if not isinstance(value, str):
+        return value
+    match = DURATION_TEXT.fullmatch(value)
+    duration_s = _positive_number(match[1]) * UNITS_S.get(match[2], 0.0) if match else 0.0
+    if not duration_s > 0.0:
+        raise ConfigError(f'{format_value(value)} is no duration; write seconds, or "90s", "30min", "1h", "2d"')
+    return duration_s
+
+
+def _positive_number(text: str) -> float:
+    """Return a number; 0 if the text is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return 0.0
+
+
+def _path(name: str, folder: Path | None) -> Path:
+    """Return a path relative to the folder of the configuration file."""
+    return (folder or Path()) / file_access.expand_user(name)
+
+
+def _check_endpoint(endpoint: str) -> None:
+    if not ENDPOINT_TEXT.fullmatch(endpoint):
+        raise ConfigError(f'{format_value(endpoint)} is no endpoint; write "{ENDPOINT}"')
+
+
+def _check_zenoh_key(key: str) -> None:
+    if not ZENOH_KEY.fullmatch(key):
+        example = 'a zenoh key such as "site/alarms", without * $ ? # and with text between slashes'
+        raise ConfigError(f"expected {example}, got {format_value(key)}")
+
+
+def _address(text: str, _: Path | None) -> Metrics:
+    """Return host and port."""
+    match = ADDRESS_TEXT.fullmatch(text)
+    if match is None or int(match[2]) == 0 or not PORT.supports(int(match[2])):
+        raise ConfigError(f'{format_value(text)} is no host and port; write "127.0.0.1:9464"')
+    return Metrics(match[1].strip("[]"), int(match[2]))
+
+
+DURATION_FROM_TEXT: Final = BeforeValidator(_seconds)
+"""Annotation of a field that is a duration in s, or a text such as "1h" in the file."""
+Duration = Annotated[float, DURATION_S, DURATION_FROM_TEXT]
+RelativePath = Annotated[Path, ReadAs(str, _path)]
+"""Path that begins at the folder of the configuration file if it is relative."""
+Endpoint = Annotated[str, checked_by(_check_endpoint)]
+ZenohKey = Annotated[str, checked_by(_check_zenoh_key)]
+Address = Annotated[Metrics, ReadAs(str, _address)]
