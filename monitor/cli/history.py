@@ -106,9 +106,9 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
     if out is not None:
         history_file.save(past, out)
     if plot is not None:
-        from monitor.publishing.plots.history_plot import history_plot
+        from monitor.publishing.plots.history_plot import save_history_plot
 
-        history_plot(past, plot, asked.axes)
+        save_history_plot(past, plot, asked.axes)
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:

@@ -154,13 +154,13 @@ def draw_plots(results: Results, path: Path, title: str) -> None:
     beside = other_deviations(results.total, results.hadamard)
     marks = [ChangeMark(change.since / result.estimate.rate_hz, AXES[change.axis]) for change in result.changes]
     if path.suffix == ".html":
-        from monitor.publishing.reports.analysis_report import html_report
+        from monitor.publishing.reports.analysis_report import write_html_report
 
-        html_report(result, path, title, beside, results.dynamic, marks)
+        write_html_report(result, path, title, beside, results.dynamic, marks)
     else:
-        from monitor.publishing.plots.analysis_plot import allan_plot
+        from monitor.publishing.plots.analysis_plot import save_analysis_plot
 
-        allan_plot(result.estimate, path, title, beside, results.dynamic, marks, result.axes_of_temperature)
+        save_analysis_plot(result.estimate, path, title, beside, results.dynamic, marks, result.axes_of_temperature)
 
 
 def _without_temperature(

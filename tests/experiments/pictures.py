@@ -47,7 +47,7 @@ from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.sqlite_store import FILE_NAME, HistoryStore, StoredEvent
 from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
-from monitor.publishing.plots.reconcile_chart import chart
+from monitor.publishing.plots.diagnostic_figure import diagnostic_svg
 from monitor.publishing.rerun import sinks
 from monitor.publishing.rerun.fleet import FleetView
 from monitor.publishing.rerun.view import RerunView
@@ -445,7 +445,7 @@ def hidden(folder: Path) -> AxisResult:
 def looked_at(result: AxisResult, when: str, path: Path) -> Path:
     """Spectrum, Allan deviation and tails of one axis beside one model, as the report draws them."""
     views = {view.lens: view for view in getattr(result, when).views}
-    drawn = [chart([(lens, views[lens])], result.axis, 520.0, 330.0) for lens in ("psd", "allan", "tails")]
+    drawn = [diagnostic_svg([(lens, views[lens])], result.axis, 5.2, 3.3) for lens in ("psd", "allan", "tails")]
     page = path.with_suffix(".html")
     style = "body{margin:8px;display:flex;font-family:sans-serif;background:white}svg{width:520px;height:330px}"
     page.write_text(f"<meta charset=utf-8><style>{style}</style>{''.join(drawn)}")

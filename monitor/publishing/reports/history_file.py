@@ -15,11 +15,8 @@ from drivers.sample import Floats
 from monitor.common.units import sensor_kind
 from monitor.history.bucket import COUNTS, STATES
 from monitor.history.reading import HistoryTable
+from monitor.publishing.exporters.noise import ascii_unit
 
-COEFFICIENT_SI_UNITS: Final = {
-    "gyro": {"Q": "rad", "N": "rad/sqrt(s)", "B": "rad/s", "K": "rad/s/sqrt(s)", "R": "rad/s^2", "sigma": "rad/s"},
-    "accel": {"Q": "m/s", "N": "m/s/sqrt(s)", "B": "m/s^2", "K": "m/s^2/sqrt(s)", "R": "m/s^3", "sigma": "m/s^2"},
-}
 STATUS_UNITS: Final = {"rate": "Hz", "latency": "s", "memory": "B", "temperature": "degC"}
 STATE_COLUMN_NAME: Final = (
     "state (" + ", ".join(f"{i} {name}" for i, name in enumerate(STATES)).replace(", ", "; ") + ")"
@@ -74,4 +71,7 @@ def unit_of(name: str) -> str:
     ('rad/sqrt(s)', 'm/s^2', 'Hz')
     """
     axis, _, rest = name.partition(".")
-    return COEFFICIENT_SI_UNITS[sensor_kind(axis)][rest.split(".")[0]] if rest else STATUS_UNITS[name]
+    if not rest:
+        return STATUS_UNITS[name]
+    quantity = rest.split(".")[0]
+    return ascii_unit("B" if quantity == "sigma" else quantity, sensor_kind(axis))  # σ has the unit of B

@@ -20,7 +20,7 @@ import rerun.blueprint as rrb
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
 from monitor.publishing.plots import colours
-from monitor.publishing.plots.reconcile_chart import DOTS, Plot, height_of, plotted
+from monitor.publishing.plots.diagnostic_figure import MAX_MARKERS, DiagnosticPlot, to_field_units, value_limits
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.rerun.allan_chart import (
     FILL_STEPS,
@@ -102,14 +102,14 @@ def overview(r: Reconciliation) -> str:
     rows = []
     for axis in _axes(r):
         result = r.axes[axis]
-        did = "; ".join(f"{step.kind} {words.step_line(step, axis, r.baseline)}" for step in result.steps)
-        left = "; ".join(words.score_line(one, axis) for one in result.left_over)
+        did = "; ".join(f"{step.kind} {words.describe_step(step, axis, r.baseline)}" for step in result.steps)
+        left = "; ".join(words.describe_gap(one, axis) for one in result.left_over)
         rows.append(f"| **{axis}** | {words.RESULT_TEXTS[result.verdict]} | {did or '—'} | {left or '—'} |")
     head = "| axis | verdict | added or retuned | left over |\n|:--|:--|:--|:--|"
     recorded = f"{r.samples:,} samples at {r.rate_hz:.6g} Hz, {format_duration(r.duration_s)}"
     notes = [f"note: {note}" for note in r.notes]
     return "\n\n".join(
-        [f"## {words.RESULT_TEXTS[r.verdict]}", words.summary(r), recorded, "\n".join([head, *rows]), *notes]
+        [f"## {words.RESULT_TEXTS[r.verdict]}", words.summarize(r), recorded, "\n".join([head, *rows]), *notes]
     )
 
 
@@ -123,21 +123,22 @@ def steps_text(r: Reconciliation, result: AxisResult) -> str:
     result
         Result of the axis.
     """
-    parts = [f"## {result.axis}: {words.RESULT_TEXTS[result.verdict]}", words.verdict_line(result)]
+    parts = [f"## {result.axis}: {words.RESULT_TEXTS[result.verdict]}", words.describe_result(result)]
     for count, step in enumerate(result.steps, start=1):
-        known = words.parameters(step, result.axis, r.baseline)
+        known = words.format_parameters(step, result.axis, r.baseline)
         parts += [
             "---",
-            f"**Step {count}: {step.kind} {words.words_of(step.effect)}** ({words.percent(step.confidence)})",
-            "\n".join(f"- {words.words_of(one.name)} **{one.short}**" for one in known),
+            f"**Step {count}: {step.kind} {words.readable_name(step.effect)}** "
+            f"({words.format_probability(step.confidence)})",
+            "\n".join(f"- {words.readable_name(one.name)} **{one.short}**" for one in known),
             f"{words.diagnostic_name(step.found.lens)}, {words.format_range(step.found.where, result.axis)}: gap "
             f"**{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}**, "
             f"threshold {words.format_gap(step.after.threshold)}",
             step.because,
-            words.alternatives_sentence(step),
+            words.describe_alternatives(step),
         ]
     if result.left_over:
-        parts += ["---", "**Left over**", *(f"- {words.score_line(one, result.axis)}" for one in result.left_over)]
+        parts += ["---", "**Left over**", *(f"- {words.describe_gap(one, result.axis)}" for one in result.left_over)]
     return "\n\n".join(parts)
 
 
@@ -223,9 +224,9 @@ def _lens(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
     """Log both plots of one diagnostic with the same scale."""
     axis = result.axis
     views = [next((view for view in look.views if view.lens == lens), None) for look in _looks_by_step(result)]
-    plots = {step: plotted("", view, axis, None) for step, view in enumerate(views) if view is not None}
+    plots = {step: to_field_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
-    scale = Scale(decades(plot.x for plot in every), decades([np.array(height_of(every))]))
+    scale = Scale(decades(plot.x for plot in every), decades([np.array(value_limits(every))]))
     for when in ("before", "after") if result.steps else ("before",):
         _log_grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
     stream.reset_time()
@@ -236,7 +237,9 @@ def _lens(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
         _log_curves(stream, f"{axis}/{lens}/after", scale, plot, axis, static=False)
 
 
-def _log_curves(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str, static: bool) -> None:
+def _log_curves(
+    stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str, static: bool
+) -> None:
     """Log the band, the measured curve and the expected curve."""
     # A lower end of zero has no logarithm; it is drawn below the box.
     low, high = (scale.to_chart(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
@@ -251,7 +254,7 @@ def _log_curves(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot,
         rr.LineStrips2D(finite_sections(at), colors=[colour], radii=thin, draw_order=5.0),
         static=static,
     )
-    if len(at) <= DOTS:
+    if len(at) <= MAX_MARKERS:
         dots = rr.Points2D(at, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0)
         stream.log(f"{path}/points", dots, static=static)
     expected = finite_sections(_inside(scale.to_chart(plot.x, plot.expected)))
@@ -263,7 +266,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, resul
     """Log a frame around each range in which this diagnostic found a gap."""
     view = next(view for view in result.start.views if view.lens == lens)
     founds = [step.found for step in result.steps] + list(result.left_over)
-    marks = [plotted("", view, result.axis, found.where) for found in founds if found.lens == lens]
+    marks = [to_field_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
     bounds = [mark.mark for mark in marks if mark.mark is not None]
     if not bounds:
         return
@@ -274,7 +277,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, resul
     stream.log(f"{path}/place", strips, static=True)
 
 
-def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str) -> None:
+def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str) -> None:
     """Log frame, decade lines, labels and the key to the curves."""
     lines = grid(scale)
     for name, strips, colour, order in (

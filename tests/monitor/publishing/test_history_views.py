@@ -17,7 +17,7 @@ from monitor.history.bucket import STATES, HistoryRow
 from monitor.history.reading import HistoryTable, build_table
 from monitor.history.sqlite_store import StoredEvent
 from monitor.history.time_ranges import TimeRange
-from monitor.publishing.plots.history_plot import history_plot
+from monitor.publishing.plots.history_plot import save_history_plot
 from monitor.publishing.reports import history_file
 from monitor.publishing.terminal import history_text
 
@@ -139,7 +139,7 @@ def test_the_picture_is_drawn_of_any_axes(tmp_path: Path, axes: tuple[str, ...])
     from matplotlib.image import imread
 
     path = tmp_path / "h.png"
-    history_plot(made(axes=axes), path)
+    save_history_plot(made(axes=axes), path)
     picture = imread(path)
     assert picture.shape[1] == (2220 if len(axes) == 3 else 1110)
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 100
@@ -148,11 +148,11 @@ def test_the_picture_is_drawn_of_any_axes(tmp_path: Path, axes: tuple[str, ...])
 @pytest.mark.long
 def test_a_picture_of_one_row_and_of_nothing(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    history_plot(made(1, slice(0, 0)), tmp_path / "one.png")
+    save_history_plot(made(1, slice(0, 0)), tmp_path / "one.png")
     with pytest.raises(NotReady):
-        history_plot(build_table("a", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2), tmp_path / "none.png")
+        save_history_plot(build_table("a", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2), tmp_path / "none.png")
     with pytest.raises(ConfigError, match="cannot write"):
-        history_plot(made(), tmp_path / "nowhere" / "h.png")
+        save_history_plot(made(), tmp_path / "nowhere" / "h.png")
 
 
 def test_a_course_keeps_its_gaps_and_a_steady_one_is_level() -> None:

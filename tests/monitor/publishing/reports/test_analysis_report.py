@@ -13,6 +13,7 @@ import pytest
 from drivers.errors import ConfigError
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.analysis import Analysis
+from monitor.estimation.fit.coefficients import SYMBOLS
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.publishing.plots.dynamic_figure import ChangeMark
@@ -97,12 +98,14 @@ def test_what_is_not_known_is_said_in_words() -> None:
     assert "— <small>(too few data)</small>" in " ".join(text.split())
     assert "<h2>Notes</h2>" not in text
     drifting = replace(made.estimate(seconds=1000.0), k_or_r=np.array([True] + [False] * 5))
-    words = {cell.word for row in analysis_report.table(drifting, "gyro") for cell in row.cells[:1]}
-    assert words == {"", "upper bound; K or R", "too few data"}
+    small = {letter: analysis_report.format_cell(drifting, letter, "gx")[1] for letter in SYMBOLS}
+    assert small["K"] == "(upper bound; K or R)"
+    assert small["R"] == "(too few data)"
+    assert "…" in small["N"]
 
 
 def test_the_facts_of_the_recording_are_on_the_page() -> None:
-    facts = dict(analysis_report.facts(analysis(samples=359_640)))
+    facts = dict(analysis_report.recording_facts(analysis(samples=359_640)))
     assert facts == {
         "rate": "100 Hz",
         "samples": "359,640",
@@ -110,13 +113,13 @@ def test_the_facts_of_the_recording_are_on_the_page() -> None:
         "missing samples": "360 (0.10 %)",
         "averaging times": "0.0100 … 655 s",
     }
-    assert dict(analysis_report.facts(analysis()))["missing samples"] == "none"
+    assert dict(analysis_report.recording_facts(analysis()))["missing samples"] == "none"
 
 
 @pytest.mark.long
 def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, long: DynamicAllan) -> None:
     path = tmp_path / "report.html"
-    analysis_report.html_report(analysis(), path, "a <b> & c", dynamic=long, marks=[ChangeMark(1500.0, "gz")])
+    analysis_report.write_html_report(analysis(), path, "a <b> & c", dynamic=long, marks=[ChangeMark(1500.0, "gz")])
     text = path.read_text("utf-8")
     assert path.stat().st_size < 1_000_000
     page = Page(text)
@@ -162,4 +165,4 @@ def test_without_its_libraries_it_says_what_to_install(monkeypatch: pytest.Monke
 @pytest.mark.long
 def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot write the report"):
-        analysis_report.html_report(analysis(), tmp_path / "absent" / "report.html")
+        analysis_report.write_html_report(analysis(), tmp_path / "absent" / "report.html")
