@@ -6,6 +6,8 @@ agree with N and K of IEEE Std 952. Kalibr rejects zero, so a term that no axis 
 upper bounds, the largest bound is used and the comment says so.
 """
 
+from typing import Final
+
 from drivers.errors import ConfigError
 from monitor.common.units import Kind
 from monitor.publishing.exporters.noise import (
@@ -20,11 +22,10 @@ from monitor.publishing.exporters.noise import (
     omitted_comment,
 )
 
-INFLATION_COMMENT = (
+INFLATION_COMMENT: Final = (
     "# Kalibr's wiki, IMU Noise Model: a sensor at rest at one temperature shows too little; for the",
     "# lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (--inflation 10)",
 )
-
 """Comment on the inflation of the values."""
 
 

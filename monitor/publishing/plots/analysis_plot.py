@@ -4,7 +4,8 @@ Gyroscopes and accelerometers are shown side by side: the Allan plot, a table of
 Allan deviation if it was computed.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -13,6 +14,7 @@ import numpy as np
 from drivers.sample import AXES
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KINDS, Kind, axes_of
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
+from monitor.estimation.analysis import Analysis
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.publishing.coefficient_cells import (
@@ -37,39 +39,34 @@ TABLE_LEGEND: Final = (
 )
 
 
-def save_analysis_plot(
-    estimate: Estimate,
-    path: Path,
-    title: str = "",
-    others: Sequence[OtherDeviation] = (),
-    dynamic: DynamicAllan | None = None,
-    marks: Sequence[ChangeMark] = (),
-    axes_of_temperature: Collection[str] = (),
-) -> None:
+@dataclass(frozen=True, slots=True)
+class DrawnAnalysis:
+    """Analysis of a recording with everything that its plot and its report show."""
+
+    analysis: Analysis
+    others: Sequence[OtherDeviation] = ()  # such as total and Hadamard deviation
+    dynamic: DynamicAllan | None = None
+    marks: Sequence[ChangeMark] = ()  # changes to mark in the dynamic Allan deviation
+
+
+def save_analysis_plot(drawn: DrawnAnalysis, path: Path, title: str = "") -> None:
     """Write the plot.
 
     Parameters
     ----------
-    estimate
-        Estimate of the whole recording.
+    drawn
+        Analysis of the recording.
     path
         File to write. Its suffix selects the format.
     title
         Title of the figure.
-    others
-        Other deviations, such as total and Hadamard deviation.
-    dynamic
-        Dynamic Allan deviation of the same recording, drawn below the table.
-    marks
-        Changes to mark in the dynamic Allan deviation.
-    axes_of_temperature
-        Axes to mark because temperature explains most of their slow variance.
 
     Raises
     ------
     ConfigError
         If matplotlib is missing or the file cannot be written.
     """
+    estimate, dynamic = drawn.analysis.estimate, drawn.dynamic
     with figure_style():
         kinds = measured_kinds(estimate)
         heights = [INCHES[1]]
@@ -79,10 +76,10 @@ def save_analysis_plot(
         parts = figure.subfigures(len(heights), len(kinds), squeeze=False, height_ratios=heights)
         for column, kind in enumerate(kinds):
             curves, table = parts[0, column].subplots(2, 1, height_ratios=[3.6, 1.75])
-            draw_allan_panel(curves, estimate, kind, others)
-            _draw_table(table, estimate, kind, axes_of_temperature)
+            draw_allan_panel(curves, estimate, kind, drawn.others)
+            _draw_table(table, drawn.analysis, kind)
             if dynamic is not None:
-                draw_dynamic_panels(parts[1, column], dynamic, kind, marks)
+                draw_dynamic_panels(parts[1, column], dynamic, kind, drawn.marks)
         figure.suptitle("\n".join([*([title] if title else []), recording_line(estimate)]))
         save_figure(figure, path)
 
@@ -118,13 +115,14 @@ def is_k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
     return letter in ("K", "R") and bool(estimate.k_or_r[i] and bounded)
 
 
-def _draw_table(panel: "Axes", estimate: Estimate, kind: Kind, axes_of_temperature: Collection[str]) -> None:
+def _draw_table(panel: "Axes", analysis: Analysis, kind: Kind) -> None:
     """Draw the table of coefficients: each value, and its interval in small print."""
+    estimate = analysis.estimate
     panel.axis("off")
     rows = np.linspace(0.97, 0.19, len(SYMBOLS) + 1)
     columns = list(zip(axes_of(kind), COLUMNS[1:], COLOURS, strict=True))
     for axis, x, colour in columns:
-        name = mark_temperature_axis(axis, axes_of_temperature)
+        name = mark_temperature_axis(axis, analysis.axes_of_temperature)
         panel.text(x, rows[0], name, color=colour, fontweight="bold", va="center")
     for letter, y in zip(SYMBOLS, rows[1:], strict=True):
         unit = COEFFICIENT_UNITS[kind][letter].name
@@ -134,7 +132,7 @@ def _draw_table(panel: "Axes", estimate: Estimate, kind: Kind, axes_of_temperatu
             panel.text(x, y + 0.02, cell.value, va="center")
             small = "K or R" if is_k_or_r(estimate, letter, axis) else cell.interval
             panel.text(x, y - 0.05, small, va="center", fontsize=6.5, color=GREY)
-    temperature = f";  {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
+    temperature = f";  {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if analysis.axes_of_temperature else ""
     for y, text in ((0.03, TABLE_LEGEND + temperature), (-0.04, LEGEND_TEXT)):
         panel.text(COLUMNS[0], y, text, va="center", fontsize=7.5, color=GREY)
     panel.set(xlim=(0, 1), ylim=(-0.06, 1))

@@ -9,16 +9,7 @@ from drivers.sample import AXES
 from monitor.common.units import DEVIATION_UNITS
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.sage_husa import USED
-from monitor.publishing.plots.style import (
-    GREY,
-    axis_colour,
-    create_figure,
-    draw_band,
-    draw_legend_above,
-    figure_style,
-    save_figure,
-    style_log_axis,
-)
+from monitor.publishing.plots import style
 from monitor.publishing.rerun.panels import format_duration
 
 if TYPE_CHECKING:
@@ -44,8 +35,8 @@ def save_compensation_plot(result: CompensationResult, path: Path) -> None:
     ConfigError
         If matplotlib is missing or the file cannot be written.
     """
-    with figure_style():
-        figure = create_figure(ROW_INCHES[0], 0.7 + ROW_INCHES[1] * len(result.axes))
+    with style.figure_style():
+        figure = style.create_figure(ROW_INCHES[0], 0.7 + ROW_INCHES[1] * len(result.axes))
         panels = figure.subplots(len(result.axes), 2, squeeze=False, sharex="col", width_ratios=[1.7, 1.0])
         for (drift, allan), (axis, one) in zip(panels, result.axes.items(), strict=True):
             _draw_drift(drift, axis, result)
@@ -53,12 +44,12 @@ def save_compensation_plot(result: CompensationResult, path: Path) -> None:
         panels[-1, 0].set_xlabel("time, min")
         panels[-1, 1].set_xlabel("averaging time τ, s")
         figure.suptitle(f"{result.recording}: drift and noise of the gyroscopes, method {result.method}")
-        save_figure(figure, path)
+        style.save_figure(figure, path)
 
 
 def _draw_drift(panel: "Axes", axis: str, result: CompensationResult) -> None:
     """Draw the means at rest and the predicted drift of one axis."""
-    i, colour = AXES.index(axis), axis_colour(axis)
+    i, colour = AXES.index(axis), style.axis_colour(axis)
     minutes = np.array([one.end for one in result.intervals]) / result.rate_hz / 60.0
     used = np.array([one.outcome[i] for one in result.intervals]) == USED
     mean = np.where(used, [one.mean[i] for one in result.intervals], np.nan)
@@ -67,23 +58,23 @@ def _draw_drift(panel: "Axes", axis: str, result: CompensationResult) -> None:
     expected = UNIT.factor * (np.array([one.expected[i] for one in result.intervals]) - centre)
     error = UNIT.factor * Z95 * np.array([one.known[i] for one in result.intervals])
     label = f"means of {format_duration(result.interval_s)} at rest"
-    panel.plot(minutes, mean, ".", markersize=2, color=GREY, label=label, rasterized=True)
-    draw_band(panel, minutes, expected - error, expected + error, colour, alpha=0.25)
+    panel.plot(minutes, mean, ".", markersize=2, color=style.GREY, label=label, rasterized=True)
+    style.draw_band(panel, minutes, expected - error, expected + error, colour, alpha=0.25)
     panel.plot(minutes, expected, color=colour, label="predicted drift, 95 %")
     limit = 1.1 * np.nanmax(np.abs([mean, expected])) if used.any() else 1.0
     panel.set_ylim(-limit, limit)
     panel.set_ylabel(f"{axis} minus its median, {UNIT.name}")
-    draw_legend_above(panel, 2, fontsize=7.5, markerscale=3.0)
+    style.draw_legend_above(panel, 2, fontsize=7.5, markerscale=3.0)
 
 
 def _draw_allan_deviation(panel: "Axes", axis: str, one: AxisCompensation) -> None:
     """Draw the Allan deviation of one axis before and after compensation."""
     for curve, colour, label in (
-        (one.uncompensated, GREY, "before compensation"),
-        (one.compensated, axis_colour(axis), "after"),
+        (one.uncompensated, style.GREY, "before compensation"),
+        (one.compensated, style.axis_colour(axis), "after"),
     ):
         panel.loglog(curve.tau_s, UNIT.factor * curve.allan, color=colour, label=label)
     for which in "xy":
-        style_log_axis(panel, which)
+        style.style_log_axis(panel, which)
     panel.set_ylabel(f"Allan deviation, {UNIT.name}")
-    draw_legend_above(panel, 2, fontsize=7.5)
+    style.draw_legend_above(panel, 2, fontsize=7.5)

@@ -14,19 +14,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.units import DEVIATION_UNITS, sensor_kind
-from monitor.publishing.plots.style import (
-    DARK,
-    GREY,
-    MINOR_GRID_COLOUR,
-    ORANGE,
-    axis_colour,
-    create_figure,
-    figure_style,
-    format_tick,
-    style_log_axis,
-    svg_element,
-    time_unit,
-)
+from monitor.publishing.plots import style
 from monitor.publishing.reports.reconcile_sentences import (
     diagnostic_name,
     field_unit,
@@ -38,6 +26,7 @@ from monitor.reconcile.result import Location, ParameterInterval, PlotData, Scor
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MARGINS_INCHES: Final = (0.58, 0.15, 0.30, 0.44)  # left, right, top and bottom of a panel, for its labels
 BAND_COLOUR: Final = "#cfd5dd"
@@ -95,13 +84,13 @@ def diagnostic_svg(
     limits = value_limits(plots)
     left, right, top, bottom = MARGINS_INCHES
     share = width / len(plots)
-    with figure_style():
-        figure = create_figure(width, height, layout=None)
+    with style.figure_style():
+        figure = style.create_figure(width, height, layout=None)
         for i, plot in enumerate(plots):
             size = ((share - left - right) / width, (height - top - bottom) / height)
             panel = figure.add_axes(((i * share + left) / width, bottom / height, *size))
-            _draw_panel(panel, plot if i == 0 else replace(plot, y_label=""), axis_colour(axis), limits)
-        return svg_element(figure, f"{axis}: {plots[0].y_label} over {plots[0].x_label}")
+            _draw_panel(panel, plot if i == 0 else replace(plot, y_label=""), style.axis_colour(axis), limits)
+        return style.svg_element(figure, f"{axis}: {plots[0].y_label} over {plots[0].x_label}")
 
 
 def select_view(views: Sequence[PlotData], lens: str, where: Location) -> PlotData | None:
@@ -193,7 +182,7 @@ def to_field_units(title: str, view: PlotData, axis: str, where: Location | None
         y_unit = DEVIATION_UNITS[sensor_kind(axis)]  # as in all Allan plots
     x_name, factor = x_unit.name, x_unit.factor
     if view.x_name == "time" and not view.log:
-        x_name, seconds = time_unit(float(np.ptp(view.x)))
+        x_name, seconds = style.time_unit(float(np.ptp(view.x)))
         factor = 1.0 / seconds
     mark = None if where is None else range_along(view, where)
     measured, expected, lo, hi = (line * y_unit.factor for line in (view.measured, view.expected, view.lo, view.hi))
@@ -247,20 +236,21 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[
     panel.fill_between(plot.x, lo, hi, where=np.isfinite(plot.hi).tolist(), color=BAND_COLOUR, linewidth=0)
     few = plot.x.size <= MAX_MARKERS
     panel.plot(plot.x, plot.measured, color=colour, linewidth=1.1, marker="o" if few else "", markersize=4.5)
-    panel.plot(plot.x, plot.expected, "--", color=DARK, linewidth=1.0)
+    panel.plot(plot.x, plot.expected, "--", color=style.DARK, linewidth=1.0)
     if plot.mark is not None:
         ends = np.clip(plot.mark, left, right).tolist()
-        panel.axvspan(*ends, facecolor=ORANGE, edgecolor=ORANGE, alpha=0.35, linewidth=3)  # visible if very narrow
+        # A line around the range keeps a very narrow range visible.
+        panel.axvspan(*ends, facecolor=style.ORANGE, edgecolor=style.ORANGE, alpha=0.35, linewidth=3)
         panel.set_title(plot.mark_label, loc="right", fontsize=9, color=RANGE_TEXT_COLOUR, fontweight="bold")
     else:
         panel.set_title(plot.title, loc="right", fontsize=9)
     for which in "xy" if plot.log else ():
-        style_log_axis(panel, which, minor_grid=False)
+        style.style_log_axis(panel, which, minor_grid=False)
     if not plot.log:
-        panel.xaxis.set_major_formatter(lambda value, _: format_tick(value))
-        panel.yaxis.set_major_formatter(lambda value, _: format_tick(value))
+        panel.xaxis.set_major_formatter(lambda value, _: style.format_tick(value))
+        panel.yaxis.set_major_formatter(lambda value, _: style.format_tick(value))
     panel.tick_params(labelsize=8.5)
-    panel.set_title(plot.y_label, loc="left", fontsize=9, color=GREY)
+    panel.set_title(plot.y_label, loc="left", fontsize=9, color=style.GREY)
 
 
 def gap_chart_svg(before: Sequence[Score], after: Sequence[Score] = ()) -> str:
@@ -274,25 +264,25 @@ def gap_chart_svg(before: Sequence[Score], after: Sequence[Score] = ()) -> str:
         Gaps with the next model; empty if there is only one model.
     """
     later = {score.lens: score for score in after}
-    with figure_style():
-        panel = _create_row_panel([diagnostic_name(score.lens) for score in before], "gap over threshold")
+    with style.figure_style():
+        figure, panel = _create_row_panel([diagnostic_name(score.lens) for score in before], "gap over threshold")
         panel.set_xscale("log")
         ratios = [1.0]
         for y, score in enumerate(before):
             scores = [score] + ([later[score.lens]] if score.lens in later else [])
             x = [max(gap_ratio(one), MIN_GAP_RATIO) for one in scores]
             colours = [ABOVE_THRESHOLD_COLOUR if one.passes else BELOW_THRESHOLD_COLOUR for one in scores]
-            panel.plot(x, [y] * len(x), color=GREY, linewidth=1.4, zorder=2)
+            panel.plot(x, [y] * len(x), color=style.GREY, linewidth=1.4, zorder=2)
             if len(x) > 1:
                 panel.plot(x[0], y, "o", mfc="white", mec=colours[0], mew=1.4, markersize=6)
             panel.plot(x[-1], y, "o", color=colours[-1], markersize=6)
             ratios += x
-        panel.axvline(1.0, color=DARK, linewidth=1.2, zorder=1)
+        panel.axvline(1.0, color=style.DARK, linewidth=1.2, zorder=1)
         panel.set_xlim(0.8 * MIN_GAP_RATIO, max(20.0, 1.3 * max(ratios)))
-        style_log_axis(panel, "x", minor_grid=False)
+        style.style_log_axis(panel, "x", minor_grid=False)
         if after:
-            panel.set_title("○ before   ● after", loc="right", fontsize=9, color=GREY)
-        return svg_element(panel.get_figure(root=True), "gap over threshold of each diagnostic")  # type: ignore[arg-type]
+            panel.set_title("○ before   ● after", loc="right", fontsize=9, color=style.GREY)
+        return style.svg_element(figure, "gap over threshold of each diagnostic")
 
 
 def interval_chart_svg(
@@ -311,8 +301,8 @@ def interval_chart_svg(
     colour
         Colour of the recordings.
     """
-    with figure_style():
-        panel = _create_row_panel([name for name, _ in intervals], x_label)
+    with style.figure_style():
+        figure, panel = _create_row_panel([name for name, _ in intervals], x_label)
         for y, (_, one) in enumerate(intervals):
             if isinstance(one.value, str) or one.lo is None or one.hi is None or not isfinite(one.hi - one.lo):
                 continue
@@ -320,19 +310,19 @@ def interval_chart_svg(
             value, lo, hi = (factor * part for part in (one.value, one.lo, one.hi))
             panel.errorbar(
                 value, y, xerr=[[max(value - lo, 0.0)], [max(hi - value, 0.0)]],
-                fmt="D" if pooled else "o", color=DARK if pooled else colour, elinewidth=1.8, markersize=6,
+                fmt="D" if pooled else "o", color=style.DARK if pooled else colour, elinewidth=1.8, markersize=6,
             )  # fmt: skip
-        panel.xaxis.set_major_formatter(lambda value, _: format_tick(value))
-        return svg_element(panel.get_figure(root=True), f"{x_label}, of each recording")  # type: ignore[arg-type]
+        panel.xaxis.set_major_formatter(lambda value, _: style.format_tick(value))
+        return style.svg_element(figure, f"{x_label}, of each recording")
 
 
-def _create_row_panel(names: Sequence[str], x_label: str) -> "Axes":
-    """Return a panel with one row for each name, the first name on top."""
-    panel = create_figure(ROWS_WIDTH_INCHES, 0.75 + ROW_INCHES * len(names)).subplots()
+def _create_row_panel(names: Sequence[str], x_label: str) -> "tuple[Figure, Axes]":
+    """Return a figure and its panel with one row for each name, the first name on top."""
+    figure = style.create_figure(ROWS_WIDTH_INCHES, 0.75 + ROW_INCHES * len(names))
+    panel = figure.subplots()
     short = [name if len(name) <= MAX_NAME_LENGTH else f"{name[: MAX_NAME_LENGTH - 1]}…" for name in names]
     panel.set_yticks(range(len(names)), short)
     panel.set_ylim(len(names) - 0.4, -0.6)
     panel.set_xlabel(x_label)
-    panel.grid(axis="y", color=MINOR_GRID_COLOUR)
-    panel.tick_params(axis="y", length=0)
-    return panel
+    panel.grid(axis="y", color=style.MINOR_GRID_COLOUR)
+    return figure, panel

@@ -18,20 +18,7 @@ from drivers.sample import AXES, Floats
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, Kind, axes_of
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
-from monitor.publishing.plots.style import (
-    DARK,
-    DASHES,
-    GREY,
-    LABEL_BOX,
-    LOG_SCALE_RATIO,
-    SMALL_TEXT,
-    axis_colour,
-    draw_band,
-    draw_legend_above,
-    set_value_limits,
-    style_log_axis,
-    time_unit,
-)
+from monitor.publishing.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -130,7 +117,7 @@ def draw_dynamic_panels(
     axes, letters = shown_axes(dynamic, kind), shown_coefficients(dynamic, kind)
     ratios = [HEAT_MAP_INCHES] * len(axes) + [COEFFICIENT_INCHES] * len(letters)
     panels = list(figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0])
-    unit, unit_s = time_unit(float(dynamic.t_s[-1]))
+    unit, unit_s = style.time_unit(float(dynamic.t_s[-1]))
     edges = _time_edges(dynamic.t_s) / unit_s
     ratio, mesh = _colour_scale_end(divide_by_median(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
     for panel, axis in zip(panels, axes, strict=False):
@@ -153,15 +140,15 @@ def _draw_changes(heat_map: "Axes", others: "Sequence[Axes]", axis: str, times: 
     left, right = heat_map.get_xlim()
     distance = MIN_LABEL_DISTANCE * (right - left)
     for t in times:
-        heat_map.axvline(t, color=DARK, linewidth=1.1, linestyle=DASHES)
+        heat_map.axvline(t, color=style.DARK, linewidth=1.1, linestyle=style.DASHES)
         for panel in others:
-            panel.axvline(t, color=axis_colour(axis), linewidth=1.1, linestyle=DASHES)
+            panel.axvline(t, color=style.axis_colour(axis), linewidth=1.1, linestyle=style.DASHES)
     for near in _group_times(np.clip(times, left + distance / 2.0, right - distance / 2.0).tolist(), distance):
         heat_map.annotate(
             "change" if len(near) == 1 else f"{len(near)} changes", (sum(near) / len(near), 1.0), (0, -4),
             xycoords=("data", "axes fraction"), textcoords="offset points",
-            ha="center", va="top", fontsize=SMALL_TEXT, color=DARK,
-            bbox=LABEL_BOX,
+            ha="center", va="top", fontsize=style.SMALL_TEXT, color=style.DARK,
+            bbox=style.LABEL_BOX,
         )  # fmt: skip
 
 
@@ -193,7 +180,7 @@ def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Float
         cmap="RdBu_r", vmin=-np.log(ratio), vmax=np.log(ratio), alpha=alpha, rasterized=True, linewidth=0,
     )  # fmt: skip
     panel.set_yscale("log")
-    style_log_axis(panel, "y", minor_grid=False)
+    style.style_log_axis(panel, "y", minor_grid=False)
     panel.grid(False)
     panel.set_facecolor("#f4f4f4")
     panel.set_ylabel(f"{axis}   τ, s")
@@ -208,9 +195,9 @@ def _draw_colour_bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "li
     bar = figure.colorbar(ScalarMappable(mesh.norm, mesh.cmap), ax=panels, aspect=30, pad=0.015, fraction=0.05)
     ticks = np.log(ratio) * np.linspace(-1.0, 1.0, 5)
     bar.set_ticks(ticks.tolist(), labels=[f"× {np.exp(tick):.2g}" for tick in ticks])
-    bar.ax.tick_params(labelsize=SMALL_TEXT)
-    bar.set_label("deviation over its median; pale: within 95 %", fontsize=SMALL_TEXT)
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.ax.tick_params(labelsize=style.SMALL_TEXT)
+    bar.set_label("deviation over its median; pale: within 95 %", fontsize=style.SMALL_TEXT)
+    bar.outline.set_visible(False)
 
 
 def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: str, t: Floats) -> None:
@@ -218,27 +205,27 @@ def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: 
     row, unit = SYMBOLS.index(letter), COEFFICIENT_UNITS[kind][letter]
     values, ends = [], []
     for axis in axes_of(kind):
-        i, colour = AXES.index(axis), axis_colour(axis)
+        i, colour = AXES.index(axis), style.axis_colour(axis)
         estimated = dynamic.status[:, row, i] == Status.ESTIMATED
         value, lo, hi = (
             np.where(estimated, part[:, row, i] * unit.factor, np.nan)
             for part in (dynamic.value, dynamic.value_lo, dynamic.value_hi)
         )
-        draw_band(panel, t, lo, hi, colour, rasterized=True)  # hundreds of corners would enlarge a report
+        style.draw_band(panel, t, lo, hi, colour, rasterized=True)  # hundreds of corners would enlarge a report
         panel.plot(t, value, color=colour, label=axis)
         alone = _isolated(estimated)
         panel.plot(t[alone], value[alone], ".", color=colour, markersize=3.5)
         values.append(value)
         ends.append((lo, hi))
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    set_value_limits(panel, low, high, 0.25)
-    if not (low > 0 and high > LOG_SCALE_RATIO * low):
+    style.set_value_limits(panel, low, high, 0.25)
+    if not (low > 0 and high > style.LOG_SCALE_RATIO * low):
         lowest, highest = np.nanquantile(ends, [1.0 - BAND_ENDS_INSIDE, BAND_ENDS_INSIDE]).tolist()
         bottom, top = panel.get_ylim()
         panel.set_ylim(max(min(bottom, lowest), 0.0), max(top, highest))
     panel.set_ylabel(f"{letter}, {unit.name}")
-    panel.set_title(COEFFICIENT_NAMES[kind][letter], fontsize=9, color=GREY, pad=3)
-    draw_legend_above(panel, 3, fontsize=SMALL_TEXT)
+    panel.set_title(COEFFICIENT_NAMES[kind][letter], fontsize=9, color=style.GREY, pad=3)
+    style.draw_legend_above(panel, 3, fontsize=style.SMALL_TEXT)
 
 
 def _isolated(estimated: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -19,20 +19,7 @@ from monitor.estimation.fit.coefficients import SYMBOLS
 from monitor.history.bucket import COUNTS, STATES
 from monitor.history.reading import HistoryTable
 from monitor.history.sqlite_store import StoredEvent
-from monitor.publishing.plots.style import (
-    DARK,
-    DASHES,
-    GREY,
-    LABEL_BOX,
-    ORANGE,
-    SMALL_TEXT,
-    axis_colour,
-    create_figure,
-    draw_band,
-    figure_style,
-    save_figure,
-    set_value_limits,
-)
+from monitor.publishing.plots import style
 from monitor.publishing.terminal.history_text import summary_line
 
 if TYPE_CHECKING:
@@ -81,7 +68,7 @@ def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES
     """
     if not len(past):
         raise NotReady(f"{past.device}: events alone are not drawn; there are no rows in that time")
-    with figure_style():
+    with style.figure_style():
         drawn = {
             kind: [axis for axis in axes_of(kind) if axis in axes and _estimated_coefficients(past, axis)]
             for kind in KINDS
@@ -90,7 +77,7 @@ def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES
         estimated = {letter for kind in kinds for axis in drawn[kind] for letter in _estimated_coefficients(past, axis)}
         letters = [letter for letter in SYMBOLS if letter in estimated]
         rows = len(letters) + (1 if len(kinds) > 1 else 2)
-        figure = create_figure(PANEL_INCHES[0] * len(kinds), SPARE_INCHES + PANEL_INCHES[1] * rows)
+        figure = style.create_figure(PANEL_INCHES[0] * len(kinds), SPARE_INCHES + PANEL_INCHES[1] * rows)
         panels = figure.subplots(rows, len(kinds), squeeze=False, sharex=True)
         for column, kind in enumerate(kinds):
             for panel, letter in zip(panels[:, column], letters, strict=False):
@@ -104,7 +91,7 @@ def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES
             events = [one for one in _select_events(past) if one.axis is None or one.axis in drawn[kind]]
             _draw_events(list(panels[:, column]), events)
         figure.suptitle(summary_line(past))
-        save_figure(figure, path)
+        style.save_figure(figure, path)
 
 
 def _estimated_coefficients(past: HistoryTable, axis: str) -> list[str]:
@@ -117,7 +104,7 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
     unit = COEFFICIENT_UNITS[kind][letter]
     lows, highs = [], []
     for axis in axes:
-        column, colour = past.column(f"{axis}.{letter}"), axis_colour(axis)
+        column, colour = past.column(f"{axis}.{letter}"), style.axis_colour(axis)
         ends = [past.column(f"{axis}.{letter}.{end}").last for end in ("lo", "hi")]
         t, low, high, last, lo, hi = _with_gaps(past, *(
             unit.factor * part for part in (column.low, column.high, column.last, *ends)
@@ -125,14 +112,14 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
         if not np.isfinite(last).any():
             continue
         near = (lo * MAX_INTERVAL_RATIO > last) & (hi < last * MAX_INTERVAL_RATIO)
-        draw_band(panel, t, np.where(near, lo, np.nan), np.where(near, hi, np.nan), colour)
-        draw_band(panel, t, low, high, colour, alpha=EXTREMES_ALPHA)
+        style.draw_band(panel, t, np.where(near, lo, np.nan), np.where(near, hi, np.nan), colour)
+        style.draw_band(panel, t, low, high, colour, alpha=EXTREMES_ALPHA)
         panel.plot(t, last, color=colour, lw=1.1, label=axis)
         lows.append(np.nanmin(low))
         highs.append(np.nanmax(high))
     if lows:
-        set_value_limits(panel, float(min(lows)), float(max(highs)), 0.15)
-        panel.legend(loc="upper left", ncols=3, fontsize=SMALL_TEXT)
+        style.set_value_limits(panel, float(min(lows)), float(max(highs)), 0.15)
+        panel.legend(loc="upper left", ncols=3, fontsize=style.SMALL_TEXT, frameon=True, edgecolor="none")
     else:
         _draw_absence(panel, "never estimated")
     panel.set_ylabel(f"{letter}, {unit.name}")
@@ -144,8 +131,8 @@ def _draw_temperature(panel: "Axes", past: HistoryTable) -> None:
     column = past.column("temperature")
     t, low, high, last = _with_gaps(past, column.low, column.high, column.last)
     if np.isfinite(last).any():
-        draw_band(panel, t, low, high, ORANGE, alpha=EXTREMES_ALPHA)
-        panel.plot(t, last, color=ORANGE, lw=1.1)
+        style.draw_band(panel, t, low, high, style.ORANGE, alpha=EXTREMES_ALPHA)
+        panel.plot(t, last, color=style.ORANGE, lw=1.1)
     else:
         _draw_absence(panel, "no temperature measured")
     panel.set_ylabel("°C")
@@ -156,7 +143,7 @@ def _draw_losses(panel: "Axes", past: HistoryTable) -> None:
     """Draw the number of missing samples by bucket, and the time in which the device was not running."""
     t, width = _days(past.start_s), past.width_s / 86_400.0
     missing = past.counts[:, [COUNTS.index(name) for name in ("lost", "bad", "overflowed")]].sum(axis=1)
-    panel.bar(t, missing, width, align="edge", color=DARK)
+    panel.bar(t, missing, width, align="edge", color=style.DARK)
     for at in np.flatnonzero(past.state >= STATES.index("waiting")):
         panel.axvspan(t[at], t[at] + width[at], color=NOT_RUNNING_COLOUR, alpha=0.18, lw=0)
     panel.set_ylim(0, max(float(missing.max()) * 1.15, 1.0))
@@ -166,14 +153,13 @@ def _draw_losses(panel: "Axes", past: HistoryTable) -> None:
 
 def _draw_absence(panel: "Axes", text: str) -> None:
     """Write in the middle of a panel why it is empty."""
-    panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", color=GREY)
+    panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", color=style.GREY)
 
 
 def _draw_title(panel: "Axes", text: str) -> None:
     """Write the title of a panel inside it, because event labels are above it."""
-    panel.text(
-        0.995, 0.95, text, transform=panel.transAxes, ha="right", va="top", fontsize=9, color=GREY, bbox=LABEL_BOX
-    )
+    place: dict[str, Any] = {"transform": panel.transAxes, "ha": "right", "va": "top", "bbox": style.LABEL_BOX}
+    panel.text(0.995, 0.95, text, fontsize=9, color=style.GREY, **place)
 
 
 def _select_events(past: HistoryTable) -> list[StoredEvent]:
@@ -189,9 +175,9 @@ def _draw_events(panels: "Sequence[Axes]", events: Sequence[StoredEvent]) -> Non
     last_label = -np.inf
     for event in events:
         t = float(_days(np.array([event.t_s]))[0])
-        colour = GREY if event.axis is None else axis_colour(event.axis)
+        colour = style.GREY if event.axis is None else style.axis_colour(event.axis)
         for panel in panels:
-            panel.axvline(t, color=colour, lw=0.9, ls=DASHES, alpha=0.6)
+            panel.axvline(t, color=colour, lw=0.9, ls=style.DASHES, alpha=0.6)
         if t - last_label < MIN_LABEL_DISTANCE * (right - left):
             continue
         last_label = t

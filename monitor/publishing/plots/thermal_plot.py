@@ -9,15 +9,7 @@ from monitor.common.units import DEVIATION_UNITS, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_model import Prediction, predict
 from monitor.drift.thermal.thermal_study import ThermalFitReport, ThermalPredictionReport
-from monitor.publishing.plots.style import (
-    GREY,
-    axis_colour,
-    create_figure,
-    draw_band,
-    draw_legend_above,
-    figure_style,
-    save_figure,
-)
+from monitor.publishing.plots import style
 from monitor.publishing.rerun.panels import format_duration
 
 ROW_INCHES: Final = (11.0, 2.6)
@@ -75,26 +67,26 @@ def save_thermal_prediction_plot(report: ThermalPredictionReport, path: Path) ->
 
 def _save_plot(rows: list[tuple[str, IntervalMeans, Prediction, str]], title: str, path: Path) -> None:
     """Draw one row for each axis, and write the plot."""
-    with figure_style():
-        figure = create_figure(ROW_INCHES[0], 0.6 + ROW_INCHES[1] * len(rows))
+    with style.figure_style():
+        figure = style.create_figure(ROW_INCHES[0], 0.6 + ROW_INCHES[1] * len(rows))
         panels = figure.subplots(len(rows), 2, squeeze=False, sharex="col", sharey="row", width_ratios=[2.4, 1.0])
         for (over_time, against_temperature), (axis, means, model, name) in zip(panels, rows, strict=True):
-            unit, colour = DEVIATION_UNITS[sensor_kind(axis)], axis_colour(axis)
-            hours = (np.arange(means.bias.size) + 0.5) * means.interval_s / 3600.0
+            unit, colour = DEVIATION_UNITS[sensor_kind(axis)], style.axis_colour(axis)
+            hours = np.asarray((np.arange(means.bias.size) + 0.5) * means.interval_s / 3600.0, np.float64)
             centre = float(np.nanmean(means.bias))
             bias, predicted, lo, hi = (
                 unit.factor * (part - centre) for part in (means.bias, model.bias, model.lo, model.hi)
             )
-            draw_band(over_time, hours, lo, hi, colour, label="95 %")
+            style.draw_band(over_time, hours, lo, hi, colour, label="95 %")
             over_time.errorbar(
-                hours, bias, unit.factor * means.error, fmt=".", markersize=4, color=GREY, lw=0.8, label="means"
+                hours, bias, unit.factor * means.error, fmt=".", markersize=4, color=style.GREY, lw=0.8, label="means"
             )
             over_time.plot(hours, predicted, color=colour, label=name)
             over_time.set_ylabel(f"{axis} minus its mean, {unit.name}")
-            draw_legend_above(over_time, 3, fontsize=7.5)
-            against_temperature.plot(means.temperature_c, bias, ".", markersize=4, color=GREY)
+            style.draw_legend_above(over_time, 3, fontsize=7.5)
+            against_temperature.plot(means.temperature_c, bias, ".", markersize=4, color=style.GREY)
             against_temperature.plot(means.temperature_c, predicted, color=colour, lw=1.2)
         panels[-1, 0].set_xlabel("time, h")
         panels[-1, 1].set_xlabel("temperature, °C")
         figure.suptitle(title)
-        save_figure(figure, path)
+        style.save_figure(figure, path)

@@ -5,14 +5,12 @@ the units of the field, facts about the recording, notes, and the dynamic Allan 
 are images inside the SVG, so that the page stays below one megabyte.
 """
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
 from monitor.common.units import COEFFICIENT_NAMES, KIND_NAMES, Kind, axes_of, format_number
-from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.analysis import Analysis
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
@@ -22,9 +20,9 @@ from monitor.publishing.coefficient_cells import (
     format_coefficient,
     mark_temperature_axis,
 )
-from monitor.publishing.plots.allan_figure import LEGEND_TEXT, OtherDeviation, draw_allan_panel
-from monitor.publishing.plots.analysis_plot import is_k_or_r, measured_kinds
-from monitor.publishing.plots.dynamic_figure import ChangeMark, draw_dynamic_panels, height_inches
+from monitor.publishing.plots.allan_figure import LEGEND_TEXT, draw_allan_panel
+from monitor.publishing.plots.analysis_plot import DrawnAnalysis, is_k_or_r, measured_kinds
+from monitor.publishing.plots.dynamic_figure import draw_dynamic_panels, height_inches
 from monitor.publishing.plots.style import axis_colour, create_figure, figure_style, svg_element
 from monitor.publishing.reports.html_page import render_template
 from monitor.publishing.rerun.panels import format_duration
@@ -33,64 +31,45 @@ ALLAN_INCHES: Final = (7.2, 5.2)
 STATUS_TEXTS: Final = {Status.UPPER_BOUND: "(upper bound)", Status.UNESTIMATED: "(too few data)"}
 
 
-def write_html_report(
-    analysis: Analysis,
-    path: Path,
-    title: str = "",
-    others: Sequence[OtherDeviation] = (),
-    dynamic: DynamicAllan | None = None,
-    marks: Sequence[ChangeMark] = (),
-) -> None:
+def write_html_report(drawn: DrawnAnalysis, path: Path, title: str = "") -> None:
     """Write the page to a file.
 
     Parameters
     ----------
-    analysis
-        The analysis.
+    drawn
+        Analysis of the recording.
     path
         File to write.
     title
         Title of the page.
-    others
-        Other deviations, such as total and Hadamard deviation.
-    dynamic
-        Dynamic Allan deviation of the same recording.
-    marks
-        Changes to mark in the dynamic Allan deviation.
 
     Raises
     ------
     ConfigError
         If matplotlib or Jinja2 is missing, or if the file cannot be written.
     """
-    page = render_page(analysis, title, others, dynamic, marks)
+    page = render_page(drawn, title)
     try:
         path.write_text(page, "utf-8")
     except OSError as error:
         raise ConfigError(f"cannot write the report {path}: {error}") from error
 
 
-def render_page(
-    analysis: Analysis,
-    title: str = "",
-    others: Sequence[OtherDeviation] = (),
-    dynamic: DynamicAllan | None = None,
-    marks: Sequence[ChangeMark] = (),
-) -> str:
+def render_page(drawn: DrawnAnalysis, title: str = "") -> str:
     """Return the page as text. The parameters and errors are those of ``write_html_report``."""
-    estimate = analysis.estimate
+    analysis = drawn.analysis
     return render_template(
         "report.html.j2",
         title=title or "Recording",
         facts=recording_facts(analysis),
         notes=analysis.notes,
-        parts=[_part(estimate, kind, others, dynamic, marks) for kind in measured_kinds(estimate)],
+        parts=[_part(drawn, kind) for kind in measured_kinds(analysis.estimate)],
         axis_colour=axis_colour,
         mark_axis=lambda axis: mark_temperature_axis(axis, analysis.axes_of_temperature),
-        format_cell=lambda letter, axis: format_cell(estimate, letter, axis),
+        format_cell=lambda letter, axis: format_cell(analysis.estimate, letter, axis),
         temperature=f"{TEMPERATURE_MARK} {TEMPERATURE_MEANS}." if analysis.axes_of_temperature else "",
         legend=LEGEND_TEXT,
-        window="" if dynamic is None else format_duration(dynamic.window_s),
+        window="" if drawn.dynamic is None else format_duration(drawn.dynamic.window_s),
     )
 
 
@@ -128,24 +107,16 @@ def format_cell(estimate: Estimate, letter: str, axis: str) -> tuple[str, str]:
     return value, STATUS_TEXTS.get(status, text.interval)
 
 
-def _part(
-    estimate: Estimate,
-    kind: Kind,
-    others: Sequence[OtherDeviation],
-    dynamic: DynamicAllan | None,
-    marks: Sequence[ChangeMark],
-) -> dict[str, Any]:
+def _part(drawn: DrawnAnalysis, kind: Kind) -> dict[str, Any]:
     """Return the values of the template for one kind of sensor."""
     name, heat_maps = KIND_NAMES[kind], ""
     with figure_style():
         figure = create_figure(*ALLAN_INCHES)
-        draw_allan_panel(figure.subplots(), estimate, kind, others)
+        draw_allan_panel(figure.subplots(), drawn.analysis.estimate, kind, drawn.others)
         allan = svg_element(figure, f"{name}: Allan deviation over averaging time")
-        if dynamic is not None:
-            figure = create_figure(ALLAN_INCHES[0], height_inches(dynamic, kind))
-            draw_dynamic_panels(figure, dynamic, kind, marks)
+        if drawn.dynamic is not None:
+            figure = create_figure(ALLAN_INCHES[0], height_inches(drawn.dynamic, kind))
+            draw_dynamic_panels(figure, drawn.dynamic, kind, drawn.marks)
             heat_maps = svg_element(figure, f"{name}: Allan deviation and coefficients over time")
-    return {
-        "name": name, "axes": axes_of(kind), "coefficients": COEFFICIENT_NAMES[kind], "allan": allan,
-        "dynamic": heat_maps,
-    }  # fmt: skip
+    texts = {"name": name, "axes": axes_of(kind), "coefficients": COEFFICIENT_NAMES[kind]}
+    return texts | {"allan": allan, "dynamic": heat_maps}

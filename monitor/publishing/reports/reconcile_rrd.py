@@ -42,14 +42,9 @@ MAX_PLOTTED_DIAGNOSTICS: Final = 2  # number of diagnostics drawn per axis; the 
 BAND_COLOUR: Final = colours.blend(colours.FRAME, 0.55)
 LEGEND_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
 RANGE_COLOUR: Final = colours.TEMPERATURE  # orange, as on the HTML page
-GAP_LINE_COLOURS: Final = (  # colours of the gap lines; more lines would not fit into the legend
-    (240, 98, 77),
-    (45, 190, 130),
-    (84, 160, 255),
-    (236, 180, 72),
-    (190, 130, 230),
-    (150, 160, 170),
-)
+GAP_LINE_COLOURS: Final = (  # more lines would not fit into the legend
+    *(colours.AXIS_COLOURS[axis] for axis in AXES[:3]), colours.TEMPERATURE, (190, 130, 230), (150, 160, 170),
+)  # fmt: skip
 
 
 def write_rrd(r: Reconciliation, path: Path) -> None:
@@ -65,7 +60,7 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
     Raises
     ------
     ConfigError
-        The file cannot be written.
+        If the file cannot be written.
     """
     try:
         path.open("wb").close()
@@ -75,15 +70,15 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.save(path, default_blueprint=blueprint(r))
-    stream.log("overview", _markdown(overview(r)), static=True)
+    stream.log("overview", _markdown(_overview(r)), static=True)
     for axis in _axes(r):
-        _axis(stream, r, r.axes[axis])
+        _log_axis(stream, r, r.axes[axis])
     stream.flush()
     stream.disconnect()
 
 
 def blueprint(r: Reconciliation) -> rrb.Blueprint:
-    """Return the layout: a tab per axis, those that disagree with the model first, and a tab for all axes."""
+    """Return the layout: a tab per axis, those that differ from the model first, and a tab for all axes."""
     axes = sorted(_axes(r), key=lambda axis: r.axes[axis].verdict == "agrees")
     tabs: list[rrb.View | rrb.Container] = [_tab(r.axes[axis]) for axis in axes]
     tabs.append(rrb.TextDocumentView(origin="/overview", contents="$origin", name="All axes"))
@@ -97,14 +92,14 @@ def blueprint(r: Reconciliation) -> rrb.Blueprint:
     )
 
 
-def overview(r: Reconciliation) -> str:
+def _overview(r: Reconciliation) -> str:
     """Return the overview of all axes as Markdown."""
     rows = []
     for axis in _axes(r):
         result = r.axes[axis]
-        did = "; ".join(f"{step.kind} {words.describe_step(step, axis, r.baseline)}" for step in result.steps)
-        left = "; ".join(words.describe_gap(one, axis) for one in result.left_over)
-        rows.append(f"| **{axis}** | {words.RESULT_TEXTS[result.verdict]} | {did or '—'} | {left or '—'} |")
+        steps = "; ".join(f"{step.kind} {words.describe_step(step, axis, r.baseline)}" for step in result.steps)
+        left_over = "; ".join(words.describe_gap(one, axis) for one in result.left_over)
+        rows.append(f"| **{axis}** | {words.RESULT_TEXTS[result.verdict]} | {steps or '—'} | {left_over or '—'} |")
     head = "| axis | verdict | added or retuned | left over |\n|:--|:--|:--|:--|"
     recorded = f"{r.samples:,} samples at {r.rate_hz:.6g} Hz, {format_duration(r.duration_s)}"
     notes = [f"note: {note}" for note in r.notes]
@@ -113,16 +108,8 @@ def overview(r: Reconciliation) -> str:
     )
 
 
-def steps_text(r: Reconciliation, result: AxisResult) -> str:
-    """Return the steps and the unexplained remainder of one axis as Markdown.
-
-    Parameters
-    ----------
-    r
-        Result of the reconciliation.
-    result
-        Result of the axis.
-    """
+def _steps_text(r: Reconciliation, result: AxisResult) -> str:
+    """Return the steps and the unexplained differences of one axis as Markdown."""
     parts = [f"## {result.axis}: {words.RESULT_TEXTS[result.verdict]}", words.describe_result(result)]
     for count, step in enumerate(result.steps, start=1):
         known = words.format_parameters(step, result.axis, r.baseline)
@@ -147,12 +134,12 @@ def _axes(r: Reconciliation) -> list[str]:
     return [axis for axis in AXES if axis in r.axes]
 
 
-def _looks_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
+def _snapshots_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
     """Return the diagnostics with the first model and after each step; the last one excludes withdrawn effects."""
     return [result.start, *(step.look for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
-def _lenses(result: AxisResult) -> list[str]:
+def _drawn_diagnostics(result: AxisResult) -> list[str]:
     """Return the logarithmic diagnostics of an axis that are drawn."""
     return [view.lens for view in result.start.views if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
@@ -172,7 +159,7 @@ def _tab(result: AxisResult) -> rrb.Container:
         rrb.Horizontal(
             *(_diagnostic_view(result, lens, when) for when in (("before", "after") if steps else ("before",)))
         )
-        for lens in _lenses(result)
+        for lens in _drawn_diagnostics(result)
     ]
     name = f"{axis}: {words.RESULT_TEXTS[result.verdict]}"
     return rrb.Horizontal(left, rrb.Vertical(*rows), column_shares=[3, 7], name=name)
@@ -192,26 +179,28 @@ def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
     )
 
 
-def _axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
+def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
     """Log all entities of one axis."""
-    stream.log(f"{result.axis}/steps", _markdown(steps_text(r, result)), static=True)
-    for lens in _lenses(result):
-        _lens(stream, result, lens)
+    stream.log(f"{result.axis}/steps", _markdown(_steps_text(r, result)), static=True)
+    for lens in _drawn_diagnostics(result):
+        _log_diagnostic(stream, result, lens)
     _log_gaps(stream, result)
 
 
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
     """Log the gap of each diagnostic relative to its threshold, for the largest gaps, and the threshold, which is 1."""
-    looks = [{score.lens: words.gap_ratio(score) for score in look.scores} for look in _looks_by_step(result)]
+    snapshots = [
+        {score.lens: words.gap_ratio(score) for score in snapshot.scores} for snapshot in _snapshots_by_step(result)
+    ]
     path = f"{result.axis}/gap"
-    largest = sorted(looks[0], key=lambda lens: -max(look.get(lens, 0.0) for look in looks))
+    largest = sorted(snapshots[0], key=lambda lens: -max(snapshot.get(lens, 0.0) for snapshot in snapshots))
     for lens, tint in zip(largest, GAP_LINE_COLOURS, strict=False):
         line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.diagnostic_name(lens)])
         stream.log(f"{path}/{lens}", line, static=True)
-        _log_by_step(stream, f"{path}/{lens}", [look.get(lens, np.nan) for look in looks])
+        _log_by_step(stream, f"{path}/{lens}", [snapshot.get(lens, np.nan) for snapshot in snapshots])
     line = rr.SeriesLines(colors=[colours.TEXT], widths=[1.0], names=["threshold"])
     stream.log(f"{path}/threshold", line, static=True)
-    _log_by_step(stream, f"{path}/threshold", [1.0] * len(looks))
+    _log_by_step(stream, f"{path}/threshold", [1.0] * len(snapshots))
 
 
 def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float]) -> None:
@@ -220,10 +209,12 @@ def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float])
     stream.send_columns(path, [steps], rr.Scalars.columns(scalars=np.array(values)))
 
 
-def _lens(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
+def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
     """Log both plots of one diagnostic with the same scale."""
     axis = result.axis
-    views = [next((view for view in look.views if view.lens == lens), None) for look in _looks_by_step(result)]
+    views = [
+        next((view for view in snapshot.views if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
+    ]
     plots = {step: to_field_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
     scale = Scale(decades(plot.x for plot in every), decades([np.array(value_limits(every))]))
