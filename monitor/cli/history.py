@@ -104,7 +104,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
         payload = history_message.encode_history(past, asked, newest_s, int(past.counts[:, 0].sum()))
         output.write("--json", json, payload + b"\n")
     if out is not None:
-        history_file.save(past, out)
+        history_file.save_history(past, out)
     if plot is not None:
         from monitor.publishing.plots.history_plot import save_history_plot
 

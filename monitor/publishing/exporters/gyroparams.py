@@ -26,7 +26,7 @@ N_POLES: Final = 500
 
 
 def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
-    """Return the script; for its properties see the module.
+    """Return the text of the MATLAB script.
 
     Parameters
     ----------

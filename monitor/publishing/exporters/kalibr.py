@@ -44,9 +44,9 @@ def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/i
     Raises
     ------
     ConfigError
-        The model has no sample rate or lacks N or K on one kind of sensor.
+        If the model has no sample rate or lacks N or K on one kind of sensor.
     NotReady
-        The analysed recording does not determine N or K on one kind of sensor.
+        If the analysed recording does not determine N or K on one kind of sensor.
     """
     if noise.sample_rate_hz is None:
         raise ConfigError("kalibr needs an update_rate, and the model has no sample_rate")

@@ -6,11 +6,13 @@ Error model of one gyroscope (for an accelerometer, velocity replaces the angle)
 
 The rate has white noise of density N². Flicker noise has no finite-dimensional state model, so a first-order
 Gauss-Markov process approximates it. The Allan deviation of this process peaks at 0.618 σ and τ = 1.89 T (IEEE Std
-952). The peak equals the flicker floor 0.664 B and lies in the middle (of log τ) of the range in which flicker
-dominates. This range extends from τ = N²/(0.664 B)² to 3 (0.664 B)²/K², so its middle is √3 N/K. Without N or K the
-range is not bounded. T must then be given, or B is omitted and the file says so.
+952). σ is chosen so that the peak equals the Allan deviation of flicker noise, 0.664 B. T is chosen so that the peak
+lies in the middle (of log τ) of the range in which flicker noise dominates. This range extends from τ = N²/(0.664 B)²
+to 3 (0.664 B)²/K², so its middle is √3 N/K. Without N or K the range is not bounded. T must then be given, or B is
+omitted and a comment in the file says so.
 
-An upper bound is used as if it were the value, because a larger process noise is the safer choice. The file says where.
+An upper bound is used as if it were the value, because a larger process noise is the safer choice. A comment in the
+file names the coefficient.
 """
 
 import math
@@ -64,14 +66,14 @@ def kalman(
     inflation
         Factor on N, B and K.
     dt_s
-        Time step [s]. None: the sample period.
+        Time step [s]. By default, the sample period.
     correlation_time_s
-        Correlation time T of the Gauss-Markov process [s]. None: computed from N and K, see the module.
+        Correlation time T of the Gauss-Markov process [s]. By default, T is computed from N and K.
 
     Raises
     ------
     ConfigError
-        The time step is unknown or not valid, or the correlation time is not valid.
+        If the time step is unknown, or if the time step or the correlation time is outside the supported range.
     """
     step_s = 1.0 / noise.sample_rate_hz if dt_s is None and noise.sample_rate_hz else dt_s
     if step_s is None or not DURATION_S.supports(step_s):
@@ -95,32 +97,20 @@ def kalman(
     return join_lines([*lines, *omitted_comment(noise, "NBK", "#")])
 
 
-def markov_sigma(B: float) -> float:
-    """Return σ of the Gauss-Markov process whose peak Allan deviation equals the floor of flicker noise.
+def _markov_sigma(B: float) -> float:
+    """Return σ of the Gauss-Markov process whose peak Allan deviation equals the Allan deviation of flicker noise.
 
-    >>> round(markov_sigma(1.0), 3)
+    >>> round(_markov_sigma(1.0), 3)
     1.075
-
-    Parameters
-    ----------
-    B
-        Bias instability, in the unit of the result.
     """
     return float(np.sqrt(BiasInstability(B).avar(FLICKER_TAU_S, 1.0)[0])) / MARKOV_PEAK_RATIO
 
 
-def markov_time_s(N: float, K: float) -> float:
+def _markov_time_s(N: float, K: float) -> float:
     """Return the correlation time [s] of the process that peaks at τ = √3 N/K, the middle of the flicker range.
 
-    >>> round(markov_time_s(N=1.5e-4, K=1.5e-6), 1)
+    >>> round(_markov_time_s(N=1.5e-4, K=1.5e-6), 1)
     91.6
-
-    Parameters
-    ----------
-    N
-        White noise, in rad/√s or m/s/√s.
-    K
-        Rate random walk, in rad/s/√s or m/s²/√s.
     """
     return math.sqrt(3.0) * N / K / MARKOV_PEAK_AT
 
@@ -178,14 +168,14 @@ def _axis(
     kind = sensor_kind(axis)
     rate, drift = ascii_unit("B", kind), ascii_unit("R", kind)
     N, B, K = (terms[letter].value * inflation if letter in terms else 0.0 for letter in "NBK")
-    time_s = correlation_time_s or (markov_time_s(N, K) if N and K else None)
+    time_s = correlation_time_s or (_markov_time_s(N, K) if N and K else None)
     lines = _remarks(terms)
     states = ["angle" if kind == "gyro" else "velocity", "bias_walk"]
     densities = [
         f"psd_white = {number(N**2)}  # ({rate})^2/Hz, N^2",
         f"psd_walk = {number(K**2)}  # ({drift})^2/Hz, K^2",
     ]
-    sigma = markov_sigma(B)
+    sigma = _markov_sigma(B)
     if B and time_s is None:
         lines.append("# B is left out: without N and K its correlation time must be given (--correlation-time S)")
     elif B and time_s is not None:

@@ -152,7 +152,7 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
     Raises
     ------
     ConfigError
-        The text is not the JSON of an analysis, or its rate is not valid.
+        If the text is not the JSON of an analysis, or if the rate is outside the supported range.
     """
     try:
         found = msgspec.json.decode(text, type=_Analysis)
@@ -182,12 +182,12 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
 
 
 def missing_coefficient_error(noise: NoiseCoefficients, text: str) -> ImuError:
-    """Return the exception for a source that lacks a coefficient: NotReady for a recording, else ConfigError.
+    """Return NotReady if a recording lacks a coefficient, and ConfigError if a noise model lacks one.
 
     Parameters
     ----------
     noise
-        The source.
+        Coefficients of the recording or the model.
     text
         Message.
     """

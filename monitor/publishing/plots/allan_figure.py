@@ -30,6 +30,7 @@ MARKER_SIZES: Final = (8.2, 5.0, 3.8)  # points
 RING_SIZES: Final = (12.0, 8.5, 5.0)  # points
 FIT_DASHES: Final = ((0, (4, 8)), (4, (4, 8)), (8, (4, 8)))
 READING_TAU_S: Final = {"Q": 3.0**0.5, "N": 1.0, "K": 3.0, "R": 2.0**0.5}  # τ at which the term's deviation equals it
+LINE_TAU_S: Final = np.array([1e-6, 1e9])  # ends of the line of a term, beyond any plot
 TAU0_S: Final = 1e-9  # sample interval for the line of a term; so short that sampling has no effect on the line
 LEGEND_TEXT: Final = (
     "○ a coefficient, read on its own line: Q at √3 s, N at 1 s, K at 3 s, R at √2 s; 0.664 B where the curve is lowest"
@@ -94,9 +95,6 @@ class _Ring:
     sigma: float  # deviation in the unit of the field
     number: int  # 0, 1 or 2 for x, y or z
     line: Floats  # deviation of the term in the unit of the field, at both ends of LINE_TAU_S
-
-
-LINE_TAU_S: Final = np.array([1e-6, 1e9])
 
 
 def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequence[OtherDeviation] = ()) -> None:

@@ -44,31 +44,15 @@ class ChangeMark:
     axis: str
 
 
-def shown_coefficients(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
-    """Return the coefficients that are estimated often enough to have a panel.
-
-    Parameters
-    ----------
-    dynamic
-        Dynamic Allan deviation.
-    kind
-        Kind of sensor.
-    """
+def _shown_coefficients(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
+    """Return the coefficients that are estimated often enough to have a panel."""
     columns = [AXES.index(axis) for axis in axes_of(kind)]
     share = (dynamic.status[:, :, columns] == Status.ESTIMATED).mean(axis=0).max(axis=1)
     return tuple(letter for letter, one in zip(SYMBOLS, share, strict=True) if one >= MIN_ESTIMATED_SHARE)
 
 
-def shown_axes(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
-    """Return the measured axes of a kind of sensor.
-
-    Parameters
-    ----------
-    dynamic
-        Dynamic Allan deviation.
-    kind
-        Kind of sensor.
-    """
+def _shown_axes(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
+    """Return the measured axes of a kind of sensor."""
     return tuple(a for a in axes_of(kind) if bool(np.isfinite(dynamic.deviation[:, :, AXES.index(a)]).any()))
 
 
@@ -82,7 +66,7 @@ def height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
     kind
         Kind of sensor.
     """
-    heat_maps, coefficients = len(shown_axes(dynamic, kind)), len(shown_coefficients(dynamic, kind))
+    heat_maps, coefficients = len(_shown_axes(dynamic, kind)), len(_shown_coefficients(dynamic, kind))
     return SPARE_INCHES + HEAT_MAP_INCHES * heat_maps + COEFFICIENT_INCHES * coefficients
 
 
@@ -114,7 +98,7 @@ def draw_dynamic_panels(
     marks
         Changes of all axes; those of this kind are drawn.
     """
-    axes, letters = shown_axes(dynamic, kind), shown_coefficients(dynamic, kind)
+    axes, letters = _shown_axes(dynamic, kind), _shown_coefficients(dynamic, kind)
     ratios = [HEAT_MAP_INCHES] * len(axes) + [COEFFICIENT_INCHES] * len(letters)
     panels = list(figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0])
     unit, unit_s = style.time_unit(float(dynamic.t_s[-1]))

@@ -46,7 +46,7 @@ from monitor.publishing.plots.style import (
     style_log_axis,
 )
 from tests.experiments.benchmarks.machine import console, table
-from tests.experiments.pictures import small
+from tests.experiments.pictures import reduce_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -229,7 +229,7 @@ def main() -> None:
     )
     draw(recorded, simulated, out, title)
     figures(recorded, simulated)
-    print(f"{small(out)} ({out.stat().st_size / 1e3:.0f} kB)")
+    print(f"{reduce_colours(out)} ({out.stat().st_size / 1e3:.0f} kB)")
 
 
 if __name__ == "__main__":

@@ -93,8 +93,8 @@ def test_a_span_of_events_alone_is_printed() -> None:
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_a_file_has_every_number_with_its_unit(tmp_path: Path, suffix: str) -> None:
     past, path = made(), tmp_path / f"h{suffix}"
-    history_file.save(past, path)
-    columns = history_file.table(past)
+    history_file.save_history(past, path)
+    columns = history_file.history_columns(past)
     assert {"t (Unix s)", "gz.N (rad/sqrt(s))", "gz.N high (rad/sqrt(s))", "az.R.bound (m/s^3)"} <= set(columns)
     np.testing.assert_array_equal(columns["gz.N high (rad/sqrt(s))"], past.column("gz.N").high)
     np.testing.assert_array_equal(columns["lost (samples)"], past.counts[:, 1])
@@ -129,7 +129,7 @@ def read_back(path: Path, suffix: str) -> dict[str, np.ndarray]:
 
 def test_a_suffix_that_is_none_is_said(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"known are \.csv"):
-        history_file.save(made(), tmp_path / "h.doc")
+        history_file.save_history(made(), tmp_path / "h.doc")
 
 
 @pytest.mark.long

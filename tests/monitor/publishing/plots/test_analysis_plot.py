@@ -176,17 +176,17 @@ def test_colours_are_of_the_deviation_over_its_median(changing: DynamicAllan) ->
 def test_only_coefficients_that_are_estimated_have_a_panel(changing: DynamicAllan) -> None:
     status = np.full_like(changing.status, Status.UPPER_BOUND)
     status[:, 1] = Status.ESTIMATED
-    assert dynamic_figure.shown_coefficients(replace(changing, status=status), "gyro") == ("N",)
+    assert dynamic_figure._shown_coefficients(replace(changing, status=status), "gyro") == ("N",)
     status[:2, 3, 1] = Status.ESTIMATED  # for a moment only
-    assert "K" not in dynamic_figure.shown_coefficients(replace(changing, status=status), "gyro")
+    assert "K" not in dynamic_figure._shown_coefficients(replace(changing, status=status), "gyro")
     status[:20, 3, 1] = Status.ESTIMATED
-    assert "K" in dynamic_figure.shown_coefficients(replace(changing, status=status), "gyro")
+    assert "K" in dynamic_figure._shown_coefficients(replace(changing, status=status), "gyro")
 
 
 def test_an_axis_without_data_has_no_surface(changing: DynamicAllan) -> None:
     deviation = changing.deviation.copy()
     deviation[:, :, 1] = np.nan
-    assert dynamic_figure.shown_axes(replace(changing, deviation=deviation), "gyro") == ("gx", "gz")
+    assert dynamic_figure._shown_axes(replace(changing, deviation=deviation), "gyro") == ("gx", "gz")
 
 
 def test_one_single_step_can_be_drawn() -> None:

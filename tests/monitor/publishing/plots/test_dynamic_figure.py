@@ -13,8 +13,8 @@ from monitor.publishing.plots.dynamic_figure import (
     MIN_LABEL_DISTANCE,
     ChangeMark,
     _group_times,
+    _shown_coefficients,
     draw_dynamic_panels,
-    shown_coefficients,
 )
 from monitor.publishing.plots.style import COLOURS, DARK, time_unit
 
@@ -29,7 +29,7 @@ def panels(found: DynamicAllan, marks: list[ChangeMark], kind: str = "gyro"):
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=(7.2, 8.0), layout="constrained")
     draw_dynamic_panels(figure, found, kind, marks)
     figure.draw_without_rendering()
-    count = 3 + len(shown_coefficients(found, kind))
+    count = 3 + len(_shown_coefficients(found, kind))
     return figure.axes[:count]
 
 
@@ -88,7 +88,7 @@ def test_heaps_lie_apart_whatever_the_times() -> None:
 def test_courses_hold_their_values_and_most_of_their_bands(white: DynamicAllan) -> None:
     *_, n = panels(white, [])
     gyros = [AXES.index(axis) for axis in ("gx", "gy", "gz")]
-    assert shown_coefficients(white, "gyro")[-1] == "N"
+    assert _shown_coefficients(white, "gyro")[-1] == "N"
     estimated = white.status[:, 1, gyros] == Status.ESTIMATED
     factor = np.degrees(1.0) * 60.0
     low, high = n.get_ylim()
