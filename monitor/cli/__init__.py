@@ -377,9 +377,9 @@ def thermal_fit(
     if out is not None:
         output.write("--out", out, thermal.write_model_file(study) + b"\n")
     if plot is not None:
-        from monitor.publishing.plots.thermal_plot import study_plot
+        from monitor.publishing.plots.thermal_plot import save_thermal_fit_plot
 
-        study_plot(study, plot)
+        save_thermal_fit_plot(study, plot)
     if Path("-") not in (json, out):
         text.print_thermal_fit(study, Console())
 
@@ -408,9 +408,9 @@ def thermal_predict(
     if not outlook.judged:
         raise NotReady("; ".join(f"{axis}: {why}" for axis, why in outlook.refused.items()))
     if plot is not None:
-        from monitor.publishing.plots.thermal_plot import outlook_plot
+        from monitor.publishing.plots.thermal_plot import save_thermal_prediction_plot
 
-        outlook_plot(outlook, plot)
+        save_thermal_prediction_plot(outlook, plot)
     if json != Path("-"):
         text.print_thermal_prediction(outlook, Console())
 

@@ -49,8 +49,8 @@ def compensate(
     if json is not None:
         output.write("--json", json, text.encode_compensation(result) + b"\n")
     if plot is not None:
-        from monitor.publishing.plots.compensate_plot import compensate_plot
+        from monitor.publishing.plots.compensate_plot import save_compensation_plot
 
-        compensate_plot(result, plot)
+        save_compensation_plot(result, plot)
     if json != Path("-"):
         text.print_compensation(result, Console())

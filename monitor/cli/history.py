@@ -104,11 +104,11 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
         message = HistoryMessage.reply(past, asked, newest_s, int(past.counts[:, 0].sum()))
         output.write("--json", json, message.encode() + b"\n")
     if out is not None:
-        history_file.save(past, out)
+        history_file.save_history(past, out)
     if plot is not None:
-        from monitor.publishing.plots.history_plot import history_plot
+        from monitor.publishing.plots.history_plot import save_history_plot
 
-        history_plot(past, plot, asked.axes)
+        save_history_plot(past, plot, asked.axes)
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:

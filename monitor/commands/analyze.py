@@ -150,17 +150,17 @@ def draw_plots(results: Results, path: Path, title: str) -> None:
     ConfigError
         The plotting library is not installed, or the file cannot be written.
     """
+    from monitor.publishing.plots.analysis_plot import DrawnAnalysis, save_analysis_plot
+
     result = results.analysis
-    beside = other_deviations(results.total, results.hadamard)
     marks = [ChangeMark(change.since / result.estimate.rate_hz, AXES[change.axis]) for change in result.changes]
+    drawn = DrawnAnalysis(result, other_deviations(results.total, results.hadamard), results.dynamic, marks)
     if path.suffix == ".html":
-        from monitor.publishing.reports.analysis_report import html_report
+        from monitor.publishing.reports.analysis_report import write_html_report
 
-        html_report(result, path, title, beside, results.dynamic, marks)
+        write_html_report(drawn, path, title)
     else:
-        from monitor.publishing.plots.analysis_plot import allan_plot
-
-        allan_plot(result.estimate, path, title, beside, results.dynamic, marks, result.axes_of_temperature)
+        save_analysis_plot(drawn, path, title)
 
 
 def _without_temperature(

@@ -1,14 +1,10 @@
 """Make every picture of the viewer and of the plots in the documentation: ``python -m tests.experiments.pictures``.
 
-Nothing is drawn by hand. The shipped model ``consumer-mems``, with the temperature of a sensor that warms up, is
-simulated into a recording; ``Service`` replays an hour of it sixty times as fast into a native viewer without a
-screen (software Vulkan), then into the page inside a real Chromium, driven by its DevTools protocol, and is stopped
-as by a signal; ``imu-monitor analyze`` makes the plot of the same hour. ``imu-monitor reconcile`` finds what was
-hidden in an hour of the model, before and after. Curves over time, in the viewer, the picture and the page, are those
-of the same hour with a gyroscope that becomes noisier. Bias beside temperature is that of two days of ``stim300``,
-replayed faster still, drift that of ``adis16470``, which is turned now and then. The fleet are simulated devices in
-real time; one cable is pulled and put back, another is pulled for good. ``demo --effect`` runs in real time too. Needs
-the packages chromium, mesa-vulkan-drivers and libvulkan1 (Debian's names); network traffic stays on loopback.
+The sensors are simulated, and the program draws everything else. ``Service`` replays a recording of the model
+``consumer-mems`` into a native viewer without a screen, and into the web viewer in Chromium. ``analyze``, ``reconcile``
+and ``compensate`` draw their own pictures. The devices of the fleet run in real time, and two cables are unplugged.
+The packages chromium, mesa-vulkan-drivers and libvulkan1 are needed (names of Debian). Network traffic stays on
+loopback.
 
     python -m tests.experiments.pictures [--out docs/pictures] [--only native surfaces temperature drift compensation …]
 """
@@ -46,7 +42,7 @@ from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.sqlite_store import FILE_NAME, HistoryStore, StoredEvent
 from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
-from monitor.publishing.plots.reconcile_chart import chart
+from monitor.publishing.plots.diagnostic_figure import diagnostic_svg
 from monitor.publishing.rerun import sinks
 from monitor.publishing.rerun.fleet import FleetView
 from monitor.publishing.rerun.view import RerunView
@@ -145,7 +141,7 @@ driver = { link = "virtual", seed = 3, decoder = "stim300" }
 
 
 def main() -> None:
-    """Make the pictures that were asked for."""
+    """Make the requested pictures."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("docs/pictures"))
     parser.add_argument("--only", nargs="*", choices=PICTURES, default=list(PICTURES))
@@ -158,30 +154,30 @@ def main() -> None:
 
 
 def native(out: Path, folder: Path) -> Path:
-    """One device in the native viewer."""
+    """Show one device in the native viewer."""
     path = out / "viewer.png"
     with window() as (port, shoot):
         with serving(folder, replay(folder), port) as service:
-            until(lambda: replayed(service, HOUR_S), 300.0)
+            wait_until(lambda: has_replayed(service, HOUR_S), 300.0)
         time.sleep(SETTLE_S)
         shoot(path)
     return path
 
 
 def surfaces(out: Path, folder: Path) -> Path:
-    """The same viewer's tab with the curves over time, of a device that has changed."""
+    """Show the tab Dynamic of a device whose noise has changed."""
     path = out / "viewer-dynamic.png"
     with window() as (port, shoot):
         with serving(folder, replay(folder, changed=True), port) as service:
-            until(lambda: replayed(service, HOUR_S), 300.0)
-        turn_to(port, 1)
+            wait_until(lambda: has_replayed(service, HOUR_S), 300.0)
+        select_tab(port, 1)
         time.sleep(SETTLE_S)
         shoot(path)
     return path
 
 
 def temperature(out: Path, folder: Path) -> Path:
-    """The tab with bias beside temperature, of two days on which gz stepped once."""
+    """Show the tab Temperature of two days in which the bias of gz stepped once."""
     path = out / "viewer-temperature.png"
     source = folder / "warm.npz"
     model = read_model(config_files.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
@@ -191,15 +187,15 @@ def temperature(out: Path, folder: Path) -> Path:
     devices = REPLAY.format(recording=source, speed=WARM_SPEED).replace("rate = 100.0", f"rate = {WARM_HZ}")
     with window() as (port, shoot):
         with serving(folder, devices, port) as service:
-            until(lambda: replayed(service, WARM_S - 600.0), 300.0)
-        turn_to(port, 2)
+            wait_until(lambda: has_replayed(service, WARM_S - 600.0), 300.0)
+        select_tab(port, 2)
         time.sleep(SETTLE_S)
         shoot(path)
     return path
 
 
 def drift(out: Path, folder: Path) -> Path:
-    """The tab with rates before and after compensation, of a sensor that is turned now and then."""
+    """Show the tab Drift of a sensor that is turned three times."""
     path = out / "viewer-drift.png"
     source = folder / "turned.npz"
     n = round(TURNED_S * 100.0)
@@ -218,15 +214,15 @@ def drift(out: Path, folder: Path) -> Path:
     save_samples(source, T0 + t_s, values)
     with window() as (port, shoot):
         with serving(folder, REPLAY.format(recording=source, speed=SPEED), port) as service:
-            until(lambda: replayed(service, TURNED_S - 2.0), 120.0)
-        turn_to(port, 3)
+            wait_until(lambda: has_replayed(service, TURNED_S - 2.0), 120.0)
+        select_tab(port, 3)
         time.sleep(SETTLE_S)
         shoot(path)
     return path
 
 
 def compensation(out: Path, folder: Path) -> Path:
-    """What ``imu-monitor compensate --plot`` makes of three hours of a sensor at rest."""
+    """Draw the plot of ``imu-monitor compensate`` for three hours of a sensor at rest."""
     path, source = out / "compensate.png", folder / "still.npz"
     n = 1_080_000
     values = (
@@ -241,8 +237,8 @@ def compensation(out: Path, folder: Path) -> Path:
     return path
 
 
-def turn_to(port: int, tab: int) -> None:
-    """Show that tab of the device in the viewer that is open at ``port``."""
+def select_tab(port: int, tab: int) -> None:
+    """Select a tab of the device in the viewer that listens on ``port``."""
     from rerun.experimental import ViewerClient
 
     viewer = ViewerClient(sinks.server_url(port))
@@ -255,11 +251,11 @@ def turn_to(port: int, tab: int) -> None:
 
 
 def fleet(out: Path, folder: Path) -> Path:
-    """Three devices: the overview."""
+    """Show the overview of three devices."""
     path = out / "viewer-fleet.png"
     with window() as (port, shoot), serving(folder, FLEET, port) as service:
         tail, wing = service.virtual["tail"], service.virtual["wing"]
-        until(lambda: all(station.publisher.latest is not None for station in service.workers), 120.0)
+        wait_until(lambda: all(station.publisher.latest is not None for station in service.workers), 120.0)
         begun_s = time.monotonic()
         for at_s, act in (
             (PULLED_S, tail.unplug),
@@ -273,7 +269,7 @@ def fleet(out: Path, folder: Path) -> Path:
 
 
 def view(out: Path, folder: Path) -> Path:
-    """``imu-monitor view``: a dozen devices of three daemons, one of which is gone; two cables are pulled."""
+    """Show ``imu-monitor view`` with twelve devices; one of three daemons is stopped, and two cables are unplugged."""
     path = out / "view-fleet.png"
     with window() as (port, shoot), contextlib.ExitStack() as ending:
         daemons, places = [], []
@@ -298,7 +294,7 @@ def view(out: Path, folder: Path) -> Path:
         viewer.start()
         looking.start()
         try:
-            until(
+            wait_until(
                 lambda: all(station.publisher.latest is not None for one in daemons for station in one.workers), 120.0
             )
             time.sleep(PULLED_AGAIN_S)
@@ -314,37 +310,37 @@ def view(out: Path, folder: Path) -> Path:
 
 
 def yesterday(out: Path, folder: Path) -> Path:
-    """A daemon that was started anew: its view opens on the last day, of which an hour is missing."""
+    """Show the viewer of a restarted daemon with the last day, of which one hour is missing."""
     path = out / "viewer-history.png"
     config = demo_config()
     (device,) = config.devices
-    remember(folder / "kept" / FILE_NAME, device.name, time.time())
+    write_history(folder / "kept" / FILE_NAME, device.name, time.time())
     zenoh = config.zenoh.model_copy(update={"mode": "none"})
     storage = loading.Storage(folder=folder / "kept", record=False)
     with window() as (port, shoot):
         viewer = config.viewer.model_copy(update={"mode": "native", "port": port, "history": 86_400.0})
         with running(replace(config, zenoh=zenoh, viewer=viewer, storage=storage)) as service:
-            until(lambda: fitted(service), 240.0)
+            wait_until(lambda: has_coefficients(service), 240.0)
             time.sleep(SHOWN_S)
             shoot(path)
     return path
 
 
-def fitted(service: Service) -> bool:
-    """Whether there are coefficients."""
+def has_coefficients(service: Service) -> bool:
+    """Return True if the service has estimated coefficients."""
     latest = service.workers[0].publisher.latest
     return latest is not None and bool(np.isfinite(latest.fitted).any())
 
 
-def remember(path: Path, device: str, now_s: float) -> None:
-    """A day of rows that ends ten minutes ago, for a sensor like the demo's, that was knocked and got warm."""
+def write_history(path: Path, device: str, now_s: float) -> None:
+    """Write a history of one day that ends ten minutes ago, with one shock and a changing temperature."""
     rng, minutes = np.random.default_rng(1), MinuteAggregator()
     rows = []
     wander = np.cumsum(0.004 * rng.standard_normal((1440, 6)), axis=0)
     for i in range(1430):
         if not 800 <= i < 860:
             scale = (1.0 + wander[i]) * (1.5 if i == 500 else 1.0)
-            rows.append(minutes.add_estimate(now_s - 86_400.0 + 60.0 * i, like(scale, rng)))
+            rows.append(minutes.add_estimate(now_s - 86_400.0 + 60.0 * i, scale_estimate(scale, rng)))
             rows.append(
                 minutes.add_temperature(now_s - 86_400.0 + 60.0 * i, np.array([24.0 + 4.0 * np.sin(i / 229.0)]))
             )
@@ -357,8 +353,8 @@ def remember(path: Path, device: str, now_s: float) -> None:
     store.close()
 
 
-def like(scale: Floats, rng: np.random.Generator) -> Estimate:
-    """What an hour of the demo's sensor gives, but for a factor an axis."""
+def scale_estimate(scale: Floats, rng: np.random.Generator) -> Estimate:
+    """Return the estimate of one hour of the demo's sensor, with one factor on the noise of each axis."""
     one = estimate(seed=int(rng.integers(1 << 30)))
     c = one.coefficients
     wanted = np.outer(DEMO_LETTERS, np.repeat([1.0, 10.0], 3)) * scale
@@ -367,7 +363,7 @@ def like(scale: Floats, rng: np.random.Generator) -> Estimate:
 
 
 def effect(out: Path, _: Path) -> Path:
-    """The demo, whose sensor has begun to vibrate."""
+    """Show the demo after its sensor has begun to vibrate."""
     path = out / "demo-effect.png"
     config = demo_config(effects=[VIBRATION])
     zenoh = config.zenoh.model_copy(update={"mode": "none"})
@@ -377,39 +373,41 @@ def effect(out: Path, _: Path) -> Path:
             (sensor,) = [device.link for device in config.devices]
             assert isinstance(sensor, loading.VirtualTable)
             begun_s = time.monotonic()
-            until(lambda: service.workers[0].publisher.latest is not None, 60.0)
+            wait_until(lambda: service.workers[0].publisher.latest is not None, 60.0)
             time.sleep(begun_s + sensor.effect_at + SHOWN_S - time.monotonic())
             shoot(path)
-    return small(path)
+    return reduce_colours(path)
 
 
 def web(out: Path, folder: Path) -> Path:
-    """One device on the page, in Chromium."""
+    """Show one device in the web viewer in Chromium."""
     with page_server() as (port, url), browser() as page:
         dark = [{"name": "prefers-color-scheme", "value": "dark"}]
         page.call("Emulation.setEmulatedMedia", features=dark)
         page.call("Page.navigate", url=url + "&renderer=webgl&hide_welcome_screen=1")
         with serving(folder, replay(folder), port) as service:
-            until(lambda: replayed(service, HOUR_S), 300.0)
-        picture = still(page)
+            wait_until(lambda: has_replayed(service, HOUR_S), 300.0)
+        picture = settled_screenshot(page)
     path = out / "viewer-web.png"
     path.write_bytes(picture)
     return path
 
 
 def allan(out: Path, folder: Path) -> Path:
-    """The plot that ``analyze --plot`` writes."""
-    return small(analyzed(recording(folder, HOUR_S), out / "allan-plot.png"))
+    """Draw the plot of ``analyze --plot``."""
+    return reduce_colours(run_analyze(recording(folder, HOUR_S), out / "allan-plot.png"))
 
 
 def dynamic(out: Path, folder: Path) -> Path:
-    """The same with the curves over time."""
-    return small(analyzed(recording(folder, HOUR_S, changed=True), out / "dynamic-plot.png", "--window", WINDOW))
+    """Draw the plot of ``analyze --plot --window``."""
+    return reduce_colours(
+        run_analyze(recording(folder, HOUR_S, changed=True), out / "dynamic-plot.png", "--window", WINDOW)
+    )
 
 
 def report(out: Path, folder: Path) -> Path:
-    """The page that ``analyze --plot`` writes, in Chromium."""
-    page = analyzed(recording(folder, HOUR_S, changed=True), folder / "report.html", "--window", WINDOW)
+    """Show the page of ``analyze --plot`` in Chromium."""
+    page = run_analyze(recording(folder, HOUR_S, changed=True), folder / "report.html", "--window", WINDOW)
     path = out / "report.png"
     with browser() as tab:
         tab.call("Page.navigate", url=page.as_uri())
@@ -418,21 +416,21 @@ def report(out: Path, folder: Path) -> Path:
         whole = {"x": 0, "y": 0, "width": size["width"], "height": size["height"], "scale": 1}
         shot = tab.call("Page.captureScreenshot", format="png", clip=whole, captureBeyondViewport=True)
     path.write_bytes(base64.b64decode(shot["data"]))
-    return small(path)
+    return reduce_colours(path)
 
 
 def before(out: Path, folder: Path) -> Path:
-    """gz beside the shipped model, which does not know what was hidden."""
-    return looked_at(hidden(folder), "start", out / "reconcile-before.png")
+    """Draw gz with the shipped model, which does not contain the hidden effects."""
+    return save_diagnostic_picture(reconcile_hidden_effects(folder), "start", out / "reconcile-before.png")
 
 
 def after(out: Path, folder: Path) -> Path:
-    """The same beside the model that reconcile wrote."""
-    return looked_at(hidden(folder), "end", out / "reconcile-after.png")
+    """Draw gz with the model that reconcile wrote."""
+    return save_diagnostic_picture(reconcile_hidden_effects(folder), "end", out / "reconcile-after.png")
 
 
-def hidden(folder: Path) -> AxisResult:
-    """What reconcile finds of HIDDEN."""
+def reconcile_hidden_effects(folder: Path) -> AxisResult:
+    """Return the result of reconcile for gz, with the effects of HIDDEN in the recording."""
     source = folder / "hidden.npz"
     if not source.exists():
         model = read_model(MODEL) + NoiseModel.from_toml(HIDDEN)
@@ -443,10 +441,10 @@ def hidden(folder: Path) -> AxisResult:
     return run_reconciliation(Request(source, read_model(MODEL), folder / "result")).axes["gz"]
 
 
-def looked_at(result: AxisResult, when: str, path: Path) -> Path:
-    """Spectrum, Allan deviation and tails of one axis beside one model, as the report draws them."""
+def save_diagnostic_picture(result: AxisResult, when: str, path: Path) -> Path:
+    """Draw spectrum, Allan deviation and tails of one axis with one model, as in the report."""
     views = {view.lens: view for view in getattr(result, when).views}
-    drawn = [chart([(lens, views[lens])], result.axis, 520.0, 330.0) for lens in ("psd", "allan", "tails")]
+    drawn = [diagnostic_svg([("", views[lens])], result.axis, 5.2, 3.3) for lens in ("psd", "allan", "tails")]
     page = path.with_suffix(".html")
     style = "body{margin:8px;display:flex;font-family:sans-serif;background:white}svg{width:520px;height:330px}"
     page.write_text(f"<meta charset=utf-8><style>{style}</style>{''.join(drawn)}")
@@ -457,11 +455,11 @@ def looked_at(result: AxisResult, when: str, path: Path) -> Path:
         shot = tab.call("Page.captureScreenshot", format="png", clip=clip)
     page.unlink()
     path.write_bytes(base64.b64decode(shot["data"]))
-    return small(path)
+    return reduce_colours(path)
 
 
-def small(path: Path) -> Path:
-    """The same picture in so many colours as a byte can tell, for the documentation: a third of its size."""
+def reduce_colours(path: Path) -> Path:
+    """Reduce a picture to 256 colours, which makes the file three times smaller."""
     from PIL import Image
 
     with Image.open(path) as picture:
@@ -470,8 +468,8 @@ def small(path: Path) -> Path:
     return path
 
 
-def analyzed(source: Path, plot: Path, *more: str) -> Path:
-    """What ``imu-monitor analyze --plot`` makes of a recording."""
+def run_analyze(source: Path, plot: Path, *more: str) -> Path:
+    """Run ``imu-monitor analyze --plot`` on a recording."""
     arguments = ["analyze", str(source), "--plot", str(plot), *more]
     subprocess.run([sys.executable, "-m", "monitor.cli", *arguments], check=True)
     return plot
@@ -497,7 +495,7 @@ PICTURES: dict[str, Callable[[Path, Path], Path]] = {
 
 
 def recording(folder: Path, seconds: float, changed: bool = False) -> Path:
-    """So much of the simulated device, with a gap; the same at every run. ``changed``: gz becomes noisier."""
+    """Return a recording of the simulated device with a gap. If ``changed`` is True, gz becomes noisier."""
     path = folder / f"bench-1_{seconds / 3600:g}h{'_changed' if changed else ''}.npz"
     if not path.exists():
         model = read_model(MODEL)
@@ -515,19 +513,19 @@ def recording(folder: Path, seconds: float, changed: bool = False) -> Path:
 
 
 def replay(folder: Path, changed: bool = False) -> str:
-    """The configuration of one device that replays it."""
+    """Return the configuration of one device that replays the recording."""
     return REPLAY.format(recording=recording(folder, HOUR_S + SPARE_S, changed), speed=SPEED)
 
 
-def replayed(service: Service, seconds: float) -> bool:
-    """Whether so much of the recording is in the estimate."""
+def has_replayed(service: Service, seconds: float) -> bool:
+    """Return True if the estimate contains this duration of the recording."""
     latest = service.workers[0].publisher.latest
     return latest is not None and latest.t_ns >= (T0 + seconds) * 1e9
 
 
 @contextmanager
 def serving(folder: Path, devices: str, port: int) -> Iterator[Service]:
-    """The service with these devices, showing them in the viewer that is open at ``port``; stopped at the end."""
+    """Run the service with these devices and the viewer that listens on ``port``."""
     viewer = f'[viewer]\nmode = "native"\nport = {port}\n'
     path = folder / "pictures.toml"
     path.write_text(f'{devices}\n[zenoh]\nlisten = ["tcp/127.0.0.1:{free_port()}"]\n\n{viewer}')
@@ -537,7 +535,7 @@ def serving(folder: Path, devices: str, port: int) -> Iterator[Service]:
 
 @contextmanager
 def running(config: loading.Config) -> Iterator[Service]:
-    """The service in a thread of its own; stopped at the end."""
+    """Run the service in a thread, and stop it at the end."""
     service = Service(config)
     thread = threading.Thread(target=service.run)
     thread.start()
@@ -550,7 +548,7 @@ def running(config: loading.Config) -> Iterator[Service]:
 
 @contextmanager
 def window() -> Iterator[tuple[int, Callable[[Path], None]]]:
-    """A native viewer without a screen: its port, and what takes its picture."""
+    """Run a native viewer without a screen; yield its port and a function that saves a screenshot."""
     from rerun.experimental import ViewerClient
 
     port = free_port()
@@ -559,7 +557,7 @@ def window() -> Iterator[tuple[int, Callable[[Path], None]]]:
         *("--bind", "127.0.0.1", "--port", str(port), "--headless", "--window-size", size, "--hide-welcome-screen")
     ])  # fmt: skip
     try:
-        until(lambda: sinks.listens(port), 30.0)
+        wait_until(lambda: sinks.listens(port), 30.0)
         yield port, lambda path: ViewerClient(sinks.server_url(port)).save_screenshot(str(path))
     finally:
         child.end()
@@ -567,20 +565,20 @@ def window() -> Iterator[tuple[int, Callable[[Path], None]]]:
 
 @contextmanager
 def page_server() -> Iterator[tuple[int, str]]:
-    """What serves the page, as mode "web" starts it, but for it to stay when the service stops: its port, the page."""
+    """Run the server of the web viewer; yield its port and the address of the page."""
     port, web_port = free_port(), free_port()
     child = sinks.ViewerProcess([
         *("--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port))
     ])  # fmt: skip
     try:
-        until(lambda: sinks.listens(port) and sinks.listens(web_port), 30.0)
+        wait_until(lambda: sinks.listens(port) and sinks.listens(web_port), 30.0)
         yield port, f"http://127.0.0.1:{web_port}/?url={quote(sinks.server_url(port), safe='')}"
     finally:
         child.end()
 
 
-def until(true: Callable[[], bool], seconds: float) -> None:
-    """Wait for it, or fail."""
+def wait_until(true: Callable[[], bool], seconds: float) -> None:
+    """Wait until the condition is true; raise TimeoutError if it takes too long."""
     end = time.monotonic() + seconds
     while not true():
         if time.monotonic() > end:
@@ -589,14 +587,14 @@ def until(true: Callable[[], bool], seconds: float) -> None:
 
 
 def free_port() -> int:
-    """A port that nobody holds right now."""
+    """Return a free port."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 class Page:
-    """One tab of a browser, spoken to by the DevTools protocol over a WebSocket (RFC 6455)."""
+    """Tab of a browser, controlled by the DevTools protocol over a WebSocket (RFC 6455)."""
 
     def __init__(self, url: str) -> None:
         host, path = url.removeprefix("ws://").split("/", 1)
@@ -646,8 +644,8 @@ class Page:
                 return whole
 
 
-def still(page: Page) -> bytes:
-    """Its picture once it has caught up: on a software renderer it may be half a minute behind."""
+def settled_screenshot(page: Page) -> bytes:
+    """Return a screenshot of a page that no longer changes. A software renderer may be half a minute late."""
     before = b""
     for _ in range(24):
         picture = base64.b64decode(page.call("Page.captureScreenshot", format="png")["data"])
@@ -660,7 +658,7 @@ def still(page: Page) -> bytes:
 
 @contextmanager
 def browser() -> Iterator[Page]:
-    """A Chromium without a screen, on an empty page."""
+    """Run Chromium without a screen; yield an empty page."""
     program = shutil.which("chromium") or shutil.which("google-chrome")
     if program is None:
         raise FileNotFoundError("no chromium: install the package chromium")
@@ -676,7 +674,7 @@ def browser() -> Iterator[Page]:
             env={**os.environ, "NO_PROXY": "127.0.0.1"},
         )
         try:
-            until(lambda: sinks.listens(port), 30.0)
+            wait_until(lambda: sinks.listens(port), 30.0)
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as reply:
                 tabs = [tab for tab in json.load(reply) if tab["type"] == "page"]
             yield Page(tabs[0]["webSocketDebuggerUrl"])

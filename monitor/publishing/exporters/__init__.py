@@ -1,14 +1,14 @@
 """Export of noise parameters for other tools: Kalibr, MATLAB (gyroparams and accelparams) and Kalman filters.
 
-The input is a ``Noise`` object with the coefficients of each axis, from a model file or from ``analyze --json``. The
-output is the text of a file that states its units, the source of its numbers and the inflation factor. No other
-factor is applied. N of IEEE Std 952 in rad/√s equals the two-sided density of white noise in rad/s/√Hz. K in rad/s/√s
-equals the density of the white noise that drives the bias, in rad/s²/√Hz.
+The input is a ``NoiseCoefficients`` object, from a model file or from ``analyze --json``. The output is the text of a
+file that states units, the source of the numbers and the inflation factor. No other factor is applied. N of IEEE Std
+952 in rad/√s equals the two-sided density of white noise in rad/s/√Hz. K in rad/s/√s equals the density of the white
+noise that drives the bias, in rad/s²/√Hz.
 
 The inflation factor multiplies N, B and K, because a sensor at rest at constant temperature has less noise than the
 same sensor on a vehicle. The formats for filters use an upper bound as if it were a value, with a comment. The format
-for simulation does not use it. Comments name the terms that a format cannot represent. All text is ASCII, as some of
-the target programs require it.
+for simulation ignores upper bounds. Comments name the terms that a format cannot represent. All text is ASCII, because
+some of the target programs require it.
 """
 
 from collections.abc import Callable
@@ -33,14 +33,14 @@ FORMATS: Final[dict[str, Callable[..., str]]] = {"kalibr": kalibr, "gyroparams":
 """Export function of each format."""
 
 
-def export(noise: NoiseCoefficients, form: str, inflation: float = 1.0, **options: Any) -> str:
+def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, **options: Any) -> str:
     """Return the text of a parameter file.
 
     Parameters
     ----------
     noise
         Coefficients from ``from_model`` or ``from_analysis``.
-    form
+    format_name
         Name of the format, a key of FORMATS.
     inflation
         Factor on N, B and K, at least 1.
@@ -50,12 +50,12 @@ def export(noise: NoiseCoefficients, form: str, inflation: float = 1.0, **option
     Raises
     ------
     ConfigError
-        The format is unknown, the inflation is below 1, or the model lacks a coefficient that the format needs.
+        If the format is unknown, the inflation is below 1, or the model lacks a coefficient that the format needs.
     NotReady
-        The analysed recording does not determine a coefficient that the format needs.
+        If the analysed recording does not determine a coefficient that the format needs.
     """
-    if form not in FORMATS:
-        raise ConfigError(f'unknown format "{form}"; possible are {", ".join(FORMATS)}')
+    if format_name not in FORMATS:
+        raise ConfigError(f'unknown format "{format_name}"; possible are {", ".join(FORMATS)}')
     try:
         INFLATION.check(inflation)
     except ConfigError as error:
@@ -66,4 +66,4 @@ def export(noise: NoiseCoefficients, form: str, inflation: float = 1.0, **option
         for letter, term in terms.items():
             if term.value and not COEFFICIENT.supports(term.value):
                 raise ConfigError(f"{axis}: {letter} = {term.value:g}; no sensor has that")
-    return FORMATS[form](noise, inflation, **options)
+    return FORMATS[format_name](noise, inflation, **options)

@@ -11,9 +11,10 @@ The script is meant for simulation. A coefficient with only an upper bound is th
 
 from typing import Final
 
+from monitor.common.units import Kind, axes_of
 from monitor.publishing.exporters.noise import (
-    AXES_OF,
     NoiseCoefficients,
+    ascii_unit,
     header_comments,
     join_lines,
     number,
@@ -25,7 +26,7 @@ N_POLES: Final = 500
 
 
 def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
-    """Return the script; for its properties see the module.
+    """Return the text of the MATLAB script.
 
     Parameters
     ----------
@@ -41,12 +42,14 @@ def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
         f"% fractalcoef({N_POLES}): 1/f noise down to about rate/{N_POLES}; more poles reach lower and take longer",
     ]
     made = []
-    for kind, maker, name, unit in (
-        ("gyro", "gyroparams", "Gyroscope", "rad/s"),
-        ("accel", "accelparams", "Accelerometer", "m/s^2"),
-    ):
-        if not set(AXES_OF[kind]) & noise.axes.keys():
+    kinds: tuple[tuple[Kind, str, str], ...] = (
+        ("gyro", "gyroparams", "Gyroscope"),
+        ("accel", "accelparams", "Accelerometer"),
+    )
+    for kind, maker, name in kinds:
+        if not set(axes_of(kind)) & noise.axes.keys():
             continue
+        unit = ascii_unit("B", kind)
         made.append(f", '{name}', {kind}")
         lines += [
             "",
@@ -62,10 +65,10 @@ def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
     return join_lines([*lines, *omitted_comment(noise, "NBK", "%")])
 
 
-def _property(noise: NoiseCoefficients, kind: str, letter: str, name: str, unit: str, inflation: float) -> str:
+def _property(noise: NoiseCoefficients, kind: Kind, letter: str, name: str, unit: str, inflation: float) -> str:
     """Return one property of three axes; unknown values are 0 and named in a comment."""
     known, values, said = noise.coefficients(kind, letter), [], ""
-    for axis in AXES_OF[kind]:
+    for axis in axes_of(kind):
         term = known.get(axis)
         values.append("0" if term is None or term.bound else number(term.value * inflation))
         if term is None:

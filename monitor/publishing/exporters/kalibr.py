@@ -6,11 +6,15 @@ agree with N and K of IEEE Std 952. Kalibr rejects zero, so a term that no axis 
 upper bounds, the largest bound is used and the comment says so.
 """
 
+from typing import Final
+
 from drivers.errors import ConfigError
+from monitor.common.units import Kind
 from monitor.publishing.exporters.noise import (
-    EFFECT_OF,
+    COEFFICIENT_EFFECTS,
     NoiseCoefficients,
     Term,
+    ascii_unit,
     header_comments,
     join_lines,
     missing_coefficient_error,
@@ -18,11 +22,10 @@ from monitor.publishing.exporters.noise import (
     omitted_comment,
 )
 
-INFLATION_COMMENT = (
+INFLATION_COMMENT: Final = (
     "# Kalibr's wiki, IMU Noise Model: a sensor at rest at one temperature shows too little; for the",
     "# lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (--inflation 10)",
 )
-
 """Comment on the inflation of the values."""
 
 
@@ -41,9 +44,9 @@ def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/i
     Raises
     ------
     ConfigError
-        The model has no sample rate or lacks N or K on one kind of sensor.
+        If the model has no sample rate or lacks N or K on one kind of sensor.
     NotReady
-        The analysed recording does not determine N or K on one kind of sensor.
+        If the analysed recording does not determine N or K on one kind of sensor.
     """
     if noise.sample_rate_hz is None:
         raise ConfigError("kalibr needs an update_rate, and the model has no sample_rate")
@@ -54,22 +57,22 @@ def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/i
         f"rostopic: {rostopic}",
         f"update_rate: {noise.sample_rate_hz!r}  # Hz",
     ]
-    for kind, word, white, walk in (
-        ("accel", "accelerometer", "m/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)"),
-        ("gyro", "gyroscope", "rad/s/sqrt(Hz)", "rad/s^2/sqrt(Hz)"),
-    ):
-        for letter, key, unit in (("N", "noise_density", white), ("K", "random_walk", walk)):
-            worst, said = _largest_term(noise, kind, letter)
-            lines += [f"# {letter}: {said}", f"{word}_{key}: {number(worst.value * inflation)}  # {unit}"]
+    kinds: tuple[tuple[Kind, str], ...] = (("accel", "accelerometer"), ("gyro", "gyroscope"))
+    for kind, name in kinds:
+        for letter, key, unit_of in (("N", "noise_density", "B"), ("K", "random_walk", "R")):
+            largest, comment = _largest_term(noise, kind, letter)
+            unit = f"{ascii_unit(unit_of, kind)}/sqrt(Hz)"  # the unit of a density: that of B for N, that of R for K
+            lines += [f"# {letter}: {comment}", f"{name}_{key}: {number(largest.value * inflation)}  # {unit}"]
     return join_lines([*lines, *omitted_comment(noise, "NK", "#")])
 
 
-def _largest_term(noise: NoiseCoefficients, kind: str, letter: str) -> tuple[Term, str]:
+def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[Term, str]:
     """Return the largest estimate of a kind, or the largest bound if there is no estimate, and a comment on it."""
     known = noise.coefficients(kind, letter)
     if not known:
         raise missing_coefficient_error(
-            noise, f"kalibr needs {letter} ({EFFECT_OF[letter]}) above 0 on the {kind} axes, and none has it"
+            noise,
+            f"kalibr needs {letter} ({COEFFICIENT_EFFECTS[letter].name}) above 0 on the {kind} axes, and none has it",
         )
     rank = {axis: (not term.bound, term.value) for axis, term in known.items()}
     axis = max(rank, key=lambda one: rank[one])

@@ -6,11 +6,13 @@ Error model of one gyroscope (for an accelerometer, velocity replaces the angle)
 
 The rate has white noise of density N². Flicker noise has no finite-dimensional state model, so a first-order
 Gauss-Markov process approximates it. The Allan deviation of this process peaks at 0.618 σ and τ = 1.89 T (IEEE Std
-952). The peak equals the flicker floor 0.664 B and lies in the middle (of log τ) of the range in which flicker
-dominates. This range extends from τ = N²/(0.664 B)² to 3 (0.664 B)²/K², so its middle is √3 N/K. Without N or K the
-range is not bounded. T must then be given, or B is omitted and the file says so.
+952). σ is chosen so that the peak equals the Allan deviation of flicker noise, 0.664 B. T is chosen so that the peak
+lies in the middle (of log τ) of the range in which flicker noise dominates. This range extends from τ = N²/(0.664 B)²
+to 3 (0.664 B)²/K², so its middle is √3 N/K. Without N or K the range is not bounded. T must then be given, or B is
+omitted and a comment in the file says so.
 
-An upper bound is used as if it were the value, because a larger process noise is the safer choice. The file says where.
+An upper bound is used as if it were the value, because a larger process noise is the safer choice. A comment in the
+file names the coefficient.
 """
 
 import math
@@ -22,18 +24,19 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.quantities import DURATION_S
 from drivers.sample import Floats
+from monitor.common.units import sensor_kind
+from monitor.noise.effects import BiasInstability
 from monitor.publishing.exporters.noise import (
-    AXES_OF,
     NoiseCoefficients,
     Term,
+    ascii_unit,
     header_comments,
     join_lines,
     number,
     omitted_comment,
 )
 
-FLICKER_FLOOR_RATIO: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
-"""Ratio of the Allan deviation of flicker noise to B (IEEE Std 952)."""
+FLICKER_TAU_S: Final = np.array([1000.0])  # any τ much longer than the sample interval gives the same deviation
 MARKOV_PEAK_RATIO: Final = 0.437 * math.sqrt(2.0)
 """Ratio of the peak Allan deviation of the Gauss-Markov process to σ: 0.437 q √T with q² = 2σ²/T (IEEE Std 952)."""
 MARKOV_PEAK_AT: Final = 1.89
@@ -63,14 +66,14 @@ def kalman(
     inflation
         Factor on N, B and K.
     dt_s
-        Time step [s]. None: the sample period.
+        Time step [s]. By default, the sample period.
     correlation_time_s
-        Correlation time T of the Gauss-Markov process [s]. None: computed from N and K, see the module.
+        Correlation time T of the Gauss-Markov process [s]. By default, T is computed from N and K.
 
     Raises
     ------
     ConfigError
-        The time step is unknown or not valid, or the correlation time is not valid.
+        If the time step is unknown, or if the time step or the correlation time is outside the supported range.
     """
     step_s = 1.0 / noise.sample_rate_hz if dt_s is None and noise.sample_rate_hz else dt_s
     if step_s is None or not DURATION_S.supports(step_s):
@@ -94,32 +97,20 @@ def kalman(
     return join_lines([*lines, *omitted_comment(noise, "NBK", "#")])
 
 
-def markov_sigma(B: float) -> float:
-    """Return σ of the Gauss-Markov process whose peak Allan deviation equals the floor of flicker noise.
+def _markov_sigma(B: float) -> float:
+    """Return σ of the Gauss-Markov process whose peak Allan deviation equals the Allan deviation of flicker noise.
 
-    >>> round(markov_sigma(1.0), 3)
+    >>> round(_markov_sigma(1.0), 3)
     1.075
-
-    Parameters
-    ----------
-    B
-        Bias instability, in the unit of the result.
     """
-    return FLICKER_FLOOR_RATIO * B / MARKOV_PEAK_RATIO
+    return float(np.sqrt(BiasInstability(B).avar(FLICKER_TAU_S, 1.0)[0])) / MARKOV_PEAK_RATIO
 
 
-def markov_time_s(N: float, K: float) -> float:
+def _markov_time_s(N: float, K: float) -> float:
     """Return the correlation time [s] of the process that peaks at τ = √3 N/K, the middle of the flicker range.
 
-    >>> round(markov_time_s(N=1.5e-4, K=1.5e-6), 1)
+    >>> round(_markov_time_s(N=1.5e-4, K=1.5e-6), 1)
     91.6
-
-    Parameters
-    ----------
-    N
-        White noise, in rad/√s or m/s/√s.
-    K
-        Rate random walk, in rad/s/√s or m/s²/√s.
     """
     return math.sqrt(3.0) * N / K / MARKOV_PEAK_AT
 
@@ -174,34 +165,35 @@ def _axis(
     axis: str, terms: Mapping[str, Term], inflation: float, dt_s: float, correlation_time_s: float | None
 ) -> list[str]:
     """Return the TOML table of one axis: comments, densities, F and Q."""
-    rate, drift, first = ("rad/s", "rad/s^2", "angle") if axis in AXES_OF["gyro"] else ("m/s^2", "m/s^3", "velocity")
-    n, b, k = (terms[letter].value * inflation if letter in terms else 0.0 for letter in "NBK")
-    time_s = correlation_time_s or (markov_time_s(n, k) if n and k else None)
+    kind = sensor_kind(axis)
+    rate, drift = ascii_unit("B", kind), ascii_unit("R", kind)
+    N, B, K = (terms[letter].value * inflation if letter in terms else 0.0 for letter in "NBK")
+    time_s = correlation_time_s or (_markov_time_s(N, K) if N and K else None)
     lines = _remarks(terms)
+    states = ["angle" if kind == "gyro" else "velocity", "bias_walk"]
     densities = [
-        f"psd_white = {number(n**2)}  # ({rate})^2/Hz, N^2",
-        f"psd_walk = {number(k**2)}  # ({drift})^2/Hz, K^2",
+        f"psd_white = {number(N**2)}  # ({rate})^2/Hz, N^2",
+        f"psd_walk = {number(K**2)}  # ({drift})^2/Hz, K^2",
     ]
-    states = [first, "bias_walk"]
-    if b and time_s is None:
+    sigma = _markov_sigma(B)
+    if B and time_s is None:
         lines.append("# B is left out: without N and K its correlation time must be given (--correlation-time S)")
-    elif b and time_s is not None:
-        sigma = markov_sigma(b)
+    elif B and time_s is not None:
         states.append("bias_markov")
         densities += [
             f"psd_markov = {number(2.0 * sigma**2 / time_s)}  # ({drift})^2/Hz, 2 sigma^2/T",
             f"sigma_markov = {number(sigma)}  # {rate}",
             f"correlation_time = {number(time_s)}  # s, T",
         ]
-    sigma, size = markov_sigma(b), len(states)
-    own_s = time_s or 1.0  # without the third state, no number depends on this value
+    size = len(states)
+    sigma, time_s = (sigma, time_s or 1.0) if size == 3 else (0.0, 1.0)  # without the third state, T has no effect
     listed = ", ".join(f'"{state}"' for state in states)
     return [
         *lines,
         f"states = [{listed}]",
         *densities,
-        f"F = {_matrix(transition(dt_s, own_s)[:size, :size])}",
-        f"Q = {_matrix(process_noise(dt_s, n, k, sigma if size == 3 else 0.0, own_s)[:size, :size])}",
+        f"F = {_matrix(transition(dt_s, time_s)[:size, :size])}",
+        f"Q = {_matrix(process_noise(dt_s, N, K, sigma, time_s)[:size, :size])}",
     ]
 
 

@@ -16,17 +16,36 @@ import msgspec
 from drivers.errors import ConfigError, ImuError, NotReady
 from drivers.quantities import RATE_HZ
 from drivers.sample import AXES
+from monitor.common.units import KINDS, Kind, axes_of
+from monitor.noise.effect import Source, parameter_units
+from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
 
-EFFECT_OF: Final = {
-    "Q": "quantization_noise",
-    "N": "angle_random_walk",
-    "B": "bias_instability",
-    "K": "rate_random_walk",
-    "R": "rate_ramp",
+COEFFICIENT_EFFECTS: Final[dict[str, type[Source]]] = {
+    "Q": QuantizationNoise,
+    "N": AngleRandomWalk,
+    "B": BiasInstability,
+    "K": RateRandomWalk,
+    "R": RateRamp,
 }
-"""Name of the effect in a noise model for each coefficient."""
-AXES_OF: Final = {"gyro": AXES[:3], "accel": AXES[3:]}
+"""Effect of the noise model whose parameter is the coefficient."""
+
+
+def ascii_unit(letter: str, kind: Kind) -> str:
+    """Return the SI unit of a coefficient in ASCII.
+
+    >>> ascii_unit("K", "gyro"), ascii_unit("R", "accel")
+    ('rad/s/sqrt(s)', 'm/s^3')
+
+    Parameters
+    ----------
+    letter
+        Coefficient.
+    kind
+        Kind of sensor.
+    """
+    unit = parameter_units(COEFFICIENT_EFFECTS[letter])[letter][KINDS.index(kind)]
+    return unit.replace("√s", "sqrt(s)").replace("²", "^2").replace("³", "^3")
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +67,7 @@ class NoiseCoefficients:
     measured: bool = False  # True if the coefficients come from a recording
     warnings: tuple[str, ...] = ()  # ASCII sentences for the header of the file
 
-    def coefficients(self, kind: str, letter: str) -> dict[str, Term]:
+    def coefficients(self, kind: Kind, letter: str) -> dict[str, Term]:
         """Return one coefficient of the axes that have it.
 
         Parameters
@@ -58,7 +77,7 @@ class NoiseCoefficients:
         letter
             Coefficient.
         """
-        return {axis: self.axes[axis][letter] for axis in AXES_OF[kind] if letter in self.axes.get(axis, {})}
+        return {axis: self.axes[axis][letter] for axis in axes_of(kind) if letter in self.axes.get(axis, {})}
 
 
 def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficients:
@@ -75,7 +94,7 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
     source
         Origin of the numbers, for the header of the file.
     """
-    letters = {effect: letter for letter, effect in EFFECT_OF.items()}
+    letters = {effect.name: letter for letter, effect in COEFFICIENT_EFFECTS.items()}
     axes: dict[str, dict[str, Term]] = {}
     left_out = []
     for axis, effects in model.effects.items():
@@ -133,7 +152,7 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
     Raises
     ------
     ConfigError
-        The text is not the JSON of an analysis, or its rate is not valid.
+        If the text is not the JSON of an analysis, or if the rate is outside the supported range.
     """
     try:
         found = msgspec.json.decode(text, type=_Analysis)
@@ -163,12 +182,12 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
 
 
 def missing_coefficient_error(noise: NoiseCoefficients, text: str) -> ImuError:
-    """Return the exception for a source that lacks a coefficient: NotReady for a recording, else ConfigError.
+    """Return NotReady if a recording lacks a coefficient, and ConfigError if a noise model lacks one.
 
     Parameters
     ----------
     noise
-        The source.
+        Coefficients of the recording or the model.
     text
         Message.
     """
@@ -209,7 +228,7 @@ def omitted_comment(noise: NoiseCoefficients, used: Collection[str], mark: str) 
         Comment mark of the format.
     """
     letters = {letter for terms in noise.axes.values() for letter, term in terms.items() if not term.bound}
-    unused = [letter for letter in EFFECT_OF if letter in letters and letter not in used]
+    unused = [letter for letter in COEFFICIENT_EFFECTS if letter in letters and letter not in used]
     return [f"{mark} not in this file: {', '.join([*unused, *noise.left_out])}"] if unused or noise.left_out else []
 
 

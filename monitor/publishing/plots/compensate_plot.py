@@ -1,30 +1,25 @@
-"""Plot of drift compensation: drift over time and Allan deviation, one row per axis.
-
-matplotlib is imported when a plot is requested, and draws without a display.
-"""
+"""Plot of drift compensation, one row per axis: the drift over time, and the Allan deviation before and after."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from drivers.errors import ConfigError
 from drivers.sample import AXES
 from monitor.common.units import DEVIATION_UNITS, format_duration
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.sage_husa import USED
-from monitor.publishing.plots.allan_figure import COLOURS, GREY
-from monitor.publishing.plots.analysis_plot import DPI, MISSING
+from monitor.publishing.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 ROW_INCHES: Final = (11.0, 2.6)
 UNIT: Final = DEVIATION_UNITS["gyro"]
-Z95: Final = 1.959964
+Z95: Final = 1.959964  # quantile of the normal distribution for a two-sided 95 % interval
 
 
-def compensate_plot(result: CompensationResult, path: Path) -> None:
+def save_compensation_plot(result: CompensationResult, path: Path) -> None:
     """Write the plot.
 
     Parameters
@@ -32,59 +27,53 @@ def compensate_plot(result: CompensationResult, path: Path) -> None:
     result
         Results of the compensation.
     path
-        File to write; its suffix selects the format.
+        File to write. Its suffix selects the format.
 
     Raises
     ------
     ConfigError
-        matplotlib is missing or the file cannot be written.
+        If matplotlib is missing or the file cannot be written.
     """
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ConfigError(MISSING) from error
-    figure = Figure(figsize=(ROW_INCHES[0], 0.7 + ROW_INCHES[1] * len(result.axes)), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    panels: Any = figure.subplots(len(result.axes), 2, squeeze=False, width_ratios=[1.7, 1.0])
-    for (over_time, allan), (axis, one) in zip(panels, result.axes.items(), strict=True):
-        _drift(over_time, axis, result)
-        _allan(allan, axis, one)
-    panels[-1, 0].set_xlabel("time, min")
-    panels[-1, 1].set_xlabel("averaging time, s")
-    figure.suptitle(f"{result.recording}: drift and noise of the gyros, {result.method}", fontsize=12)
-    try:
-        figure.savefig(path)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"cannot write the plot {path}: {error}") from error
+    with style.figure_style():
+        figure = style.create_figure(ROW_INCHES[0], 0.7 + ROW_INCHES[1] * len(result.axes))
+        panels = figure.subplots(len(result.axes), 2, squeeze=False, sharex="col", width_ratios=[1.7, 1.0])
+        for (drift, allan), (axis, one) in zip(panels, result.axes.items(), strict=True):
+            _draw_drift(drift, axis, result)
+            _draw_allan_deviation(allan, axis, one)
+        panels[-1, 0].set_xlabel("time, min")
+        panels[-1, 1].set_xlabel("averaging time τ, s")
+        figure.suptitle(f"{result.recording}: drift and noise of the gyroscopes, method {result.method}")
+        style.save_figure(figure, path)
 
 
-def _drift(panel: "Axes", axis: str, result: CompensationResult) -> None:
+def _draw_drift(panel: "Axes", axis: str, result: CompensationResult) -> None:
     """Draw the means at rest and the predicted drift of one axis."""
-    at = AXES.index(axis)
+    i, colour = AXES.index(axis), style.axis_colour(axis)
     minutes = np.array([one.end for one in result.intervals]) / result.rate_hz / 60.0
-    mean = np.array([one.mean[at] for one in result.intervals])
-    used = np.array([one.outcome[at] for one in result.intervals]) == USED
-    expected = np.array([one.expected[at] for one in result.intervals])
-    error = Z95 * np.array([one.known[at] for one in result.intervals])
-    middle = float(np.nanmedian(np.where(used, mean, np.nan)))
-    mean, expected, error = UNIT.factor * (mean - middle), UNIT.factor * (expected - middle), UNIT.factor * error
-    panel.plot(
-        minutes[used], mean[used], ".", ms=2, color=GREY, label=f"means of {format_duration(result.interval_s)} at rest"
-    )
-    panel.fill_between(minutes, expected - error, expected + error, color=COLOURS[at], alpha=0.25, lw=0)
-    panel.plot(minutes, expected, color=COLOURS[at], lw=1.3, label="drift expected before each, 95 %")
-    far = np.nanmax(np.abs(np.concatenate([mean[used], expected]))) if used.any() else 1.0
-    panel.set_ylim(-1.1 * far, 1.1 * far)
-    panel.set_ylabel(f"{axis} about its middle, {UNIT.name}")
-    panel.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=7.5, frameon=False, borderaxespad=0.1)
+    used = np.array([one.outcome[i] for one in result.intervals]) == USED
+    mean = np.where(used, [one.mean[i] for one in result.intervals], np.nan)
+    centre = float(np.nanmedian(mean))
+    mean = UNIT.factor * (mean - centre)
+    expected = UNIT.factor * (np.array([one.expected[i] for one in result.intervals]) - centre)
+    error = UNIT.factor * Z95 * np.array([one.known[i] for one in result.intervals])
+    label = f"means of {format_duration(result.interval_s)} at rest"
+    panel.plot(minutes, mean, ".", markersize=2, color=style.GREY, label=label, rasterized=True)
+    style.draw_band(panel, minutes, expected - error, expected + error, colour, alpha=0.25)
+    panel.plot(minutes, expected, color=colour, label="predicted drift, 95 %")
+    limit = 1.1 * np.nanmax(np.abs([mean, expected])) if used.any() else 1.0
+    panel.set_ylim(-limit, limit)
+    panel.set_ylabel(f"{axis} minus its median, {UNIT.name}")
+    style.draw_legend_above(panel, 2, fontsize=7.5, markerscale=3.0)
 
 
-def _allan(panel: "Axes", axis: str, one: AxisCompensation) -> None:
+def _draw_allan_deviation(panel: "Axes", axis: str, one: AxisCompensation) -> None:
     """Draw the Allan deviation of one axis before and after compensation."""
-    colour = COLOURS[AXES.index(axis)]
-    panel.loglog(one.uncompensated.tau_s, UNIT.factor * one.uncompensated.allan, color=GREY, lw=1.2, label="before")
-    panel.loglog(one.compensated.tau_s, UNIT.factor * one.compensated.allan, color=colour, lw=1.5, label="after")
-    panel.grid(which="major", lw=0.3, alpha=0.6)
+    for curve, colour, label in (
+        (one.uncompensated, style.GREY, "before compensation"),
+        (one.compensated, style.axis_colour(axis), "after"),
+    ):
+        panel.loglog(curve.tau_s, UNIT.factor * curve.allan, color=colour, label=label)
+    for which in "xy":
+        style.style_log_axis(panel, which)
     panel.set_ylabel(f"Allan deviation, {UNIT.name}")
-    panel.legend(loc="best", fontsize=7.5, frameon=False)
+    style.draw_legend_above(panel, 2, fontsize=7.5)

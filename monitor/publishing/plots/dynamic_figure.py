@@ -1,13 +1,12 @@
-"""Plot of the dynamic Allan deviation of one kind of sensor: heat maps over time, and the coefficients Q(t) … R(t).
+"""Plot of the dynamic Allan deviation of one kind of sensor: heat maps over time, and the coefficients over time.
 
-All panels share one time axis, the end of the window. A heat map shows each τ over time, coloured by the deviation
-relative to its median over time, so all τ share one scale. Red is above the median, blue below. Cells whose 95 %
-interval contains the median are pale, because their colour is not significant. Coefficients are drawn if they are
-estimated for some time on some axis, with their intervals as bands. A line is interrupted where there is no estimate.
-A change is a labelled vertical line through the heat map of its axis and, in the colour of the axis, through the
-coefficient panels. Changes too close to each other share a label.
+All panels share one time axis, the end of the window. A heat map shows each τ over time. Its colour is the deviation
+divided by the median over time, so that all τ share one scale. Cells whose 95 % interval contains the median are pale.
+A coefficient has a panel if it is estimated for some time on some axis. A change is a vertical line, with a label in
+the heat map of its axis and in the colour of the axis in the panels of the coefficients.
 """
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
@@ -19,31 +18,22 @@ from drivers.sample import AXES, Floats
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, Kind, axes_of
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
-from monitor.publishing.plots.allan_figure import COLOURS, DARK, GREY, set_log_ticks, style_grid
+from monitor.publishing.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.collections import QuadMesh
     from matplotlib.figure import Figure, SubFigure
 
-SURFACE_INCHES: Final = 1.35
-LINE_INCHES: Final = 1.6
+HEAT_MAP_INCHES: Final = 1.35
+COEFFICIENT_INCHES: Final = 1.6
 SPARE_INCHES: Final = 1.2  # height of title, colour bar and time axis
 MIN_ESTIMATED_SHARE: Final = 0.05  # smallest share of time steps with an estimate for a coefficient to have a panel
 PALE_ALPHA: Final = 0.3
-DASHED_LINE: Final = (0, (4, 2))
 MIN_LABEL_DISTANCE: Final = 0.13  # smallest distance between two labels, as a share of the width
-COLOUR_SCALE_RATIOS: Final = (
-    1.25,
-    1.5,
-    2.0,
-    3.0,
-    5.0,
-    10.0,
-)  # possible ends of the colour scale; the first that holds most cells
-BANDS: Final = 0.9  # share of the ends of the bands inside a panel; the widest would determine its scale
-LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
-UNITS_S: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
+COLOUR_SCALE_RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # possible ends of the colour scale
+MIN_CELLS_IN_SCALE: Final = 0.95  # smallest share of the cells inside the colour scale
+BAND_ENDS_INSIDE: Final = 0.9  # share of the ends of the bands inside a panel; the widest would determine its scale
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,48 +44,15 @@ class ChangeMark:
     axis: str
 
 
-@dataclass(frozen=True, slots=True)
-class TimeUnit:
-    """Unit of a time axis."""
-
-    name: str
-    seconds: float
-
-    @classmethod
-    def of(cls, span_s: float) -> "TimeUnit":
-        """Return the unit that suits a time span given in seconds.
-
-        >>> TimeUnit.of(7200.0).name, TimeUnit.of(5e5).name
-        ('min', 'd')
-        """
-        return next(cls(name, seconds) for name, seconds, below in UNITS_S if span_s < below)
-
-
-def panel_letters(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
-    """Return the coefficients that are estimated often enough to have a panel.
-
-    Parameters
-    ----------
-    dynamic
-        Dynamic curves.
-    kind
-        Kind of sensor.
-    """
+def _shown_coefficients(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
+    """Return the coefficients that are estimated often enough to have a panel."""
     columns = [AXES.index(axis) for axis in axes_of(kind)]
     share = (dynamic.status[:, :, columns] == Status.ESTIMATED).mean(axis=0).max(axis=1)
     return tuple(letter for letter, one in zip(SYMBOLS, share, strict=True) if one >= MIN_ESTIMATED_SHARE)
 
 
-def axes_shown(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
-    """Return the measured axes of a kind of sensor.
-
-    Parameters
-    ----------
-    dynamic
-        Dynamic curves.
-    kind
-        Kind of sensor.
-    """
+def _shown_axes(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
+    """Return the measured axes of a kind of sensor."""
     return tuple(a for a in axes_of(kind) if bool(np.isfinite(dynamic.deviation[:, :, AXES.index(a)]).any()))
 
 
@@ -105,27 +62,27 @@ def height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
     Parameters
     ----------
     dynamic
-        Dynamic curves.
+        Dynamic Allan deviation.
     kind
         Kind of sensor.
     """
-    surfaces, lines = len(axes_shown(dynamic, kind)), len(panel_letters(dynamic, kind))
-    return SPARE_INCHES + SURFACE_INCHES * surfaces + LINE_INCHES * lines
+    heat_maps, coefficients = len(_shown_axes(dynamic, kind)), len(_shown_coefficients(dynamic, kind))
+    return SPARE_INCHES + HEAT_MAP_INCHES * heat_maps + COEFFICIENT_INCHES * coefficients
 
 
-def relative(dynamic: DynamicAllan) -> Floats:
+def divide_by_median(dynamic: DynamicAllan) -> Floats:
     """Return the deviation divided by its median over time, shape [T, m, 6]; NaN if missing or if the median is 0.
 
     >>> from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan as of
     >>> steady = of(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0)
-    >>> bool(np.allclose(np.median(relative(steady), axis=0), 1.0))
+    >>> bool(np.allclose(np.median(divide_by_median(steady), axis=0), 1.0))
     True
     """
     with np.errstate(invalid="ignore", divide="ignore"):
         return dynamic.deviation / _median(dynamic)
 
 
-def dynamic_panels(
+def draw_dynamic_panels(
     figure: "Figure | SubFigure", dynamic: DynamicAllan, kind: Kind, marks: Sequence[ChangeMark] = ()
 ) -> None:
     """Draw the panels of one kind of sensor.
@@ -135,89 +92,81 @@ def dynamic_panels(
     figure
         Figure to fill.
     dynamic
-        Dynamic curves.
+        Dynamic Allan deviation.
     kind
         Kind of sensor.
     marks
         Changes of all axes; those of this kind are drawn.
     """
-    axes, shown = axes_shown(dynamic, kind), panel_letters(dynamic, kind)
-    ratios = [SURFACE_INCHES] * len(axes) + [LINE_INCHES] * len(shown)
-    panels = figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
-    clock = TimeUnit.of(float(dynamic.t_s[-1]))
-    edges = _edges(dynamic.t_s) / clock.seconds
-    ratio, mesh = _colour_scale_end(relative(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
+    axes, letters = _shown_axes(dynamic, kind), _shown_coefficients(dynamic, kind)
+    ratios = [HEAT_MAP_INCHES] * len(axes) + [COEFFICIENT_INCHES] * len(letters)
+    panels = list(figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0])
+    unit, unit_s = style.time_unit(float(dynamic.t_s[-1]))
+    edges = _time_edges(dynamic.t_s) / unit_s
+    ratio, mesh = _colour_scale_end(divide_by_median(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
     for panel, axis in zip(panels, axes, strict=False):
         mesh = _draw_heat_map(panel, dynamic, axis, edges, ratio)
-    for panel, letter in zip(panels[len(axes) :], shown, strict=True):
-        _draw_coefficient(panel, dynamic, kind, letter, dynamic.t_s / clock.seconds)
-    for panel in panels:
-        panel.set_xlim(edges[0], edges[-1])
-    own = [mark for mark in marks if mark.axis in axes and edges[0] <= mark.t_s / clock.seconds <= edges[-1]]
-    _draw_changes(list(panels), axes, own, clock)
-    panels[0].set_title(KIND_NAMES[kind], loc="left", fontsize=12)
-    panels[-1].set_xlabel(f"time at the end of the window of {dynamic.window_s:.4g} s, {clock.name}")
-    figure.align_ylabels(list(panels))
-    if mesh is not None:
-        _draw_colour_bar(figure, mesh, list(panels[: len(axes)]), ratio)
-
-
-def _draw_changes(panels: "Sequence[Axes]", axes: Sequence[str], marks: Sequence[ChangeMark], clock: TimeUnit) -> None:
-    """Draw changes as vertical lines, with labels in the heat map of their axis."""
-    left, right = panels[0].get_xlim()
-    apart = MIN_LABEL_DISTANCE * (right - left)
+    for panel, letter in zip(panels[len(axes) :], letters, strict=True):
+        _draw_coefficient(panel, dynamic, kind, letter, dynamic.t_s / unit_s)
+    panels[0].set_xlim(edges[0], edges[-1])
+    inside = [mark for mark in marks if mark.axis in axes and edges[0] <= mark.t_s / unit_s <= edges[-1]]
     for panel, axis in zip(panels, axes, strict=False):
-        times = [mark.t_s / clock.seconds for mark in marks if mark.axis == axis]
-        for at in times:
-            panel.axvline(at, color=DARK, linewidth=1.1, linestyle=DASHED_LINE)
-            for course in panels[len(axes) :]:
-                course.axvline(at, color=COLOURS[AXES.index(axis) % 3], linewidth=1.1, linestyle=DASHED_LINE)
-        for near in _group_times(np.clip(times, left + apart / 2.0, right - apart / 2.0).tolist(), apart):
-            panel.annotate(
-                "change" if len(near) == 1 else f"{len(near)} changes", (sum(near) / len(near), 1.0), (0, -4),
-                xycoords=("data", "axes fraction"), textcoords="offset points",
-                ha="center", va="top", fontsize=8, color=DARK,
-                bbox={"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": "none", "alpha": 0.9},
-            )  # fmt: skip
+        _draw_changes(panel, panels[len(axes) :], axis, [mark.t_s / unit_s for mark in inside if mark.axis == axis])
+    panels[0].set_title(KIND_NAMES[kind])
+    panels[-1].set_xlabel(f"time at the end of the window of {dynamic.window_s:.4g} s, {unit}")
+    figure.align_ylabels(panels)
+    if mesh is not None:
+        _draw_colour_bar(figure, mesh, panels[: len(axes)], ratio)
 
 
-def _group_times(times: Sequence[float], apart: float) -> list[list[float]]:
-    """Group times so that the means of neighbouring groups are at least ``apart`` apart.
+def _draw_changes(heat_map: "Axes", others: "Sequence[Axes]", axis: str, times: Sequence[float]) -> None:
+    """Draw the changes of one axis as vertical lines, with labels in its heat map."""
+    left, right = heat_map.get_xlim()
+    distance = MIN_LABEL_DISTANCE * (right - left)
+    for t in times:
+        heat_map.axvline(t, color=style.DARK, linewidth=1.1, linestyle=style.DASHES)
+        for panel in others:
+            panel.axvline(t, color=style.axis_colour(axis), linewidth=1.1, linestyle=style.DASHES)
+    for near in _group_times(np.clip(times, left + distance / 2.0, right - distance / 2.0).tolist(), distance):
+        heat_map.annotate(
+            "change" if len(near) == 1 else f"{len(near)} changes", (sum(near) / len(near), 1.0), (0, -4),
+            xycoords=("data", "axes fraction"), textcoords="offset points",
+            ha="center", va="top", fontsize=style.SMALL_TEXT, color=style.DARK,
+            bbox=style.LABEL_BOX,
+        )  # fmt: skip
+
+
+def _group_times(times: Sequence[float], distance: float) -> list[list[float]]:
+    """Group times so that the means of neighbouring groups are at least ``distance`` apart.
 
     >>> _group_times([1.0, 9.0, 1.5, 2.0], 2.0)
     [[1.0, 1.5, 2.0], [9.0]]
     """
-    heaps = [[time] for time in sorted(times)]
-    at = 1
-    while at < len(heaps):
-        before, this = heaps[at - 1], heaps[at]
-        if sum(this) / len(this) - sum(before) / len(before) < apart:
-            heaps[at - 1 : at + 1] = [before + this]
-            at = max(at - 1, 1)  # the mean of the group has changed
-        else:
-            at += 1
-    return heaps
+    groups: list[list[float]] = []
+    for time in sorted(times):
+        groups.append([time])
+        # Joining two groups moves their mean, so that the previous group may be too close as well.
+        while len(groups) > 1 and float(np.mean(groups[-1]) - np.mean(groups[-2])) < distance:
+            groups[-2:] = [groups[-2] + groups[-1]]
+    return groups
 
 
 def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Floats, ratio: float) -> "QuadMesh":
     """Draw the heat map of one axis, time by τ."""
-    from matplotlib.ticker import NullLocator
-
     i = AXES.index(axis)
     with np.errstate(invalid="ignore", divide="ignore"):
-        colour = np.log(relative(dynamic)[:, :, i].T)
+        colour = np.log(divide_by_median(dynamic)[:, :, i].T)
     median = _median(dynamic)[:, :, i]
     usual = (dynamic.lo[:, :, i] <= median) & (median <= dynamic.hi[:, :, i])
-    end = np.log(ratio)
-    pale: Any = np.where(usual.T, PALE_ALPHA, 1.0)  # matplotlib accepts an array, but its type hints do not
+    alpha: Any = np.where(usual.T, PALE_ALPHA, 1.0)  # matplotlib accepts an array, but its type hints do not
     mesh = panel.pcolormesh(
-        edges, _edges_of_tau(dynamic.tau_s), colour,
-        cmap="RdBu_r", vmin=-end, vmax=end, alpha=pale, rasterized=True, linewidth=0,
+        edges, _tau_edges(dynamic.tau_s), colour,
+        cmap="RdBu_r", vmin=-np.log(ratio), vmax=np.log(ratio), alpha=alpha, rasterized=True, linewidth=0,
     )  # fmt: skip
     panel.set_yscale("log")
-    panel.yaxis.set_minor_locator(NullLocator())
+    style.style_log_axis(panel, "y", minor_grid=False)
+    panel.grid(False)
     panel.set_facecolor("#f4f4f4")
-    panel.spines[["top", "right"]].set_visible(False)
     panel.set_ylabel(f"{axis}   τ, s")
     return mesh
 
@@ -228,59 +177,49 @@ def _draw_colour_bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "li
 
     # A separate mappable is used, because the colour bar of the mesh would be as pale as its cells.
     bar = figure.colorbar(ScalarMappable(mesh.norm, mesh.cmap), ax=panels, aspect=30, pad=0.015, fraction=0.05)
-    ticks = [-np.log(ratio), -np.log(ratio) / 2, 0.0, np.log(ratio) / 2, np.log(ratio)]
-    bar.set_ticks(ticks, labels=[f"× {np.exp(tick):.2g}" for tick in ticks])
-    bar.ax.tick_params(labelsize=8)
-    bar.set_label("deviation over its median; pale: within 95 %", fontsize=8)
+    ticks = np.log(ratio) * np.linspace(-1.0, 1.0, 5)
+    bar.set_ticks(ticks.tolist(), labels=[f"× {np.exp(tick):.2g}" for tick in ticks])
+    bar.ax.tick_params(labelsize=style.SMALL_TEXT)
+    bar.set_label("deviation over its median; pale: within 95 %", fontsize=style.SMALL_TEXT)
     bar.outline.set_visible(False)
 
 
 def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: str, t: Floats) -> None:
     """Draw one coefficient of three axes over time."""
     row, unit = SYMBOLS.index(letter), COEFFICIENT_UNITS[kind][letter]
-    held, ends = [], []
-    for axis, colour in zip(axes_of(kind), COLOURS, strict=True):
-        i = AXES.index(axis)
+    values, ends = [], []
+    for axis in axes_of(kind):
+        i, colour = AXES.index(axis), style.axis_colour(axis)
         estimated = dynamic.status[:, row, i] == Status.ESTIMATED
         value, lo, hi = (
             np.where(estimated, part[:, row, i] * unit.factor, np.nan)
             for part in (dynamic.value, dynamic.value_lo, dynamic.value_hi)
         )
-        # Bands have hundreds of corners; rasterized, they do not enlarge a report.
-        panel.fill_between(t, lo, hi, color=colour, alpha=0.15, linewidth=0, rasterized=True)
-        panel.plot(t, value, "-", color=colour, linewidth=1.4, label=axis)
+        style.draw_band(panel, t, lo, hi, colour, rasterized=True)  # hundreds of corners would enlarge a report
+        panel.plot(t, value, color=colour, label=axis)
         alone = _isolated(estimated)
         panel.plot(t[alone], value[alone], ".", color=colour, markersize=3.5)
-        held.append(value)
+        values.append(value)
         ends.append((lo, hi))
-    low, high = np.nanmin(held), np.nanmax(held)
-    if low > 0 and high > LOG_SCALE_RATIO * low:
-        panel.set_yscale("log")
-        panel.set_ylim(low / 1.5, high * 1.5)
-        set_log_ticks(panel)
-    else:
-        room = 0.25 * (high - low) + 0.02 * high
-        lowest, highest = np.nanquantile(ends, [1.0 - BANDS, BANDS]).tolist()
-        panel.set_ylim(max(min(low - room, lowest), 0.0), max(high + room, highest))
+    low, high = float(np.nanmin(values)), float(np.nanmax(values))
+    style.set_value_limits(panel, low, high, 0.25)
+    if not (low > 0 and high > style.LOG_SCALE_RATIO * low):
+        lowest, highest = np.nanquantile(ends, [1.0 - BAND_ENDS_INSIDE, BAND_ENDS_INSIDE]).tolist()
+        bottom, top = panel.get_ylim()
+        panel.set_ylim(max(min(bottom, lowest), 0.0), max(top, highest))
     panel.set_ylabel(f"{letter}, {unit.name}")
-    panel.set_title(COEFFICIENT_NAMES[kind][letter], loc="left", fontsize=9, color=GREY, pad=3)
-    style_grid(panel)
-    panel.legend(
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.1, frameon=False,
-        ncols=3, fontsize=8, handlelength=1.2, columnspacing=1.0,
-    )  # fmt: skip
+    panel.set_title(COEFFICIENT_NAMES[kind][letter], fontsize=9, color=style.GREY, pad=3)
+    style.draw_legend_above(panel, 3, fontsize=style.SMALL_TEXT)
 
 
-def _isolated(there: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _isolated(estimated: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return the points without a neighbour, which no line shows."""
-    padded = np.concatenate([[False], there, [False]])
-    return np.asarray(there & ~padded[:-2] & ~padded[2:])
+    padded = np.concatenate([[False], estimated, [False]])
+    return np.asarray(estimated & ~padded[:-2] & ~padded[2:])
 
 
 def _median(dynamic: DynamicAllan) -> Floats:
     """Return the median of the deviation over time, shape [1, m, 6]; NaN if there is none."""
-    import warnings
-
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # raised for an axis that is not measured
         median = np.nanmedian(dynamic.deviation, axis=0, keepdims=True)
@@ -288,21 +227,21 @@ def _median(dynamic: DynamicAllan) -> Floats:
 
 
 def _colour_scale_end(ratios: Floats) -> float:
-    """Return the end of the colour scale, which holds 95 % of the cells."""
+    """Return the smallest possible end of the colour scale that holds most cells."""
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.abs(np.log(ratios))
     size = size[np.isfinite(size)]
-    most = float(np.exp(np.quantile(size, 0.95))) if size.size else COLOUR_SCALE_RATIOS[0]
-    return next((ratio for ratio in COLOUR_SCALE_RATIOS if ratio >= most), COLOUR_SCALE_RATIOS[-1])
+    needed = float(np.exp(np.quantile(size, MIN_CELLS_IN_SCALE))) if size.size else 1.0
+    return next((ratio for ratio in COLOUR_SCALE_RATIOS if ratio >= needed), COLOUR_SCALE_RATIOS[-1])
 
 
-def _edges(t: Floats) -> Floats:
+def _time_edges(t: Floats) -> Floats:
     """Return the edges of the cells around equally spaced times."""
     half = (t[1] - t[0]) / 2.0 if t.size > 1 else t[0] / 40.0
     return np.append(t - half, t[-1] + half)
 
 
-def _edges_of_tau(tau_s: Floats) -> Floats:
+def _tau_edges(tau_s: Floats) -> Floats:
     """Return the edges of the cells around the τ, at the means of their logarithms."""
     if tau_s.size == 1:
         return np.array([0.7, 1.4]) * float(tau_s[0])

@@ -1,113 +1,91 @@
-"""Plots of bias and temperature: over time and against each other, one row per axis.
-
-matplotlib is imported when a plot is requested, and draws without a display.
-"""
+"""Plots of bias and temperature, one row per axis: over time, and against each other."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Final
 
 import numpy as np
 
-from drivers.errors import ConfigError
-from drivers.sample import AXES, Floats
 from monitor.common.units import DEVIATION_UNITS, format_duration, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_model import Prediction, predict
 from monitor.drift.thermal.thermal_study import ThermalFitReport, ThermalPredictionReport
-from monitor.publishing.plots.allan_figure import COLOURS, GREY
-from monitor.publishing.plots.analysis_plot import DPI, MISSING
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from monitor.publishing.plots import style
 
 ROW_INCHES: Final = (11.0, 2.6)
 
 
-def study_plot(study: ThermalFitReport, path: Path) -> None:
+def save_thermal_fit_plot(report: ThermalFitReport, path: Path) -> None:
     """Write a plot of interval means and the fitted thermal models.
 
     Parameters
     ----------
-    study
+    report
         The fitted models.
     path
-        File to write; its suffix selects the format.
+        File to write. Its suffix selects the format.
 
     Raises
     ------
     ConfigError
-        matplotlib is missing or the file cannot be written.
+        If matplotlib is missing or the file cannot be written.
     """
     rows = [
         (
             axis,
-            study.means[axis],
-            predict(one.model, study.means[axis].temperature_c, began=True),
+            report.means[axis],
+            predict(one.model, report.means[axis].temperature_c, began=True),
             one.model.shape.name,
         )
-        for axis, one in study.fits.items()
+        for axis, one in report.fits.items()
     ]
-    _draw(rows, f"{study.recording}: bias and temperature, means of {format_duration(study.interval_s)}", path)
+    _save_plot(rows, f"{report.recording}: bias and temperature, means of {format_duration(report.interval_s)}", path)
 
 
-def outlook_plot(outlook: ThermalPredictionReport, path: Path) -> None:
-    """Write a plot of interval means and the predictions of models of another recording, with the offset removed.
+def save_thermal_prediction_plot(report: ThermalPredictionReport, path: Path) -> None:
+    """Write a plot of interval means and the predictions of another recording's models, with the offset removed.
 
     Parameters
     ----------
-    outlook
+    report
         The predictions.
     path
-        File to write; its suffix selects the format.
+        File to write. Its suffix selects the format.
 
     Raises
     ------
     ConfigError
-        matplotlib is missing or the file cannot be written.
+        If matplotlib is missing or the file cannot be written.
     """
     rows = []
-    for axis, one in outlook.judged.items():
-        band = Prediction(*(each + one.offset for each in (one.multi_step.bias, one.multi_step.lo, one.multi_step.hi)))
-        rows.append((axis, outlook.means[axis], band, "multi-step, offset out"))
-    _draw(rows, f"{outlook.recording}: expected from temperature, means of {format_duration(outlook.interval_s)}", path)
+    for axis, one in report.judged.items():
+        predicted = (bound + one.offset for bound in (one.multi_step.bias, one.multi_step.lo, one.multi_step.hi))
+        rows.append((axis, report.means[axis], Prediction(*predicted), "multi-step prediction, offset removed"))
+    duration = format_duration(report.interval_s)
+    _save_plot(rows, f"{report.recording}: bias predicted from temperature, means of {duration}", path)
 
 
-def _draw(rows: list[tuple[str, IntervalMeans, Prediction, str]], title: str, path: Path) -> None:
-    """Write the plot; raise ConfigError if matplotlib is missing or the file cannot be written."""
-    try:
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
-    except ImportError as error:
-        raise ConfigError(MISSING) from error
-    figure = Figure(figsize=(ROW_INCHES[0], 0.6 + ROW_INCHES[1] * len(rows)), dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    panels: Any = figure.subplots(len(rows), 2, squeeze=False, width_ratios=[2.4, 1.0])
-    for (over_time, against), (axis, means, model, name) in zip(panels, rows, strict=True):
-        unit, colour = DEVIATION_UNITS[sensor_kind(axis)], COLOURS[AXES.index(axis) % 3]
-        hours = (np.arange(means.bias.size) + 0.5) * means.interval_s / 3600.0
-        middle = float(np.nanmean(means.bias))
-        bias, expected, lo, hi, bars = (
-            unit.factor * each
-            for each in (means.bias - middle, model.bias - middle, model.lo - middle, model.hi - middle, means.error)
-        )
-        over_time.fill_between(hours, lo, hi, color=colour, alpha=0.15, lw=0, label="95 %")
-        over_time.errorbar(hours, bias, bars, fmt=".", ms=4, color=GREY, lw=0.8, label="means")
-        over_time.plot(hours, expected, color=colour, lw=1.4, label=name)
-        over_time.set_ylabel(f"{axis} less its mean, {unit.name}")
-        over_time.legend(loc="best", fontsize=7.5, frameon=False)
-        _draw_against_temperature(against, means.temperature_c, bias, expected, colour)
-    panels[-1, 0].set_xlabel("time, h")
-    panels[-1, 1].set_xlabel("temperature, °C")
-    figure.suptitle(title, fontsize=12)
-    try:
-        figure.savefig(path)
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"cannot write the plot {path}: {error}") from error
-
-
-def _draw_against_temperature(
-    panel: "Axes", temperature_c: Floats, bias: Floats, expected: Floats, colour: str
-) -> None:
-    """Draw bias and prediction against temperature."""
-    panel.plot(temperature_c, bias, ".", ms=4, color=GREY)
-    panel.plot(temperature_c, expected, color=colour, lw=1.2)
+def _save_plot(rows: list[tuple[str, IntervalMeans, Prediction, str]], title: str, path: Path) -> None:
+    """Draw one row for each axis, and write the plot."""
+    with style.figure_style():
+        figure = style.create_figure(ROW_INCHES[0], 0.6 + ROW_INCHES[1] * len(rows))
+        panels = figure.subplots(len(rows), 2, squeeze=False, sharex="col", sharey="row", width_ratios=[2.4, 1.0])
+        for (over_time, against_temperature), (axis, means, model, name) in zip(panels, rows, strict=True):
+            unit, colour = DEVIATION_UNITS[sensor_kind(axis)], style.axis_colour(axis)
+            hours = np.asarray((np.arange(means.bias.size) + 0.5) * means.interval_s / 3600.0, np.float64)
+            centre = float(np.nanmean(means.bias))
+            bias, predicted, lo, hi = (
+                unit.factor * (part - centre) for part in (means.bias, model.bias, model.lo, model.hi)
+            )
+            style.draw_band(over_time, hours, lo, hi, colour, label="95 %")
+            over_time.errorbar(
+                hours, bias, unit.factor * means.error, fmt=".", markersize=4, color=style.GREY, lw=0.8, label="means"
+            )
+            over_time.plot(hours, predicted, color=colour, label=name)
+            over_time.set_ylabel(f"{axis} minus its mean, {unit.name}")
+            style.draw_legend_above(over_time, 3, fontsize=7.5)
+            against_temperature.plot(means.temperature_c, bias, ".", markersize=4, color=style.GREY)
+            against_temperature.plot(means.temperature_c, predicted, color=colour, lw=1.2)
+        panels[-1, 0].set_xlabel("time, h")
+        panels[-1, 1].set_xlabel("temperature, °C")
+        figure.suptitle(title)
+        style.save_figure(figure, path)

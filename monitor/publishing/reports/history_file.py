@@ -1,7 +1,7 @@
 """Export of a history as a table: CSV, Parquet, Arrow or .npz, one row per bucket and one column per number, in SI.
 
 Column names include the unit in ASCII: ``gz.N (rad/sqrt(s))``, and for the extremes ``gz.N low (rad/sqrt(s))`` and
-``gz.N high (rad/sqrt(s))``. Missing values are empty or NaN. The file is created completely or not at all.
+``gz.N high (rad/sqrt(s))``. Missing values are empty or NaN. If writing fails, no file is left.
 """
 
 from pathlib import Path
@@ -15,18 +15,13 @@ from drivers.sample import Floats
 from monitor.common.units import sensor_kind
 from monitor.history.bucket import COUNTS, STATES
 from monitor.history.reading import HistoryTable
+from monitor.publishing.exporters.noise import ascii_unit
 
-COEFFICIENT_SI_UNITS: Final = {
-    "gyro": {"Q": "rad", "N": "rad/sqrt(s)", "B": "rad/s", "K": "rad/s/sqrt(s)", "R": "rad/s^2", "sigma": "rad/s"},
-    "accel": {"Q": "m/s", "N": "m/s/sqrt(s)", "B": "m/s^2", "K": "m/s^2/sqrt(s)", "R": "m/s^3", "sigma": "m/s^2"},
-}
 STATUS_UNITS: Final = {"rate": "Hz", "latency": "s", "memory": "B", "temperature": "degC"}
-STATE_COLUMN_NAME: Final = (
-    "state (" + ", ".join(f"{i} {name}" for i, name in enumerate(STATES)).replace(", ", "; ") + ")"
-)
+STATE_COLUMN_NAME: Final = "state (" + "; ".join(f"{i} {name}" for i, name in enumerate(STATES)) + ")"
 
 
-def save(past: HistoryTable, path: Path) -> None:
+def save_history(past: HistoryTable, path: Path) -> None:
     """Write a history in the format of the path's suffix.
 
     Parameters
@@ -39,22 +34,22 @@ def save(past: HistoryTable, path: Path) -> None:
     Raises
     ------
     ConfigError
-        The suffix is unknown or the file cannot be written.
+        If the suffix is unknown or the file cannot be written.
     """
-    columns = table(past)
+    columns = history_columns(past)
     begin = format_for_path(path).writer
     with atomic_write_path(path) as part, begin(part, list(columns)) as append:
         append(columns)
 
 
-def table(past: HistoryTable) -> dict[str, Floats]:
+def history_columns(past: HistoryTable) -> dict[str, Floats]:
     """Return the columns by name, shape [p] each; interval ends and bounds have only their last value per bucket."""
     columns: dict[str, Floats] = {
         "t (Unix s)": past.start_s.astype(np.float64),
         "width (s)": past.width_s.astype(np.float64),
     }
     for name in past.names:
-        course, unit = past.column(name), unit_of(name)
+        course, unit = past.column(name), column_unit(name)
         columns[f"{name} ({unit})"] = course.last
         if name.endswith((".lo", ".hi", ".bound")):
             continue
@@ -67,11 +62,14 @@ def table(past: HistoryTable) -> dict[str, Floats]:
     return columns
 
 
-def unit_of(name: str) -> str:
+def column_unit(name: str) -> str:
     """Return the SI unit of a column of a history row.
 
-    >>> unit_of("gz.N.lo"), unit_of("az.sigma.0.1"), unit_of("rate")
+    >>> column_unit("gz.N.lo"), column_unit("az.sigma.0.1"), column_unit("rate")
     ('rad/sqrt(s)', 'm/s^2', 'Hz')
     """
     axis, _, rest = name.partition(".")
-    return COEFFICIENT_SI_UNITS[sensor_kind(axis)][rest.split(".")[0]] if rest else STATUS_UNITS[name]
+    if not rest:
+        return STATUS_UNITS[name]
+    quantity = rest.split(".")[0]
+    return ascii_unit("B" if quantity == "sigma" else quantity, sensor_kind(axis))  # σ has the unit of B

@@ -21,7 +21,7 @@ from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
 from monitor.common.units import format_duration
 from monitor.publishing.plots import colours
-from monitor.publishing.plots.reconcile_chart import DOTS, Plot, height_of, plotted
+from monitor.publishing.plots.diagnostic_figure import MAX_MARKERS, DiagnosticPlot, to_field_units, value_limits
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.rerun.allan_chart import (
     FILL_STEPS,
@@ -42,14 +42,9 @@ MAX_PLOTTED_DIAGNOSTICS: Final = 2  # number of diagnostics drawn per axis; the 
 BAND_COLOUR: Final = colours.blend(colours.FRAME, 0.55)
 LEGEND_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
 RANGE_COLOUR: Final = colours.TEMPERATURE  # orange, as on the HTML page
-GAP_LINE_COLOURS: Final = (  # colours of the gap lines; more lines would not fit into the legend
-    (240, 98, 77),
-    (45, 190, 130),
-    (84, 160, 255),
-    (236, 180, 72),
-    (190, 130, 230),
-    (150, 160, 170),
-)
+GAP_LINE_COLOURS: Final = (  # more lines would not fit into the legend
+    *(colours.AXIS_COLOURS[axis] for axis in AXES[:3]), colours.TEMPERATURE, (190, 130, 230), (150, 160, 170),
+)  # fmt: skip
 
 
 def write_rrd(r: Reconciliation, path: Path) -> None:
@@ -65,7 +60,7 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
     Raises
     ------
     ConfigError
-        The file cannot be written.
+        If the file cannot be written.
     """
     try:
         path.open("wb").close()
@@ -75,15 +70,15 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.save(path, default_blueprint=blueprint(r))
-    stream.log("overview", _markdown(overview(r)), static=True)
+    stream.log("overview", _markdown(_overview(r)), static=True)
     for axis in _axes(r):
-        _axis(stream, r, r.axes[axis])
+        _log_axis(stream, r, r.axes[axis])
     stream.flush()
     stream.disconnect()
 
 
 def blueprint(r: Reconciliation) -> rrb.Blueprint:
-    """Return the layout: a tab per axis, those that disagree with the model first, and a tab for all axes."""
+    """Return the layout: a tab per axis, those that differ from the model first, and a tab for all axes."""
     axes = sorted(_axes(r), key=lambda axis: r.axes[axis].verdict == "agrees")
     tabs: list[rrb.View | rrb.Container] = [_tab(r.axes[axis]) for axis in axes]
     tabs.append(rrb.TextDocumentView(origin="/overview", contents="$origin", name="All axes"))
@@ -97,47 +92,40 @@ def blueprint(r: Reconciliation) -> rrb.Blueprint:
     )
 
 
-def overview(r: Reconciliation) -> str:
+def _overview(r: Reconciliation) -> str:
     """Return the overview of all axes as Markdown."""
     rows = []
     for axis in _axes(r):
         result = r.axes[axis]
-        did = "; ".join(f"{step.kind} {words.step_line(step, axis, r.baseline)}" for step in result.steps)
-        left = "; ".join(words.score_line(one, axis) for one in result.left_over)
-        rows.append(f"| **{axis}** | {words.RESULT_TEXTS[result.verdict]} | {did or '—'} | {left or '—'} |")
+        steps = "; ".join(f"{step.kind} {words.describe_step(step, axis, r.baseline)}" for step in result.steps)
+        left_over = "; ".join(words.describe_gap(one, axis) for one in result.left_over)
+        rows.append(f"| **{axis}** | {words.RESULT_TEXTS[result.verdict]} | {steps or '—'} | {left_over or '—'} |")
     head = "| axis | verdict | added or retuned | left over |\n|:--|:--|:--|:--|"
     recorded = f"{r.samples:,} samples at {r.rate_hz:.6g} Hz, {format_duration(r.duration_s)}"
     notes = [f"note: {note}" for note in r.notes]
     return "\n\n".join(
-        [f"## {words.RESULT_TEXTS[r.verdict]}", words.summary(r), recorded, "\n".join([head, *rows]), *notes]
+        [f"## {words.RESULT_TEXTS[r.verdict]}", words.summarize(r), recorded, "\n".join([head, *rows]), *notes]
     )
 
 
-def steps_text(r: Reconciliation, result: AxisResult) -> str:
-    """Return the steps and the unexplained remainder of one axis as Markdown.
-
-    Parameters
-    ----------
-    r
-        Result of the reconciliation.
-    result
-        Result of the axis.
-    """
-    parts = [f"## {result.axis}: {words.RESULT_TEXTS[result.verdict]}", words.verdict_line(result)]
+def _steps_text(r: Reconciliation, result: AxisResult) -> str:
+    """Return the steps and the unexplained differences of one axis as Markdown."""
+    parts = [f"## {result.axis}: {words.RESULT_TEXTS[result.verdict]}", words.describe_result(result)]
     for count, step in enumerate(result.steps, start=1):
-        known = words.parameters(step, result.axis, r.baseline)
+        known = words.format_parameters(step, result.axis, r.baseline)
         parts += [
             "---",
-            f"**Step {count}: {step.kind} {words.words_of(step.effect)}** ({words.percent(step.confidence)})",
-            "\n".join(f"- {words.words_of(one.name)} **{one.short}**" for one in known),
+            f"**Step {count}: {step.kind} {words.readable_name(step.effect)}** "
+            f"({words.format_probability(step.confidence)})",
+            "\n".join(f"- {words.readable_name(one.name)} **{one.short}**" for one in known),
             f"{words.diagnostic_name(step.found.lens)}, {words.format_range(step.found.where, result.axis)}: gap "
             f"**{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}**, "
             f"threshold {words.format_gap(step.after.threshold)}",
             step.because,
-            words.alternatives_sentence(step),
+            words.describe_alternatives(step),
         ]
     if result.left_over:
-        parts += ["---", "**Left over**", *(f"- {words.score_line(one, result.axis)}" for one in result.left_over)]
+        parts += ["---", "**Left over**", *(f"- {words.describe_gap(one, result.axis)}" for one in result.left_over)]
     return "\n\n".join(parts)
 
 
@@ -146,12 +134,12 @@ def _axes(r: Reconciliation) -> list[str]:
     return [axis for axis in AXES if axis in r.axes]
 
 
-def _looks_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
+def _snapshots_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
     """Return the diagnostics with the first model and after each step; the last one excludes withdrawn effects."""
     return [result.start, *(step.look for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
-def _lenses(result: AxisResult) -> list[str]:
+def _drawn_diagnostics(result: AxisResult) -> list[str]:
     """Return the logarithmic diagnostics of an axis that are drawn."""
     return [view.lens for view in result.start.views if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
@@ -171,7 +159,7 @@ def _tab(result: AxisResult) -> rrb.Container:
         rrb.Horizontal(
             *(_diagnostic_view(result, lens, when) for when in (("before", "after") if steps else ("before",)))
         )
-        for lens in _lenses(result)
+        for lens in _drawn_diagnostics(result)
     ]
     name = f"{axis}: {words.RESULT_TEXTS[result.verdict]}"
     return rrb.Horizontal(left, rrb.Vertical(*rows), column_shares=[3, 7], name=name)
@@ -191,26 +179,28 @@ def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
     )
 
 
-def _axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
+def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
     """Log all entities of one axis."""
-    stream.log(f"{result.axis}/steps", _markdown(steps_text(r, result)), static=True)
-    for lens in _lenses(result):
-        _lens(stream, result, lens)
+    stream.log(f"{result.axis}/steps", _markdown(_steps_text(r, result)), static=True)
+    for lens in _drawn_diagnostics(result):
+        _log_diagnostic(stream, result, lens)
     _log_gaps(stream, result)
 
 
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
     """Log the gap of each diagnostic relative to its threshold, for the largest gaps, and the threshold, which is 1."""
-    looks = [{score.lens: words.gap_ratio(score) for score in look.scores} for look in _looks_by_step(result)]
+    snapshots = [
+        {score.lens: words.gap_ratio(score) for score in snapshot.scores} for snapshot in _snapshots_by_step(result)
+    ]
     path = f"{result.axis}/gap"
-    largest = sorted(looks[0], key=lambda lens: -max(look.get(lens, 0.0) for look in looks))
+    largest = sorted(snapshots[0], key=lambda lens: -max(snapshot.get(lens, 0.0) for snapshot in snapshots))
     for lens, tint in zip(largest, GAP_LINE_COLOURS, strict=False):
         line = rr.SeriesLines(colors=[tint], widths=[2.0], names=[words.diagnostic_name(lens)])
         stream.log(f"{path}/{lens}", line, static=True)
-        _log_by_step(stream, f"{path}/{lens}", [look.get(lens, np.nan) for look in looks])
+        _log_by_step(stream, f"{path}/{lens}", [snapshot.get(lens, np.nan) for snapshot in snapshots])
     line = rr.SeriesLines(colors=[colours.TEXT], widths=[1.0], names=["threshold"])
     stream.log(f"{path}/threshold", line, static=True)
-    _log_by_step(stream, f"{path}/threshold", [1.0] * len(looks))
+    _log_by_step(stream, f"{path}/threshold", [1.0] * len(snapshots))
 
 
 def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float]) -> None:
@@ -219,13 +209,15 @@ def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float])
     stream.send_columns(path, [steps], rr.Scalars.columns(scalars=np.array(values)))
 
 
-def _lens(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
+def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
     """Log both plots of one diagnostic with the same scale."""
     axis = result.axis
-    views = [next((view for view in look.views if view.lens == lens), None) for look in _looks_by_step(result)]
-    plots = {step: plotted("", view, axis, None) for step, view in enumerate(views) if view is not None}
+    views = [
+        next((view for view in snapshot.views if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
+    ]
+    plots = {step: to_field_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
-    scale = Scale(decades(plot.x for plot in every), decades([np.array(height_of(every))]))
+    scale = Scale(decades(plot.x for plot in every), decades([np.array(value_limits(every))]))
     for when in ("before", "after") if result.steps else ("before",):
         _log_grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
     stream.reset_time()
@@ -236,7 +228,9 @@ def _lens(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
         _log_curves(stream, f"{axis}/{lens}/after", scale, plot, axis, static=False)
 
 
-def _log_curves(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str, static: bool) -> None:
+def _log_curves(
+    stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str, static: bool
+) -> None:
     """Log the band, the measured curve and the expected curve."""
     # A lower end of zero has no logarithm; it is drawn below the box.
     low, high = (scale.to_chart(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
@@ -251,7 +245,7 @@ def _log_curves(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot,
         rr.LineStrips2D(finite_sections(at), colors=[colour], radii=thin, draw_order=5.0),
         static=static,
     )
-    if len(at) <= DOTS:
+    if len(at) <= MAX_MARKERS:
         dots = rr.Points2D(at, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0)
         stream.log(f"{path}/points", dots, static=static)
     expected = finite_sections(_inside(scale.to_chart(plot.x, plot.expected)))
@@ -263,7 +257,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, resul
     """Log a frame around each range in which this diagnostic found a gap."""
     view = next(view for view in result.start.views if view.lens == lens)
     founds = [step.found for step in result.steps] + list(result.left_over)
-    marks = [plotted("", view, result.axis, found.where) for found in founds if found.lens == lens]
+    marks = [to_field_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
     bounds = [mark.mark for mark in marks if mark.mark is not None]
     if not bounds:
         return
@@ -274,7 +268,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, resul
     stream.log(f"{path}/place", strips, static=True)
 
 
-def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Plot, axis: str) -> None:
+def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str) -> None:
     """Log frame, decade lines, labels and the key to the curves."""
     lines = grid(scale)
     for name, strips, colour, order in (

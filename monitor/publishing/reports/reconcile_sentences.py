@@ -8,7 +8,7 @@ HTML, Rerun or a terminal.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from math import floor, isfinite, log10
+from math import floor, isfinite, log10, nan
 from typing import Any, Final
 
 from drivers.sample import AXES
@@ -16,15 +16,18 @@ from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEGREE,
     DEVIATION_UNITS,
-    HOUR,
+    KINDS,
     MICRO_G,
     SAMPLE_UNITS,
+    Kind,
     Unit,
     format_number,
     sensor_kind,
 )
+from monitor.noise.effect import parameter_units
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
+from monitor.publishing.exporters.noise import COEFFICIENT_EFFECTS
 from monitor.reconcile.result import AxisResult, Location, ParameterInterval, Reconciliation, ReconciliationStep, Score
 
 RESULT_TEXTS: Final = {
@@ -36,44 +39,38 @@ RESULT_TEXTS: Final = {
 """Text of each result."""
 DIAGNOSTIC_NAMES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
 """Names of diagnostics that differ from their identifier."""
+SAMPLE_SI_UNITS: Final[dict[Kind, str]] = {"gyro": "rad/s", "accel": "m/s²"}
 GRAVITY: Final = 9.80665  # m/s², standard (CGPM 1901)
-DEGREES_PER_HOUR: Final = DEGREE * HOUR  # °/h per rad/s
 SMALL_UNIT_BELOW: Final = 0.1  # °/s or m/s²; below it, a rate or an acceleration is shown in °/h or µg
-_GYRO, _ACCEL = COEFFICIENT_UNITS["gyro"], COEFFICIENT_UNITS["accel"]
+_DEGREES_PER_HOUR: Final = DEVIATION_UNITS["gyro"].factor  # °/h per rad/s
+_SI_OF_COEFFICIENTS: Final = {
+    si: COEFFICIENT_UNITS[kind][letter]
+    for letter, effect in COEFFICIENT_EFFECTS.items()
+    for kind, si in zip(KINDS, parameter_units(effect)[letter], strict=True)
+}
 FIELD_UNITS: Final = {
+    **_SI_OF_COEFFICIENTS,
     "1": Unit(1.0, ""),
-    "rad": _GYRO["Q"],
-    "rad/√s": _GYRO["N"],
-    "rad/s/√s": _GYRO["K"],
-    "rad/s²": _GYRO["R"],
-    "rad/s/°C": Unit(DEGREES_PER_HOUR, "°/h/°C"),
-    "rad/s/°C²": Unit(DEGREES_PER_HOUR, "°/h/°C²"),
-    "rad/s per m/s²": Unit(DEGREES_PER_HOUR * GRAVITY, "°/h/g"),
-    "(rad/s)²/Hz": Unit(DEGREES_PER_HOUR**2, "(°/h)²/Hz"),
-    "rad²/s²/Hz": Unit(DEGREES_PER_HOUR**2, "(°/h)²/Hz"),
-    "rad/s/√Hz": Unit(DEGREES_PER_HOUR, "°/h/√Hz"),
-    "(rad/s)²": Unit(DEGREES_PER_HOUR**2, "(°/h)²"),
-    "rad²/s²": Unit(DEGREES_PER_HOUR**2, "(°/h)²"),
-    "m/s": _ACCEL["Q"],
-    "m/s/√s": _ACCEL["N"],
-    "m/s²/√s": _ACCEL["K"],
-    "m/s³": _ACCEL["R"],
+    "rad/s/°C": Unit(_DEGREES_PER_HOUR, "°/h/°C"),
+    "rad/s/°C²": Unit(_DEGREES_PER_HOUR, "°/h/°C²"),
+    "rad/s per m/s²": Unit(_DEGREES_PER_HOUR * GRAVITY, "°/h/g"),
+    **dict.fromkeys(("(rad/s)²/Hz", "rad²/s²/Hz"), Unit(_DEGREES_PER_HOUR**2, "(°/h)²/Hz")),
+    "rad/s/√Hz": Unit(_DEGREES_PER_HOUR, "°/h/√Hz"),
+    **dict.fromkeys(("(rad/s)²", "rad²/s²"), Unit(_DEGREES_PER_HOUR**2, "(°/h)²")),
     "m/s²/°C": Unit(MICRO_G, "µg/°C"),
     "m/s²/°C²": Unit(MICRO_G, "µg/°C²"),
-    "(m/s²)²/Hz": Unit(MICRO_G**2, "µg²/Hz"),
-    "m²/s⁴/Hz": Unit(MICRO_G**2, "µg²/Hz"),
+    **dict.fromkeys(("(m/s²)²/Hz", "m²/s⁴/Hz"), Unit(MICRO_G**2, "µg²/Hz")),
     "m/s²/√Hz": Unit(MICRO_G, "µg/√Hz"),
-    "(m/s²)²": Unit(MICRO_G**2, "µg²"),
-    "m²/s⁴": Unit(MICRO_G**2, "µg²"),
+    **dict.fromkeys(("(m/s²)²", "m²/s⁴"), Unit(MICRO_G**2, "µg²")),
 }
 """Unit of the field for each SI unit; units that are absent (Hz, s, °C) are used as they are."""
 UNITS_BY_NAME: Final = {"phase": Unit(DEGREE, "°"), "fraction": Unit(100.0, "%")}
 """Units of parameters that their SI unit does not determine."""
 RANGE_FORMATS: Final = {
-    "frequency": ("", "Hz"),
-    "tau": ("τ = ", "s"),
-    "time": ("t = ", "s"),
-    "temperature": ("", "°C"),
+    "frequency": ("", Unit(1.0, "Hz")),
+    "tau": ("τ = ", Unit(1.0, "s")),
+    "time": ("t = ", Unit(1.0, "s")),
+    "temperature": ("", Unit(1.0, "°C")),
 }
 """Prefix and unit of each kind of range."""
 MIN_RANGE_SHARE: Final = 1e-3  # a range narrower than this share of its position is written as one number
@@ -105,27 +102,27 @@ def field_unit(si: str, size: float) -> Unit:
     size
         Size of the quantity in the SI unit.
     """
-    for kind, unit in (("gyro", "rad/s"), ("accel", "m/s²")):
-        if si == unit:
-            large = SAMPLE_UNITS[kind]  # type: ignore[index]
-            return DEVIATION_UNITS[kind] if abs(size) * large.factor < SMALL_UNIT_BELOW else large  # type: ignore[index]
+    for kind in KINDS:
+        if si == SAMPLE_SI_UNITS[kind]:
+            large = SAMPLE_UNITS[kind]
+            return DEVIATION_UNITS[kind] if abs(size) * large.factor < SMALL_UNIT_BELOW else large
     return FIELD_UNITS.get(si, Unit(1.0, si))
 
 
-def words_of(name: str) -> str:
+def readable_name(name: str) -> str:
     """Return the name of an effect or a parameter with spaces instead of underscores."""
     return name.replace("_", " ")
 
 
 def diagnostic_name(lens: str) -> str:
     """Return the name of a diagnostic for the user."""
-    return DIAGNOSTIC_NAMES.get(lens, words_of(lens))
+    return DIAGNOSTIC_NAMES.get(lens, readable_name(lens))
 
 
-def percent(share: float) -> str:
+def format_probability(share: float) -> str:
     """Format a probability; values near 0 and 1 are written as inequalities.
 
-    >>> percent(0.998), percent(0.99999), percent(0.0002)
+    >>> format_probability(0.998), format_probability(0.99999), format_probability(0.0002)
     ('99.8 %', '> 99.9 %', '< 0.1 %')
     """
     if not isfinite(share):
@@ -135,29 +132,11 @@ def percent(share: float) -> str:
     return "< 0.1 %" if share < 0.001 else f"{100.0 * share:.1f} %"
 
 
-def span(low: float, high: float, unit: str) -> str:
-    """Format a range along one diagnostic.
-
-    >>> span(17.1, 17.5, "Hz"), span(1800.0, 1800.5, "s")
-    ('17.1 … 17.5 Hz', '1800 s')
-
-    Parameters
-    ----------
-    low, high
-        Ends of the range.
-    unit
-        Name of the unit.
-    """
-    if not abs(high - low) > MIN_RANGE_SHARE * max(abs(low), abs(high)):
-        return f"{_short(0.5 * (low + high))} {unit}".rstrip()
-    return f"{_short(low)} … {_short(high)} {unit}".rstrip()
-
-
 def format_range(where: Location, axis: str) -> str:
     """Format the range in which a diagnostic found a gap; "everywhere" if no range is given.
 
-    >>> format_range(Location(tau=(1.0, 4.0), source="ax"), "gz")
-    'τ = 1 … 4 s, from ax'
+    >>> format_range(Location(tau=(1.0, 4.0), source="ax"), "gz"), format_range(Location(time=(1800.0, 1800.5)), "gz")
+    ('τ = 1 … 4 s, from ax', 't = 1800 s')
 
     Parameters
     ----------
@@ -166,20 +145,22 @@ def format_range(where: Location, axis: str) -> str:
     axis
         Name of the axis, which selects the units.
     """
-    found = []
-    for name, at in where.found().items():
-        if isinstance(at, str):
-            found.append(f"from {at}")
-        elif name == "value":
-            unit = field_unit("rad/s" if sensor_kind(axis) == "gyro" else "m/s²", max(map(abs, at)))
-            found.append(span(at[0] * unit.factor, at[1] * unit.factor, unit.name))
-        else:
-            sign, unit_name = RANGE_FORMATS[name]
-            found.append(sign + span(*at, unit_name))
-    return ", ".join(found) or "everywhere"
+    texts = []
+    for name, ends in where.found().items():
+        if isinstance(ends, str):
+            texts.append(f"from {ends}")
+            continue
+        prefix, unit = RANGE_FORMATS.get(name, ("", Unit(1.0, "")))
+        if name == "value":
+            unit = field_unit(SAMPLE_SI_UNITS[sensor_kind(axis)], max(map(abs, ends)))
+        low, high = (end * unit.factor for end in ends)
+        narrow = not abs(high - low) > MIN_RANGE_SHARE * max(abs(low), abs(high))
+        text = _short(0.5 * (low + high)) if narrow else f"{_short(low)} … {_short(high)}"
+        texts.append(f"{prefix}{text} {unit.name}")
+    return ", ".join(texts) or "everywhere"
 
 
-def score_line(one: Score, axis: str) -> str:
+def describe_gap(one: Score, axis: str) -> str:
     """Return one line with the diagnostic, its range, its gap and its threshold.
 
     Parameters
@@ -210,7 +191,7 @@ def gap_ratio(one: Score) -> float:
     return share if isfinite(share) else 0.0
 
 
-def parameters(step: ReconciliationStep, axis: str, baseline: NoiseModel) -> tuple[Parameter, ...]:
+def format_parameters(step: ReconciliationStep, axis: str, baseline: NoiseModel) -> tuple[Parameter, ...]:
     """Return the text of all parameters of a step; for a changed term, also its value in the model under test.
 
     Parameters
@@ -225,12 +206,12 @@ def parameters(step: ReconciliationStep, axis: str, baseline: NoiseModel) -> tup
     known = [effect for effect in baseline.effects.get(axis, ()) if effect.name == step.effect]
     given = known[0] if len(known) == 1 and step.kind == "retuned" else None
     return tuple(
-        _parameter(step.effect, name, bounds, axis, getattr(given, name, None))
+        _format_parameter(step.effect, name, bounds, axis, getattr(given, name, None))
         for name, bounds in step.parameters.items()
     )
 
 
-def step_line(step: ReconciliationStep, axis: str, baseline: NoiseModel) -> str:
+def describe_step(step: ReconciliationStep, axis: str, baseline: NoiseModel) -> str:
     """Return one line with an effect and its parameters.
 
     Example: "sinusoidal: amplitude 30.94 ± 0.55 °/h, frequency 17.30000 ± 0.00010 Hz".
@@ -244,65 +225,93 @@ def step_line(step: ReconciliationStep, axis: str, baseline: NoiseModel) -> str:
     baseline
         Model under test.
     """
-    said = [f"{words_of(one.name)} {one.short}" for one in parameters(step, axis, baseline)]
-    return f"{words_of(step.effect)}: {', '.join(said)}" if said else words_of(step.effect)
+    said = [f"{readable_name(one.name)} {one.short}" for one in format_parameters(step, axis, baseline)]
+    return f"{readable_name(step.effect)}: {', '.join(said)}" if said else readable_name(step.effect)
 
 
-def summary(r: Reconciliation) -> str:
+def summarize(r: Reconciliation) -> str:
     """Return the result of the whole recording in one or two sentences."""
     differ = [axis for axis in AXES if axis in r.axes and r.axes[axis].verdict != "agrees"]
-    open_axes = [axis for axis in differ if r.axes[axis].left_over]
-    named = [step for axis in differ for step in r.axes[axis].steps]
-    model = "The five classic terms, fitted first," if r.fitted_first else "The model"
+    unexplained = [axis for axis in differ if r.axes[axis].left_over]
+    model = "The model of five classic terms, fitted first," if r.fitted_first else "The model"
     if r.verdict == "agrees":
-        many = "one axis" if len(r.axes) == 1 else f"each of {len(r.axes)} axes"
-        return f"{model} and the recording agree: on {many}, through every lens, they differ by no more than chance."
-    head = f"{model} and the recording differ by more than chance on {_listed(differ)}."
+        axes = "one axis" if len(r.axes) == 1 else f"all {len(r.axes)} axes"
+        return f"{model} and the recording agree: on {axes}, no diagnostic shows a difference larger than chance."
+    head = f"{model} and the recording differ by more than chance on {_join(differ)}."
     if r.verdict == "unexplained":
-        return f"{head} No known effect closes the gap, so no name is given."
+        return f"{head} No known effect explains the difference, so no effect is named."
+    steps = _join(_count_steps([step for axis in differ for step in r.axes[axis].steps]))
     if r.verdict == "partly_explained":
-        tail = f"is explained in part; on {_listed(open_axes)} something is left that no known effect closes."
-        return f"{head} With {_listed(_counted(named))}, it {tail}"
-    return f"{head} With {_listed(_counted(named))}, nothing is left that chance would not make."
+        rest = f"On {_join(unexplained)}, a difference remains that no known effect explains."
+        return f"{head} The difference is partly explained with {steps}. {rest}"
+    return f"{head} With {steps}, no difference larger than chance remains."
 
 
-def verdict_line(result: AxisResult) -> str:
+def describe_result(result: AxisResult) -> str:
     """Return the result of one axis in a sentence."""
     match result.verdict:
         case "agrees":
-            return "Model and measurement differ by no more than chance, through every lens."
+            return "In every diagnostic, model and measurement differ by no more than chance."
         case "explained":
-            return "After the last step nothing is left that chance would not make."
+            return "After the last step, no difference larger than chance remains."
         case "partly_explained":
-            return "The steps below are kept, and something is left that no known effect closes."
+            return "The steps below explain a part of the difference. No known effect explains the rest."
         case "unexplained":
-            return "Model and measurement differ, and no known effect closes the gap: no name is given."
+            return "Model and measurement differ. No known effect explains the difference, so no effect is named."
 
 
-def alternatives_sentence(step: ReconciliationStep) -> str:
+def describe_alternatives(step: ReconciliationStep) -> str:
     """Return a sentence on the effects that were also tried, with their probabilities."""
     if not step.runners_up:
-        return "No other effect came near."
-    tried = [f"{words_of(one.effect)} ({percent(one.confidence)})" for one in step.runners_up]
-    return f"Tried for the same gap and less likely: {_listed(tried)}."
+        return "No other effect explains the gap nearly as well."
+    tried = [f"{readable_name(one.effect)} ({format_probability(one.confidence)})" for one in step.runners_up]
+    return f"Less likely explanations of the same gap: {_join(tried)}."
 
 
-def _parameter(effect: str, name: str, bounds: ParameterInterval, axis: str, given: Any) -> Parameter:
+def describe_held_out_gap(step: ReconciliationStep) -> str:
+    """Return how the gap changed on the held-out data, which were not used to choose the effect."""
+    before, after = step.held_out_before, step.held_out_after
+    if before is None or after is None:
+        return f"None: {step.held_out_reason}."
+    return f"{format_gap(before.gap)} → {format_gap(after.gap)}, threshold {format_gap(after.threshold)}"
+
+
+def parameter_unit(effect: str, name: str, axis: str, size: float) -> Unit:
+    """Return the unit of the field for a parameter of an effect.
+
+    Parameters
+    ----------
+    effect
+        Name of the effect.
+    name
+        Name of the parameter.
+    axis
+        Name of the axis.
+    size
+        Size of the value in the SI unit.
+    """
+    si = parameter_units(EFFECTS[effect])[name][KINDS.index(sensor_kind(axis))]
+    return UNITS_BY_NAME.get(name) or field_unit(si, size)
+
+
+def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: str, given: Any) -> Parameter:
     """Return the text of one parameter."""
     if isinstance(bounds.value, str):
         return Parameter(name, bounds.value, "", bounds.value, "", "" if given is None else str(given))
-    known = {f.name: f.metadata for f in fields(EFFECTS[effect])}[name]  # type: ignore[arg-type]
-    unit = UNITS_BY_NAME.get(name) or field_unit(known["units"][0 if sensor_kind(axis) == "gyro" else 1], bounds.value)
-    was = "" if given is None else f"{format_number(given * unit.factor)} {unit.name}".rstrip()
-    value, lo, hi = (None if one is None else one * unit.factor for one in (bounds.value, bounds.lo, bounds.hi))
-    assert value is not None
-    if known["whole"]:
-        return Parameter(name, f"{value:.0f}", "", f"{value:.0f} {unit.name}".rstrip(), unit.name, was)
-    if lo is None or hi is None or not (isfinite(lo) and isfinite(hi)) or hi <= lo:
-        return Parameter(name, format_number(value), "", f"{format_number(value)} {unit.name}".rstrip(), unit.name, was)
+    unit = parameter_unit(effect, name, axis, bounds.value)
+
+    def with_unit(text: str) -> str:
+        return f"{text} {unit.name}".rstrip()
+
+    was = "" if given is None else with_unit(format_number(given * unit.factor))
+    value, lo, hi = (nan if end is None else end * unit.factor for end in (bounds.value, bounds.lo, bounds.hi))
+    whole = any(f.name == name and f.metadata["whole"] for f in fields(EFFECTS[effect]))  # type: ignore[arg-type]
+    if whole or not isfinite(hi - lo) or hi <= lo:
+        text = f"{value:.0f}" if whole else format_number(value)
+        return Parameter(name, text, "", with_unit(text), unit.name, was)
     texts = _with_interval(value, lo, hi)
-    short, interval = _plus_minus(value, lo, hi, texts), f"{texts[1]} … {texts[2]}"
-    return Parameter(name, texts[0], interval, f"{short} {unit.name}".rstrip(), unit.name, was)
+    short = with_unit(_plus_minus(value, lo, hi, texts))
+    return Parameter(name, texts[0], f"{texts[1]} … {texts[2]}", short, unit.name, was)
 
 
 def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str:
@@ -330,23 +339,21 @@ def _short(value: float) -> str:
     return text.replace("-", "−", 1) if value < 0.0 else text
 
 
-def _counted(steps: Sequence[ReconciliationStep]) -> list[str]:
+def _count_steps(steps: Sequence[ReconciliationStep]) -> list[str]:
     """Return the numbers of added effects and of changed terms, with their names."""
-    said = []
-    for kind, one, many in (
-        ("added", "effect added", "effects added"),
-        ("retuned", "known term retuned", "known terms retuned"),
-    ):
-        names = [words_of(step.effect) for step in steps if step.kind == kind]
+    texts = []
+    for kind, noun in (("added", "added effect"), ("retuned", "retuned term")):
+        names = [readable_name(step.effect) for step in steps if step.kind == kind]
         if names:
-            said.append(f"{len(names)} {one if len(names) == 1 else many} ({_listed(list(dict.fromkeys(names)))})")
-    return said
+            plural = "" if len(names) == 1 else "s"
+            texts.append(f"{len(names)} {noun}{plural} ({_join(list(dict.fromkeys(names)))})")
+    return texts
 
 
-def _listed(words: Sequence[str]) -> str:
-    """Join words with commas and "and".
+def _join(texts: Sequence[str]) -> str:
+    """Join texts with commas and "and".
 
-    >>> _listed(["gx"]), _listed(["gx", "gy", "gz"])
+    >>> _join(["gx"]), _join(["gx", "gy", "gz"])
     ('gx', 'gx, gy and gz')
     """
-    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
+    return " and ".join([", ".join(texts[:-1]), texts[-1]]) if len(texts) > 1 else "".join(texts)

@@ -15,7 +15,7 @@ from rich.text import Text
 
 from drivers.sample import AXES
 from monitor.common.units import format_duration
-from monitor.publishing.reports import comparison_sentences as runs_words
+from monitor.publishing.reports import comparison_sentences
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.reconcile.result import AxisResult, Reconciliation, ReconciliationStep
 from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect
@@ -40,7 +40,7 @@ def print_report(r: Reconciliation, console: Console) -> None:
         Destination.
     """
     console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
-    console.print(_verdict(r.verdict), Text(words.summary(r)))
+    console.print(_verdict(r.verdict), Text(words.summarize(r)))
     console.print(table(r))
     for note in r.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
@@ -61,22 +61,22 @@ def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
     """Add an axis to the table: its first line with the name of the axis, then its other lines."""
     lines = [_step(r, result.axis, step) for step in result.steps]
     lines += [
-        ("", "", Text(f"left over: {words.score_line(one, result.axis)}", style="yellow")) for one in result.left_over
+        ("", "", Text(f"left over: {words.describe_gap(one, result.axis)}", style="yellow")) for one in result.left_over
     ]
     head = (Text(result.axis, style="bold"), _verdict(result.verdict))
     if not lines and result.start.scores:
         most = max(result.start.scores, key=words.gap_ratio)
-        lines.append(("", "", Text(f"largest: {words.score_line(most, result.axis)}", style="dim")))
+        lines.append(("", "", Text(f"largest: {words.describe_gap(most, result.axis)}", style="dim")))
     for i, line in enumerate(lines or [("", "", Text())]):
         rows.add_row(*(head if i == 0 else ("", "")), *line)
 
 
 def _step(r: Reconciliation, axis: str, step: ReconciliationStep) -> tuple[str, str, Text]:
     """Return the gap, confidence and description of one step."""
-    what = Text.assemble(f"{step.kind} ", words.step_line(step, axis, r.baseline))
-    what.highlight_words([words.words_of(step.effect)], "bold")
+    what = Text.assemble(f"{step.kind} ", words.describe_step(step, axis, r.baseline))
+    what.highlight_words([words.readable_name(step.effect)], "bold")
     gap = f"{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}"
-    return gap, words.percent(step.confidence), what
+    return gap, words.format_probability(step.confidence), what
 
 
 def _verdict(verdict: str) -> Text:
@@ -95,7 +95,7 @@ def print_comparison(c: Comparison, console: Console) -> None:
     console
         Destination.
     """
-    console.print(_verdict(c.verdict), Text(runs_words.summary(c)))
+    console.print(_verdict(c.verdict), Text(comparison_sentences.summarize(c)))
     console.print(Padding(_axes_by_runs(c), (1, 0)))
     for title, found in (("common to all", _common(c)), ("in some only", _single(c))):
         if found:
@@ -118,7 +118,7 @@ def _axes_by_runs(c: Comparison) -> Table:
 
 def _cell(result: AxisResult | None) -> Text:
     """Return the cell of one axis in one recording."""
-    said = Text(runs_words.axis_summary(result), style="dim")
+    said = Text(comparison_sentences.count_findings(result), style="dim")
     return (
         said
         if result is None
@@ -144,7 +144,9 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
     for axis, one in c.axes.items():
         for seen in one.common:
             said = _effect(c, axis, seen)
-            said.append(f"; {runs_words.size_agreement(seen)}", style="yellow" if seen.consistent is False else "")
+            said.append(
+                f"; {comparison_sentences.describe_agreement(seen)}", style="yellow" if seen.consistent is False else ""
+            )
             found.append((axis, said))
     return found
 
@@ -163,13 +165,13 @@ def _single_on(c: Comparison, axis: str, one: AxisRuns) -> list[tuple[str, Text]
         found.append((axis, said))
         for absence in seen.absent:
             style = "yellow" if absence.meaning == "contradiction" else "dim"
-            meaning = f"not in {absence.run}: {runs_words.MEANINGS[absence.meaning]}: {absence.because}"
+            meaning = f"not in {absence.run}: {comparison_sentences.ABSENCE_TEXTS[absence.meaning]}: {absence.because}"
             found.append(("", Text(meaning, style=style)))
     return found
 
 
 def _effect(c: Comparison, axis: str, seen: MatchedEffect) -> Text:
     """Return the description of an effect, with its name in bold."""
-    said = Text(f"{seen.kind} {runs_words.effect_line(seen, axis, c.baseline)}")
-    said.highlight_words([words.words_of(seen.effect)], "bold")
+    said = Text(f"{seen.kind} {words.describe_step(seen.step(), axis, c.baseline)}")
+    said.highlight_words([words.readable_name(seen.effect)], "bold")
     return said

@@ -16,8 +16,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from scipy.signal import welch
 
 from drivers.sample import AXES, Floats
@@ -36,9 +34,19 @@ from monitor.estimation.analysis import Analysis
 from monitor.estimation.detection.line_detection import detect_lines
 from monitor.noise.catalogue import load_model
 from monitor.publishing.coefficient_cells import format_coefficient
-from monitor.publishing.plots.allan_figure import COLOURS, DARK, DASHES, GREY, MARKERS, SIZES, set_log_ticks, style_grid
+from monitor.publishing.plots.allan_figure import FIT_DASHES, MARKER_SIZES, MARKERS
+from monitor.publishing.plots.style import (
+    COLOURS,
+    DARK,
+    GREY,
+    create_figure,
+    draw_legend_above,
+    figure_style,
+    save_figure,
+    style_log_axis,
+)
 from tests.experiments.benchmarks.machine import console, table
-from tests.experiments.pictures import small
+from tests.experiments.pictures import reduce_colours
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,7 +55,6 @@ RECORDING: Final = "adis16405/run1.npz"
 MODEL: Final = "adis16405"
 SEED: Final = 1
 INCHES: Final = (14.4, 6.4)
-DPI: Final = 130
 MOST_AT: Final = 0.371  # of τf, for a sine
 BEYOND: Final = 3.0  # an interval further than this factor beyond the points is cut
 STAGGER: Final = 0.05  # of the plot's height: names of lines close to each other
@@ -91,12 +98,12 @@ def sides(recording: Path, model: str, seed: int) -> tuple[Side, Side]:
 
 def draw(recorded: Side, simulated: Side, path: Path, title: str) -> None:
     """Gyroscopes left, accelerometers right; points recorded, lines simulated, 95 % shaded."""
-    figure = Figure(figsize=INCHES, dpi=DPI, layout="constrained")
-    FigureCanvasAgg(figure)
-    for kind, axes in zip(KINDS, figure.subplots(1, 2), strict=True):
-        panel(axes, recorded, simulated, kind)
-    figure.suptitle(title, fontsize=12)
-    figure.savefig(path)
+    with figure_style():
+        figure = create_figure(*INCHES)
+        for kind, axes in zip(KINDS, figure.subplots(1, 2), strict=True):
+            panel(axes, recorded, simulated, kind)
+        figure.suptitle(title)
+        save_figure(figure, path)
 
 
 def panel(axes: "Axes", recorded: Side, simulated: Side, kind: Kind) -> None:
@@ -106,11 +113,11 @@ def panel(axes: "Axes", recorded: Side, simulated: Side, kind: Kind) -> None:
     for number, (axis, colour) in enumerate(zip(axes_of(kind), COLOURS, strict=True)):
         for side, style in (
             (recorded, {"linestyle": "", "marker": MARKERS[number], "mec": "white", "mew": 0.4, "label": axis}),
-            (simulated, {"linestyle": DASHES[number], "linewidth": 1.8}),
+            (simulated, {"linestyle": FIT_DASHES[number], "linewidth": 1.8}),
         ):
             tau_s, deviation, lo, hi = curve(side, axis)
             axes.fill_between(tau_s, lo, hi, color=colour, alpha=0.16, linewidth=0)
-            axes.plot(tau_s, deviation, color=colour, markersize=SIZES[number], **style)
+            axes.plot(tau_s, deviation, color=colour, markersize=MARKER_SIZES[number], **style)
             shown += [lo, hi]
     every = np.concatenate(shown)
     axes.set_ylim(every.min() / 1.3, every.max() * 1.3)
@@ -118,10 +125,10 @@ def panel(axes: "Axes", recorded: Side, simulated: Side, kind: Kind) -> None:
     axes.plot([], [], "--", color=GREY, label="simulated")
     axes.fill_between([], [], [], color=GREY, alpha=0.25, label="95 %")
     axes.set(xlabel="averaging time τ, s", ylabel=f"Allan deviation σ(τ), {DEVIATION_UNITS[kind].name}")
-    axes.set_title(KIND_NAMES[kind], loc="left", fontsize=12)
-    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, frameon=False, ncols=5)
-    set_log_ticks(axes)
-    style_grid(axes)
+    axes.set_title(KIND_NAMES[kind])
+    for which in "xy":
+        style_log_axis(axes, which)
+    draw_legend_above(axes, 5)
 
 
 def curve(side: Side, axis: str) -> tuple[Floats, Floats, Floats, Floats]:
@@ -222,7 +229,7 @@ def main() -> None:
     )
     draw(recorded, simulated, out, title)
     figures(recorded, simulated)
-    print(f"{small(out)} ({out.stat().st_size / 1e3:.0f} kB)")
+    print(f"{reduce_colours(out)} ({out.stat().st_size / 1e3:.0f} kB)")
 
 
 if __name__ == "__main__":

@@ -101,7 +101,7 @@ def test_every_recording_has_its_own_report(compared: tuple[Path, str]) -> None:
 
 def test_the_terminal_tells_the_same(compared: tuple[Path, str]) -> None:
     said = " ".join(compared[1].split())
-    assert "explained 3 recordings beside the model. Common to all: sinusoidal (gz)." in said
+    assert "explained 3 recordings were compared with the model. Common to all: sinusoidal (gz)." in said
     assert "added bias step" in said
     assert "not in run3: may differ: what happens once need not happen in another recording" in said
 

@@ -17,7 +17,7 @@ from monitor.history.bucket import STATES, HistoryRow
 from monitor.history.reading import HistoryTable, build_table
 from monitor.history.sqlite_store import StoredEvent
 from monitor.history.time_ranges import TimeRange
-from monitor.publishing.plots.history_plot import history_plot
+from monitor.publishing.plots.history_plot import save_history_plot
 from monitor.publishing.reports import history_file
 from monitor.publishing.terminal import history_text
 
@@ -93,8 +93,8 @@ def test_a_span_of_events_alone_is_printed() -> None:
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_a_file_has_every_number_with_its_unit(tmp_path: Path, suffix: str) -> None:
     past, path = made(), tmp_path / f"h{suffix}"
-    history_file.save(past, path)
-    columns = history_file.table(past)
+    history_file.save_history(past, path)
+    columns = history_file.history_columns(past)
     assert {"t (Unix s)", "gz.N (rad/sqrt(s))", "gz.N high (rad/sqrt(s))", "az.R.bound (m/s^3)"} <= set(columns)
     np.testing.assert_array_equal(columns["gz.N high (rad/sqrt(s))"], past.column("gz.N").high)
     np.testing.assert_array_equal(columns["lost (samples)"], past.counts[:, 1])
@@ -129,7 +129,7 @@ def read_back(path: Path, suffix: str) -> dict[str, np.ndarray]:
 
 def test_a_suffix_that_is_none_is_said(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"known are \.csv"):
-        history_file.save(made(), tmp_path / "h.doc")
+        history_file.save_history(made(), tmp_path / "h.doc")
 
 
 @pytest.mark.long
@@ -139,7 +139,7 @@ def test_the_picture_is_drawn_of_any_axes(tmp_path: Path, axes: tuple[str, ...])
     from matplotlib.image import imread
 
     path = tmp_path / "h.png"
-    history_plot(made(axes=axes), path)
+    save_history_plot(made(axes=axes), path)
     picture = imread(path)
     assert picture.shape[1] == (2220 if len(axes) == 3 else 1110)
     assert len(np.unique(picture.reshape(-1, picture.shape[2]), axis=0)) > 100
@@ -148,11 +148,11 @@ def test_the_picture_is_drawn_of_any_axes(tmp_path: Path, axes: tuple[str, ...])
 @pytest.mark.long
 def test_a_picture_of_one_row_and_of_nothing(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
-    history_plot(made(1, slice(0, 0)), tmp_path / "one.png")
+    save_history_plot(made(1, slice(0, 0)), tmp_path / "one.png")
     with pytest.raises(NotReady):
-        history_plot(build_table("a", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2), tmp_path / "none.png")
+        save_history_plot(build_table("a", TimeRange(T0, T0 + 60.0), 60, [], EVENTS, 2), tmp_path / "none.png")
     with pytest.raises(ConfigError, match="cannot write"):
-        history_plot(made(), tmp_path / "nowhere" / "h.png")
+        save_history_plot(made(), tmp_path / "nowhere" / "h.png")
 
 
 def test_a_course_keeps_its_gaps_and_a_steady_one_is_level() -> None:

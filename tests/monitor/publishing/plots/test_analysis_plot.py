@@ -10,8 +10,9 @@ import pytest
 from drivers.errors import ConfigError
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.fit.coefficients import Status
-from monitor.publishing.plots import allan_figure, analysis_plot, dynamic_figure
+from monitor.publishing.plots import allan_figure, analysis_plot, dynamic_figure, style
 from monitor.publishing.plots.allan_figure import OtherDeviation
+from monitor.publishing.plots.analysis_plot import DrawnAnalysis
 from monitor.publishing.plots.dynamic_figure import ChangeMark
 from tests.monitor.publishing import made
 
@@ -37,7 +38,7 @@ def near(image: np.ndarray, colour: str) -> int:
 def panel(kind: str = "gyro", **arguments: object):
     figure = pytest.importorskip("matplotlib.figure").Figure()
     axes = figure.subplots()
-    allan_figure.allan_panel(axes, arguments.pop("estimate", made.estimate()), kind, **arguments)
+    allan_figure.draw_allan_panel(axes, arguments.pop("estimate", made.estimate()), kind, **arguments)
     return axes
 
 
@@ -53,11 +54,11 @@ def lettered(axes) -> dict[str, list[tuple[float, float]]]:
 def test_both_kinds_side_by_side_in_all_colours(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "plot.png"
-    analysis_plot.allan_plot(made.estimate(), path, title="bench-1")
+    analysis_plot.save_analysis_plot(DrawnAnalysis(made.analysis()), path, title="bench-1")
     image = pixels(path)
-    assert image.shape[1] == round(2 * analysis_plot.INCHES[0] * analysis_plot.DPI)
+    assert image.shape[1] == round(2 * analysis_plot.INCHES[0] * style.STYLE["figure.dpi"])
     for half in (image[:, : image.shape[1] // 2], image[:, image.shape[1] // 2 :]):
-        assert all(near(half, colour) > 500 for colour in allan_figure.COLOURS)
+        assert all(near(half, colour) > 500 for colour in style.COLOURS)
 
 
 def test_a_gyroscope_alone_fills_the_picture(tmp_path: Path) -> None:
@@ -65,12 +66,12 @@ def test_a_gyroscope_alone_fills_the_picture(tmp_path: Path) -> None:
     estimate = made.estimate()
     estimate.curve.avar[:, [0, 1, 3, 4, 5]] = np.nan
     path = tmp_path / "plot.png"
-    analysis_plot.allan_plot(estimate, path)
+    analysis_plot.save_analysis_plot(DrawnAnalysis(made.analysis(estimate)), path)
     image = pixels(path)
-    assert image.shape[1] == round(analysis_plot.INCHES[0] * analysis_plot.DPI)
+    assert image.shape[1] == round(analysis_plot.INCHES[0] * style.STYLE["figure.dpi"])
     curves = image[: image.shape[0] // 2]
-    assert near(curves, allan_figure.COLOURS[2]) > 300
-    assert near(curves, allan_figure.COLOURS[0]) == 0
+    assert near(curves, style.COLOURS[2]) > 300
+    assert near(curves, style.COLOURS[0]) == 0
 
 
 def test_letters_stand_where_the_field_reads_them() -> None:
@@ -135,16 +136,16 @@ def test_total_deviation_goes_on_where_the_allan_deviation_ends() -> None:
 
 def test_the_summary_says_what_is_missing() -> None:
     estimate = made.estimate()
-    assert analysis_plot.summary(estimate) == "360,000 samples at 100 Hz, 1 h 00 min"
-    assert analysis_plot.summary(replace(estimate, samples=359_000)).endswith("1 h 00 min, 1,000 missing")
+    assert analysis_plot.recording_line(estimate) == "360,000 samples at 100 Hz, 1 h 00 min"
+    assert analysis_plot.recording_line(replace(estimate, samples=359_000)).endswith("1 h 00 min, 1,000 missing")
 
 
 def test_k_or_r_is_said_of_bounds_only() -> None:
     estimate = replace(made.estimate(seconds=1000.0), k_or_r=np.array([True, False] + [True] * 4))
-    assert analysis_plot.k_or_r(estimate, "K", "gx")
-    assert not analysis_plot.k_or_r(estimate, "K", "gy")
-    assert not analysis_plot.k_or_r(estimate, "N", "gx")
-    assert not analysis_plot.k_or_r(made.estimate(), "K", "gx")
+    assert analysis_plot.is_k_or_r(estimate, "K", "gx")
+    assert not analysis_plot.is_k_or_r(estimate, "K", "gy")
+    assert not analysis_plot.is_k_or_r(estimate, "N", "gx")
+    assert not analysis_plot.is_k_or_r(made.estimate(), "K", "gx")
 
 
 @pytest.mark.long
@@ -153,11 +154,12 @@ def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing
     path = tmp_path / "plot.png"
     estimate = made.estimate()
     estimate.curve.avar[:, 3:] = np.nan
-    analysis_plot.allan_plot(estimate, path, "bench-1", dynamic=changing, marks=[ChangeMark(300.0, "gz")])
+    drawn = DrawnAnalysis(made.analysis(estimate), dynamic=changing, marks=[ChangeMark(300.0, "gz")])
+    analysis_plot.save_analysis_plot(drawn, path, "bench-1")
     image = pixels(path)
-    below = dynamic_figure.height_inches(changing, "gyro") * analysis_plot.DPI
-    assert image.shape[0] == pytest.approx(analysis_plot.INCHES[1] * analysis_plot.DPI + below, abs=2)
-    gyro = image[round(analysis_plot.INCHES[1] * analysis_plot.DPI) :, :, :3]
+    below = dynamic_figure.height_inches(changing, "gyro") * style.STYLE["figure.dpi"]
+    assert image.shape[0] == pytest.approx(analysis_plot.INCHES[1] * style.STYLE["figure.dpi"] + below, abs=2)
+    gyro = image[round(analysis_plot.INCHES[1] * style.STYLE["figure.dpi"]) :, :, :3]
     blue = (gyro[..., 2] - gyro[..., 0] > 0.3).any(axis=0)
     red = (gyro[..., 0] - gyro[..., 2] > 0.3).any(axis=0)
     assert blue.any()
@@ -165,7 +167,7 @@ def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing
 
 
 def test_colours_are_of_the_deviation_over_its_median(changing: DynamicAllan) -> None:
-    relative = dynamic_figure.relative(changing)
+    relative = dynamic_figure.divide_by_median(changing)
     assert np.nanmedian(relative, axis=0) == pytest.approx(np.ones(relative.shape[1:]))
     assert relative[-1, 0, 0] / relative[0, 0, 0] == pytest.approx(2.0, rel=0.1)
     assert relative[-1, 0, 5] / relative[0, 0, 5] == pytest.approx(1.0, rel=0.1)
@@ -174,24 +176,24 @@ def test_colours_are_of_the_deviation_over_its_median(changing: DynamicAllan) ->
 def test_only_coefficients_that_are_estimated_have_a_panel(changing: DynamicAllan) -> None:
     status = np.full_like(changing.status, Status.UPPER_BOUND)
     status[:, 1] = Status.ESTIMATED
-    assert dynamic_figure.panel_letters(replace(changing, status=status), "gyro") == ("N",)
+    assert dynamic_figure._shown_coefficients(replace(changing, status=status), "gyro") == ("N",)
     status[:2, 3, 1] = Status.ESTIMATED  # for a moment only
-    assert "K" not in dynamic_figure.panel_letters(replace(changing, status=status), "gyro")
+    assert "K" not in dynamic_figure._shown_coefficients(replace(changing, status=status), "gyro")
     status[:20, 3, 1] = Status.ESTIMATED
-    assert "K" in dynamic_figure.panel_letters(replace(changing, status=status), "gyro")
+    assert "K" in dynamic_figure._shown_coefficients(replace(changing, status=status), "gyro")
 
 
 def test_an_axis_without_data_has_no_surface(changing: DynamicAllan) -> None:
     deviation = changing.deviation.copy()
     deviation[:, :, 1] = np.nan
-    assert dynamic_figure.axes_shown(replace(changing, deviation=deviation), "gyro") == ("gx", "gz")
+    assert dynamic_figure._shown_axes(replace(changing, deviation=deviation), "gyro") == ("gx", "gz")
 
 
 def test_one_single_step_can_be_drawn() -> None:
     figure = pytest.importorskip("matplotlib.figure").Figure()
     once = compute_dynamic_allan(np.random.default_rng(2).standard_normal((600, 6)), 10.0, 60.0, (0.1,))
     assert once.t_s.size == 1
-    dynamic_figure.dynamic_panels(figure, once, "gyro")
+    dynamic_figure.draw_dynamic_panels(figure, once, "gyro")
     figure.draw_without_rendering()
     low, high = figure.axes[0].get_xlim()
     assert low < 60.0 < high
@@ -200,11 +202,11 @@ def test_one_single_step_can_be_drawn() -> None:
 def test_without_matplotlib_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ConfigError, match=r"pip install \"imu-monitor\[plot\]\""):
-        analysis_plot.allan_plot(made.estimate(), tmp_path / "plot.png")
+        analysis_plot.save_analysis_plot(DrawnAnalysis(made.analysis()), tmp_path / "plot.png")
 
 
 @pytest.mark.long
 def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     with pytest.raises(ConfigError, match="cannot write the plot"):
-        analysis_plot.allan_plot(made.estimate(), tmp_path / "absent" / "plot.png")
+        analysis_plot.save_analysis_plot(DrawnAnalysis(made.analysis()), tmp_path / "absent" / "plot.png")

@@ -8,16 +8,15 @@ import pytest
 from drivers.sample import AXES
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.fit.coefficients import Status
-from monitor.publishing.plots.allan_figure import COLOURS, DARK
 from monitor.publishing.plots.dynamic_figure import (
-    BANDS,
+    BAND_ENDS_INSIDE,
     MIN_LABEL_DISTANCE,
     ChangeMark,
-    TimeUnit,
     _group_times,
-    dynamic_panels,
-    panel_letters,
+    _shown_coefficients,
+    draw_dynamic_panels,
 )
+from monitor.publishing.plots.style import COLOURS, DARK, time_unit
 
 
 @pytest.fixture(scope="module")
@@ -28,9 +27,9 @@ def white() -> DynamicAllan:
 
 def panels(found: DynamicAllan, marks: list[ChangeMark], kind: str = "gyro"):
     figure = pytest.importorskip("matplotlib.figure").Figure(figsize=(7.2, 8.0), layout="constrained")
-    dynamic_panels(figure, found, kind, marks)
+    draw_dynamic_panels(figure, found, kind, marks)
     figure.draw_without_rendering()
-    count = 3 + len(panel_letters(found, kind))
+    count = 3 + len(_shown_coefficients(found, kind))
     return figure.axes[:count]
 
 
@@ -89,7 +88,7 @@ def test_heaps_lie_apart_whatever_the_times() -> None:
 def test_courses_hold_their_values_and_most_of_their_bands(white: DynamicAllan) -> None:
     *_, n = panels(white, [])
     gyros = [AXES.index(axis) for axis in ("gx", "gy", "gz")]
-    assert panel_letters(white, "gyro")[-1] == "N"
+    assert _shown_coefficients(white, "gyro")[-1] == "N"
     estimated = white.status[:, 1, gyros] == Status.ESTIMATED
     factor = np.degrees(1.0) * 60.0
     low, high = n.get_ylim()
@@ -97,11 +96,11 @@ def test_courses_hold_their_values_and_most_of_their_bands(white: DynamicAllan) 
     assert low < values.min()
     assert values.max() < high
     ends = np.stack([white.value_lo[:, 1, gyros][estimated], white.value_hi[:, 1, gyros][estimated]]) * factor
-    assert ((ends >= low) & (ends <= high)).mean() > 2.0 * BANDS - 1.0
+    assert ((ends >= low) & (ends <= high)).mean() > 2.0 * BAND_ENDS_INSIDE - 1.0
 
 
 @pytest.mark.parametrize(
     ("span_s", "name"), [(599.0, "s"), (600.0, "min"), (10_800.0, "h"), (259_200.0, "d"), (1e9, "d")]
 )
 def test_the_time_axis_has_the_unit_of_its_span(span_s: float, name: str) -> None:
-    assert TimeUnit.of(span_s).name == name
+    assert time_unit(span_s)[0] == name

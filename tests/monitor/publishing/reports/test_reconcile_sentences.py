@@ -21,7 +21,7 @@ def one(effect: str, axis: str = "gz", kind: str = "added", **parameters: Parame
 
 
 def short(effect: str, axis: str = "gz", **parameters: ParameterInterval) -> list[str]:
-    return [found.short for found in words.parameters(one(effect, **parameters), axis, NO_MODEL)]
+    return [found.short for found in words.format_parameters(one(effect, **parameters), axis, NO_MODEL)]
 
 
 @pytest.mark.parametrize("axis", ["gz", "az"])
@@ -32,7 +32,7 @@ def test_every_parameter_of_every_effect_has_a_unit_of_the_field(effect: str, ax
         name: ParameterInterval("ax") if si == "axis" else ParameterInterval(2.0, 1.9, 2.1)
         for name, si in known.items()
     }
-    for found in words.parameters(one(effect, **given), axis, NO_MODEL):
+    for found in words.format_parameters(one(effect, **given), axis, NO_MODEL):
         assert "rad" not in found.unit.replace("µrad", "")
         assert found.value
         assert found.short.endswith(found.unit)
@@ -62,16 +62,16 @@ def test_sizes_choose_their_unit_and_known_names_have_theirs() -> None:
 
 
 def test_an_axis_is_a_value_without_interval() -> None:
-    (found,) = words.parameters(one("cross_axis", source=ParameterInterval("gx")), "gz", NO_MODEL)
+    (found,) = words.format_parameters(one("cross_axis", source=ParameterInterval("gx")), "gz", NO_MODEL)
     assert (found.value, found.interval, found.unit, found.short) == ("gx", "", "", "gx")
 
 
 def test_a_retuned_term_stands_beside_what_the_model_had() -> None:
     model = NoiseModel({"gz": (AngleRandomWalk(N=1.5e-4),)})
     bounds = {"N": ParameterInterval(1.8e-4, 1.79e-4, 1.81e-4)}
-    (retuned,) = words.parameters(one("angle_random_walk", kind="retuned", **bounds), "gz", model)
+    (retuned,) = words.format_parameters(one("angle_random_walk", kind="retuned", **bounds), "gz", model)
     assert retuned.given == "0.516 °/√h"
-    (added,) = words.parameters(one("angle_random_walk", kind="added", **bounds), "gz", model)
+    (added,) = words.format_parameters(one("angle_random_walk", kind="added", **bounds), "gz", model)
     assert added.given == ""
 
 
@@ -94,27 +94,29 @@ def test_a_place_is_said_with_its_unit(where: Location, said: str) -> None:
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (samples.agrees(), "The model and the recording agree: on each of 6 axes, through every lens, they differ by "
-                           "no more than chance."),
-        (samples.explained(), "The model and the recording differ by more than chance on gz. With 1 effect added "
-                              "(sinusoidal) and 1 known term retuned (angle random walk), nothing is left that chance "
-                              "would not make."),
-        (samples.partly_explained(), "The model and the recording differ by more than chance on gz. With 1 effect "
-                                     "added (sinusoidal), it is explained in part; on gz something is left that no "
-                                     "known effect closes."),
-        (samples.unexplained(), "The five classic terms, fitted first, and the recording differ by more than chance "
-                                "on ax. No known effect closes the gap, so no name is given."),
+        (samples.agrees(), "The model and the recording agree: on all 6 axes, no diagnostic shows a difference "
+                           "larger than chance."),
+        (samples.explained(), "The model and the recording differ by more than chance on gz. With 1 added effect "
+                              "(sinusoidal) and 1 retuned term (angle random walk), no difference larger than chance "
+                              "remains."),
+        (samples.partly_explained(), "The model and the recording differ by more than chance on gz. The "
+                                     "difference is partly explained with 1 added effect (sinusoidal). On gz, a "
+                                     "difference remains that no known effect explains."),
+        (samples.unexplained(), "The model of five classic terms, fitted first, and the recording differ by more than "
+                                "chance on ax. No known effect explains the difference, so no effect is named."),
     ],
 )  # fmt: skip
 def test_the_verdict_is_a_plain_sentence(made: Reconciliation, said: str) -> None:
-    assert words.summary(made) == said
+    assert words.summarize(made) == said
 
 
 def test_runners_up_are_named_with_their_share() -> None:
     step = samples.explained().axes["gz"].steps[0]
-    assert words.alternatives_sentence(step) == (
-        "Tried for the same gap and less likely: narrowband (0.2 %) and sample rate error (< 0.1 %)."
+    assert words.describe_alternatives(step) == (
+        "Less likely explanations of the same gap: narrowband (0.2 %) and sample rate error (< 0.1 %)."
     )
-    assert words.alternatives_sentence(replace(step, runners_up=())) == "No other effect came near."
-    alone = words.alternatives_sentence(replace(step, runners_up=(RunnerUp("bias_step", 0.31),)))
-    assert alone == "Tried for the same gap and less likely: bias step (31.0 %)."
+    assert (
+        words.describe_alternatives(replace(step, runners_up=())) == "No other effect explains the gap nearly as well."
+    )
+    alone = words.describe_alternatives(replace(step, runners_up=(RunnerUp("bias_step", 0.31),)))
+    assert alone == "Less likely explanations of the same gap: bias step (31.0 %)."

@@ -74,7 +74,8 @@ def runs() -> Comparison:
 def test_several_recordings_stand_beside_each_other() -> None:
     lines = [joined(one) for one in told_runs(runs())]
     assert lines[0] == (
-        "● explained 2 recordings beside the model. Common to all: sinusoidal (gz). In some only: bias step (gz, warm)."
+        "● explained 2 recordings were compared with the model. Common to all: sinusoidal (gz). "
+        "In some only: bias step (gz, warm)."
     )
     at = lines.index("axis cold warm")
     assert lines[at + 1 : at + 4] == ["gx not recorded ● agrees", "gz ● explained ● explained", "1 effect 2 effects"]

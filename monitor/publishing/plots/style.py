@@ -1,0 +1,269 @@
+"""Style of all figures, and their output as image files and as SVG elements of a page.
+
+Figures are ``Figure`` objects of matplotlib without pyplot, so they need no display. ``figure_style`` applies the
+colours, line widths and text sizes. Equal figures give equal bytes: identifiers in an SVG depend only on its content,
+and no file contains a date. matplotlib is imported when a figure is drawn.
+"""
+
+import hashlib
+import html
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+
+from drivers.errors import ConfigError
+from drivers.sample import AXES, Floats
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+COLOURS: Final = ("#D55E00", "#009E73", "#0072B2")  # x y z: vermilion, bluish green, blue (Okabe & Ito)
+DARK: Final = "#222222"
+GREY: Final = "#6b6b6b"
+ORANGE: Final = "#E69F00"  # marks the range in which a diagnostic found a difference (Okabe & Ito)
+MINOR_GRID_COLOUR: Final = "#ececec"
+BAND_ALPHA: Final = 0.16
+DASHES: Final = (0, (4, 2))
+SMALL_TEXT: Final = 8.0  # points
+MISSING_MESSAGE: Final = 'matplotlib is not installed: pip install "imu-monitor[plot]"'
+STYLE: Final[dict[Any, Any]] = {
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.5,
+    "axes.titlesize": 11.0,
+    "axes.titlelocation": "left",
+    "figure.titlesize": 11.5,
+    "figure.dpi": 150.0,
+    "text.color": DARK,
+    "text.parse_math": False,  # names of recordings may contain a dollar sign
+    "axes.labelcolor": DARK,
+    "axes.edgecolor": "#999999",
+    "xtick.color": DARK,
+    "ytick.color": DARK,
+    "xtick.bottom": False,  # the grid shows the position of a tick
+    "ytick.left": False,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#d0d0d0",
+    "grid.linewidth": 0.7,
+    "lines.linewidth": 1.4,
+    "legend.frameon": False,
+    "legend.fontsize": 8.5,
+    "legend.handlelength": 1.6,
+    "legend.handletextpad": 0.5,
+    "legend.columnspacing": 1.1,
+    "path.simplify_threshold": 0.6,
+    "svg.fonttype": "none",
+    "svg.hashsalt": "imu-monitor",
+}
+"""Settings of matplotlib that all figures share."""
+UNDATED: Final[dict[str, dict[str, Any]]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
+"""Metadata that keep the date out of a file, by suffix."""
+RASTER_DPI: Final = 80  # resolution of heat maps and dense bands, which are images inside an SVG
+FEW_DECADES_RATIO: Final = 60.0  # an axis with a smaller ratio of its ends has labels between the powers of ten
+MAX_LABELS: Final = 7  # largest number of powers of ten with a label
+LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
+SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+LABEL_BOX: Final[dict[str, Any]] = {
+    "boxstyle": "square,pad=0.15",
+    "facecolor": "white",
+    "edgecolor": "none",
+    "alpha": 0.8,
+}
+"""Box behind a label inside a panel, so that curves do not cross the text."""
+TIME_UNITS: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
+"""Name of each time unit, its length [s], and the duration [s] below which it is used."""
+
+
+def axis_colour(axis: str) -> str:
+    """Return the colour of an axis: x, y and z of both kinds of sensor have one colour each."""
+    return COLOURS[AXES.index(axis) % 3]
+
+
+@contextmanager
+def figure_style() -> Iterator[None]:
+    """Apply the style to everything that is drawn inside the ``with`` block.
+
+    Raises
+    ------
+    ConfigError
+        If matplotlib is not installed.
+    """
+    try:
+        import matplotlib
+        import matplotlib.figure
+    except ImportError as error:
+        raise ConfigError(MISSING_MESSAGE) from error
+    with matplotlib.rc_context(STYLE):
+        yield
+
+
+def create_figure(width: float, height: float, layout: Literal["constrained"] | None = "constrained") -> "Figure":
+    """Return an empty figure.
+
+    Parameters
+    ----------
+    width, height
+        Size [inches].
+    layout
+        By default, panels are arranged so that no labels overlap. None keeps them where they are placed.
+    """
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout=layout)
+
+
+def save_figure(figure: "Figure", path: Path) -> None:
+    """Write a figure to a file.
+
+    Parameters
+    ----------
+    figure
+        Figure to write.
+    path
+        File to write. Its suffix selects the format.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be written.
+    """
+    try:
+        figure.savefig(path, metadata=UNDATED.get(path.suffix.lower()))
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"cannot write the plot {path}: {error}") from error
+
+
+def svg_element(figure: "Figure", description: str) -> str:
+    """Return a figure as an SVG element without width and height, so that it fills its column in a page.
+
+    Parameters
+    ----------
+    figure
+        Figure to convert.
+    description
+        Short description for readers who cannot see the figure.
+    """
+    text = io.StringIO()
+    figure.savefig(text, format="svg", dpi=RASTER_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
+    element = text.getvalue()[text.getvalue().index("<svg") :]
+    element = re.sub(r' (?:width|height)="[\d.]+pt"', "", element, count=2)
+    element = element.replace("<svg", f'<svg role="img" aria-label="{html.escape(description)}"', 1)
+    element = re.sub(r'<g id="[^"]*"', "<g", element)  # nothing refers to these identifiers
+    element = re.sub(r"<[^>]*>", lambda tag: re.sub(r"\d+\.\d{3,}", _shorten, tag[0]), element)
+    element = re.sub(r"\n(?:L )?\s*", " ", element)  # a path continues with lines if no letter is given
+    prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # identifiers of figures in one page must differ
+    return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}", element)
+
+
+def _shorten(number: re.Match[str]) -> str:
+    """Return a coordinate of an SVG with one decimal."""
+    return f"{float(number[0]):.1f}".removesuffix(".0")
+
+
+def format_tick(value: float) -> str:
+    """Format the number of a tick.
+
+    >>> format_tick(0.01), format_tick(-2000.0), format_tick(1e4), format_tick(2.5e-7)
+    ('0.01', '−2000', '10⁴', '2.5·10⁻⁷')
+    """
+    sign, size = "−" if value < 0.0 else "", abs(value)
+    mantissa, power = f"{size:.4e}".split("e")
+    factor = f"{float(mantissa):g}"
+    if size == 0.0 or 0.99e-3 < size < (1e4 if factor == "1" else 1e5):
+        return f"{sign}{size:.5g}"
+    return f"{sign}{'' if factor == '1' else f'{factor}·'}10{str(int(power)).translate(SUPERSCRIPTS)}"
+
+
+def style_log_axis(panel: "Axes", which: str, minor_grid: bool = True) -> None:
+    """Label a logarithmic axis with plain numbers and draw its grid.
+
+    Powers of ten have labels. If the axis spans only a few decades, 2 and 5 also have labels.
+
+    Parameters
+    ----------
+    panel
+        Axes of matplotlib with final limits.
+    which
+        Name of the axis: x or y.
+    minor_grid
+        True to draw grid lines between the powers of ten.
+    """
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, NullLocator
+
+    axis, (low, high) = (panel.xaxis, panel.get_xlim()) if which == "x" else (panel.yaxis, panel.get_ylim())
+    few = high / low < FEW_DECADES_RATIO
+    axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if few else (1.0,), numticks=MAX_LABELS + 2))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: format_tick(value)))
+    axis.set_minor_formatter(NullFormatter())
+    axis.set_minor_locator(LogLocator(subs=tuple(range(2, 10)), numticks=50) if minor_grid else NullLocator())
+    panel.grid(which="minor", axis=which, color=MINOR_GRID_COLOUR, linewidth=0.5)  # type: ignore[arg-type]
+
+
+def draw_band(panel: "Axes", x: Floats, lo: Floats, hi: Floats, colour: str, **options: Any) -> None:
+    """Draw the band of an interval.
+
+    Parameters
+    ----------
+    panel
+        Axes of matplotlib.
+    x, lo, hi
+        Position and ends of the interval, shape [n].
+    colour
+        Colour of the band.
+    options
+        Other options of ``fill_between``.
+    """
+    panel.fill_between(x, lo, hi, **{"color": colour, "alpha": BAND_ALPHA, "linewidth": 0, **options})
+
+
+def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
+    """Draw the legend above the panel, where it covers no curve.
+
+    Parameters
+    ----------
+    panel
+        Axes of matplotlib.
+    columns
+        Number of columns of the legend.
+    options
+        Other options of ``legend``.
+    """
+    panel.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=columns, **options)
+
+
+def set_value_limits(panel: "Axes", low: float, high: float, margin: float) -> None:
+    """Set the limits of the y axis of a positive quantity, with a logarithmic scale if its values differ much.
+
+    Parameters
+    ----------
+    panel
+        Axes of matplotlib.
+    low, high
+        Smallest and largest value that is drawn.
+    margin
+        Margin of a linear scale above and below, as a share of the range.
+    """
+    if low > 0 and high > LOG_SCALE_RATIO * low:
+        panel.set_yscale("log")
+        panel.set_ylim(low / 1.3, high * 1.3)
+        style_log_axis(panel, "y")
+    else:
+        space = margin * (high - low) + 0.02 * high
+        panel.set_ylim(max(low - space, 0.0), high + space)
+
+
+def time_unit(duration_s: float) -> tuple[str, float]:
+    """Return the name and the length [s] of the unit that suits a time axis of this duration [s].
+
+    >>> time_unit(7200.0), time_unit(5e5)
+    (('min', 60.0), ('d', 86400.0))
+    """
+    return next((name, seconds) for name, seconds, below in TIME_UNITS if duration_s < below)

@@ -1,0 +1,37 @@
+"""Self-contained HTML pages from the templates of this package. Equal values give equal pages."""
+
+from typing import Any, Final
+
+from drivers.errors import ConfigError
+
+MISSING_MESSAGE: Final = 'matplotlib and Jinja2 are needed: pip install "imu-monitor[plot]"'
+
+
+def render_template(name: str, **values: Any) -> str:
+    """Return a page as text.
+
+    Parameters
+    ----------
+    name
+        File name of the template.
+    values
+        Values and functions that the template uses.
+
+    Raises
+    ------
+    ConfigError
+        If matplotlib or Jinja2 is missing.
+    """
+    try:
+        import matplotlib.figure as _  # noqa: F401
+        from jinja2 import Environment, PackageLoader, StrictUndefined
+    except ImportError as error:
+        raise ConfigError(MISSING_MESSAGE) from error
+    environment = Environment(
+        loader=PackageLoader("monitor.publishing.reports"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name).render(**values)
