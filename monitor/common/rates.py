@@ -8,7 +8,9 @@ from typing import Final
 
 import numpy as np
 
-MILLI_G: Final = 9.80665e-3
+from drivers.units import G0
+
+MILLI_G: Final = 1e-3 * G0
 """One thousandth of standard gravity, in m/s²."""
 
 

@@ -18,6 +18,7 @@ from drivers.driver import Driver
 from drivers.errors import ImuError, NotReady
 from drivers.links.base import Link
 from drivers.links.replay_link import ReplayLink
+from drivers.quantities import HOUR_S
 from drivers.recordings.segment import DaemonState
 from drivers.sample import Chunk, Event, Floats, Ints, SampleBlock, merge_contiguous_blocks
 from drivers.timing.sample_clock import LastSample, SampleClock
@@ -557,7 +558,7 @@ class DeviceWorker:
             return
         text = (
             f"the host's clock was set {'on' if set_s > 0.0 else 'back'} by {abs(set_s):.6g} s; times follow by "
-            f"{MAX_SLEW_RATE * 3600.0:g} s an hour, a restart takes the new time over at once"
+            f"{MAX_SLEW_RATE * HOUR_S:g} s an hour, a restart takes the new time over at once"
         )
         self._publish_events(outputs, [Event("clock_jumped", now_ns, text)])
 

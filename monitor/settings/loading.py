@@ -25,7 +25,7 @@ from drivers.decoders.base import AddressFilter, Decoder
 from drivers.driver import AxisMap, parse_axis_map
 from drivers.errors import ConfigError, format_one_line
 from drivers.links.base import AddressFilteringLink, Link
-from drivers.quantities import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ
+from drivers.quantities import DAY_S, DURATION_S, HOUR_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ
 from drivers.sample import AXES, EVENT_KINDS
 from drivers.zenoh.session import configuration, format_error, secret_files
 from monitor.common.config_files import model_path
@@ -69,13 +69,13 @@ __all__ = [
 T = TypeVar("T", bound=msgspec.Struct)
 T_co = TypeVar("T_co", bound=msgspec.Struct, covariant=True)
 
-UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
+UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": float(HOUR_S), "d": float(DAY_S)}
 WINDOW_SAMPLES: Final = (100, 10_000_000)
-MAX_WINDOW_S: Final = 40 * 86400.0
+MAX_WINDOW_S: Final = 40.0 * DAY_S
 THERMAL_SAMPLES: Final = 8
 """In an interval at the least: its scatter tells how well its mean is known."""
-MAX_THERMAL_INTERVAL_S: Final = 86400.0
-SEGMENT_S: Final = (10.0, 86400.0)
+MAX_THERMAL_INTERVAL_S: Final = float(DAY_S)
+SEGMENT_S: Final = (10.0, float(DAY_S))
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 IS_ENDPOINT: Final = re.compile(r"[a-z]+/.+")
 MAX_QUOTED_CHARACTERS: Final = 60
@@ -146,8 +146,8 @@ class Storage:
     folder: Path
     record: bool = True  # samples
     raw: bool = False  # bytes as they came
-    segment_s: float = 3600.0  # of one file
-    keep_s: float = 30 * 86400.0
+    segment_s: float = float(HOUR_S)  # of one file
+    keep_s: float = 30.0 * DAY_S
     disk_share: float = 0.9  # taken, above which the oldest segments go
     history: bool = True  # results, events, status
 

@@ -22,6 +22,7 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.quantities import DURATION_S
 from drivers.sample import Floats
+from monitor.noise.effects.bias_instability import FLICKER_FLOOR
 from monitor.publishing.exporters.noise import (
     AXES_OF,
     NoiseCoefficients,
@@ -32,8 +33,6 @@ from monitor.publishing.exporters.noise import (
     omitted_comment,
 )
 
-FLICKER_FLOOR_RATIO: Final = math.sqrt(2.0 * math.log(2.0) / math.pi)
-"""Ratio of the Allan deviation of flicker noise to B (IEEE Std 952)."""
 MARKOV_PEAK_RATIO: Final = 0.437 * math.sqrt(2.0)
 """Ratio of the peak Allan deviation of the Gauss-Markov process to σ: 0.437 q √T with q² = 2σ²/T (IEEE Std 952)."""
 MARKOV_PEAK_AT: Final = 1.89
@@ -105,7 +104,7 @@ def markov_sigma(B: float) -> float:
     B
         Bias instability, in the unit of the result.
     """
-    return FLICKER_FLOOR_RATIO * B / MARKOV_PEAK_RATIO
+    return FLICKER_FLOOR * B / MARKOV_PEAK_RATIO
 
 
 def markov_time_s(N: float, K: float) -> float:

@@ -17,14 +17,9 @@ from drivers.errors import ConfigError, ImuError, NotReady
 from drivers.quantities import RATE_HZ
 from drivers.sample import AXES
 from monitor.noise.model import NoiseModel
+from monitor.noise.standard_terms import STANDARD_TERMS
 
-EFFECT_OF: Final = {
-    "Q": "quantization_noise",
-    "N": "angle_random_walk",
-    "B": "bias_instability",
-    "K": "rate_random_walk",
-    "R": "rate_ramp",
-}
+EFFECT_OF: Final = {symbol: term.name for symbol, term in STANDARD_TERMS.items()}
 """Name of the effect in a noise model for each coefficient."""
 AXES_OF: Final = {"gyro": AXES[:3], "accel": AXES[3:]}
 

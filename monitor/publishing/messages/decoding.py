@@ -15,6 +15,7 @@ from monitor.common.health import Health
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients
+from monitor.noise.standard_terms import unit_allan_variances
 from monitor.publishing.messages import remote_device
 
 MAX_AVERAGING_TIMES: Final = 1000
@@ -66,16 +67,14 @@ def to_estimate(allan: remote_device.AllanMessage, noise: remote_device.Noise) -
             hi=hi,
             n=round(allan.filled * allan.rate),
         ),
-        fitted=fitted_variance(tau_s, noise.coefficients),
+        fitted=fitted_variance(tau_s, noise.coefficients, 1.0 / allan.rate),
         coefficients=noise.coefficients,
         k_or_r=np.array([axis in noise.either for axis in AXES]),
     )
 
 
-def fitted_variance(tau_s: Floats, coefficients: Coefficients) -> Floats:
-    """Return the Allan variance of the estimated terms, shape [m, 6]; NaN on axes without estimated terms.
-
-    σ²(τ) = 3Q²/τ² + N²/τ + (2 ln 2/π)B² + K²τ/3 + R²τ²/2, IEEE Std 952-1997, Annex C.
+def fitted_variance(tau_s: Floats, coefficients: Coefficients, tau0_s: float) -> Floats:
+    """Return the Allan variance of the estimated terms, shape [m, 6]. Axes without estimated terms are NaN.
 
     Parameters
     ----------
@@ -83,10 +82,10 @@ def fitted_variance(tau_s: Floats, coefficients: Coefficients) -> Floats:
         Averaging times [s], shape [m].
     coefficients
         Coefficients, shape [5, 6], SI.
+    tau0_s
+        Sample interval [s].
     """
-    flat = np.ones_like(tau_s)
-    terms = np.column_stack([3 / tau_s**2, 1 / tau_s, 2 * np.log(2) / np.pi * flat, tau_s / 3, tau_s**2 / 2])
-    total: Floats = terms @ np.nan_to_num(coefficients.value) ** 2
+    total: Floats = unit_allan_variances(tau_s, tau0_s) @ np.nan_to_num(coefficients.value) ** 2
     total[:, np.isnan(coefficients.value).all(axis=0)] = np.nan
     return total
 

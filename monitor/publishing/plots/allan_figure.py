@@ -21,6 +21,7 @@ from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.noise.effects.bias_instability import FLICKER_FLOOR
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +35,6 @@ GREY: Final = "#6b6b6b"
 DARK: Final = "#222222"
 READING_TAU_S: Final = {"Q": 3.0**0.5, "N": 1.0, "K": 3.0, "R": 2.0**0.5}  # τ at which the term's deviation equals it
 SLOPES: Final = {"Q": -1.0, "N": -0.5, "B": 0.0, "K": 0.5, "R": 1.0}  # log-log slope of the deviation
-FLICKER_FLOOR_RATIO: Final = (2.0 * np.log(2.0) / np.pi) ** 0.5  # ratio of the deviation of flicker noise to B
 LEGEND_TEXT: Final = (
     "○ a coefficient, read on its own line: Q at √3 s, N at 1 s, K at 3 s, R at √2 s; 0.664 B where the curve is lowest"
 )
@@ -200,7 +200,7 @@ def _rings(estimate: Estimate, i: int, factor: float, lowest_s: float, floor: fl
         _Ring(
             letter,
             READING_TAU_S.get(letter, lowest_s),
-            float(value) * (FLICKER_FLOOR_RATIO if letter == "B" else 1.0) * factor,
+            float(value) * (FLICKER_FLOOR if letter == "B" else 1.0) * factor,
             i % 3,
         )
         for letter, value, status in zip(SYMBOLS, known.value[:, i], known.status[:, i], strict=True)

@@ -10,6 +10,7 @@ import numpy as np
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES
+from monitor.common.distributions import Z95
 from monitor.common.units import DEVIATION_UNITS
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.sage_husa import USED
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
 
 ROW_INCHES: Final = (11.0, 2.6)
 UNIT: Final = DEVIATION_UNITS["gyro"]
-Z95: Final = 1.959964
 
 
 def compensate_plot(result: CompensationResult, path: Path) -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.quantities import DAY_S, HOUR_S
 from drivers.sample import AXES, Floats
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, Kind, axes_of
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
@@ -43,7 +44,7 @@ COLOUR_SCALE_RATIOS: Final = (
 )  # possible ends of the colour scale; the first that holds most cells
 BANDS: Final = 0.9  # share of the ends of the bands inside a panel; the widest would determine its scale
 LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
-UNITS_S: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
+UNITS_S: Final = (("s", 1.0, 600.0), ("min", 60.0, 3.0 * HOUR_S), ("h", HOUR_S, 3.0 * DAY_S), ("d", DAY_S, np.inf))
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from drivers.errors import ConfigError
+from drivers.quantities import HOUR_S
 from drivers.sample import AXES, Floats
 from monitor.common.units import DEVIATION_UNITS, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
@@ -85,7 +86,7 @@ def _draw(rows: list[tuple[str, IntervalMeans, Prediction, str]], title: str, pa
     panels: Any = figure.subplots(len(rows), 2, squeeze=False, width_ratios=[2.4, 1.0])
     for (over_time, against), (axis, means, model, name) in zip(panels, rows, strict=True):
         unit, colour = DEVIATION_UNITS[sensor_kind(axis)], COLOURS[AXES.index(axis) % 3]
-        hours = (np.arange(means.bias.size) + 0.5) * means.interval_s / 3600.0
+        hours = (np.arange(means.bias.size) + 0.5) * means.interval_s / HOUR_S
         middle = float(np.nanmean(means.bias))
         bias, expected, lo, hi, bars = (
             unit.factor * each

@@ -11,12 +11,13 @@ from dataclasses import dataclass, fields
 from math import floor, isfinite, log10
 from typing import Any, Final
 
+from drivers.quantities import HOUR_S
 from drivers.sample import AXES
+from drivers.units import G0
 from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEGREE,
     DEVIATION_UNITS,
-    HOUR,
     MICRO_G,
     SAMPLE_UNITS,
     Unit,
@@ -36,8 +37,7 @@ RESULT_TEXTS: Final = {
 """Text of each result."""
 DIAGNOSTIC_NAMES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
 """Names of diagnostics that differ from their identifier."""
-GRAVITY: Final = 9.80665  # m/s², standard (CGPM 1901)
-DEGREES_PER_HOUR: Final = DEGREE * HOUR  # °/h per rad/s
+DEGREES_PER_HOUR: Final = DEGREE * HOUR_S  # °/h per rad/s
 SMALL_UNIT_BELOW: Final = 0.1  # °/s or m/s²; below it, a rate or an acceleration is shown in °/h or µg
 _GYRO, _ACCEL = COEFFICIENT_UNITS["gyro"], COEFFICIENT_UNITS["accel"]
 FIELD_UNITS: Final = {
@@ -48,7 +48,7 @@ FIELD_UNITS: Final = {
     "rad/s²": _GYRO["R"],
     "rad/s/°C": Unit(DEGREES_PER_HOUR, "°/h/°C"),
     "rad/s/°C²": Unit(DEGREES_PER_HOUR, "°/h/°C²"),
-    "rad/s per m/s²": Unit(DEGREES_PER_HOUR * GRAVITY, "°/h/g"),
+    "rad/s per m/s²": Unit(DEGREES_PER_HOUR * G0, "°/h/g"),
     "(rad/s)²/Hz": Unit(DEGREES_PER_HOUR**2, "(°/h)²/Hz"),
     "rad²/s²/Hz": Unit(DEGREES_PER_HOUR**2, "(°/h)²/Hz"),
     "rad/s/√Hz": Unit(DEGREES_PER_HOUR, "°/h/√Hz"),

@@ -10,6 +10,8 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from drivers.quantities import DAY_S, HOUR_S
+from monitor.common.distributions import Z95
 from monitor.common.health import Health
 from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, KIND_NAMES, KINDS, Kind, axes_of, format_number
 from monitor.drift.compensation.arma import ArmaModel
@@ -143,7 +145,7 @@ def drift_text(look: DriftUpdate) -> str:
         if not math.isfinite(expected):
             rows.append(f"| {axis} | not known yet | | | | |")
             continue
-        error = format_number(1.96 * unit.factor * float(look.error[at]), 2)
+        error = format_number(Z95 * unit.factor * float(look.error[at]), 2)
         now = f"{format_number(unit.factor * expected)} ± {error} {unit.name}"
         if model is None:
             rows.append(f"| {axis} | {now} | learning | | | |")
@@ -172,7 +174,7 @@ def format_duration(seconds: float) -> str:
     if seconds < 60:
         return f"{format_number(seconds)} s" if seconds < 10 else f"{seconds:.0f} s"
     whole = round(seconds)
-    days, hours, minutes = whole // 86400, whole // 3600 % 24, whole // 60 % 60
+    days, hours, minutes = whole // DAY_S, whole // HOUR_S % 24, whole // 60 % 60
     if days:
         return f"{days} d {hours:02d} h"
     if hours:

@@ -23,6 +23,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from drivers.quantities import HOUR_S
 from monitor.common import topics
 from monitor.common.units import COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of, format_number
 from monitor.estimation.estimate import Estimate
@@ -502,7 +503,7 @@ def _age(age_s: float) -> str:
         return f"{max(age_s, 0.0):.1f} s"
     if age_s < 120:
         return f"{age_s:.0f} s"
-    return f"{age_s / 60:.0f} min" if age_s < 7200 else f"{age_s / 3600:.0f} h"
+    return f"{age_s / 60:.0f} min" if age_s < 2 * HOUR_S else f"{age_s / HOUR_S:.0f} h"
 
 
 def _has_axis_of(one: RemoteDevice, kind: Kind) -> bool:

@@ -42,7 +42,7 @@ def test_the_fitted_curve_is_that_of_the_standard() -> None:
     coefficients.value[:] = np.nan
     coefficients.value[1, 0] = 3.0
     coefficients.value[2, 1] = 2.0
-    fitted = decoding.fitted_variance(np.array([1.0, 9.0]), coefficients)
+    fitted = decoding.fitted_variance(np.array([1.0, 9.0]), coefficients, 1e-3)
     assert fitted[:, 0] == pytest.approx([9.0, 1.0])
     assert fitted[:, 1] == pytest.approx([1.7651, 1.7651], rel=1e-4)
     assert np.isnan(fitted[:, 2:]).all()
