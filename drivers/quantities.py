@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 Number = TypeVar("Number", int, float)
 
-DAY_S: Final = 86_400.0
+HOUR_S: Final = 3600
+"""Seconds per hour."""
+DAY_S: Final = 86_400
+"""Seconds per day."""
 PREFIXED_UNITS: Final = ("Hz", "bit/s", "byte/s", "byte")
 """Units that are written with the prefixes k, M, G, T."""
 PREFIXES: Final = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))

@@ -12,6 +12,7 @@ from typing import Final, TypeVar
 
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError
+from drivers.quantities import HOUR_S
 
 G0: Final = 9.80665
 """Standard acceleration of free fall in m/s², exact by definition (CGPM 1901)."""
@@ -32,9 +33,9 @@ RATE: Final[Mapping[str, float]] = {
     "dps": DEGREE,
     "mdeg/s": 1e-3 * DEGREE,
     "mdps": 1e-3 * DEGREE,
-    "deg/h": DEGREE / 3600.0,
-    "deg/hr": DEGREE / 3600.0,
-    "°/h": DEGREE / 3600.0,
+    "deg/h": DEGREE / HOUR_S,
+    "deg/hr": DEGREE / HOUR_S,
+    "°/h": DEGREE / HOUR_S,
 }
 """Factor from each unit of angular rate to rad/s."""
 

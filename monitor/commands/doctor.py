@@ -31,6 +31,7 @@ from drivers import file_access
 from drivers.extras import missing_packages
 from drivers.links.can_link import missing_package
 from drivers.links.replay_link import ReplayLink
+from drivers.quantities import DAY_S
 from monitor.commands.check import check
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, lock_holder
 from monitor.settings.loading import Config, Storage
@@ -44,8 +45,6 @@ It is 32.5 to 33.3 bytes for a sensor that fills a float, and 17 to 23 bytes for
 """
 RAW_BYTES: Final = 60.0
 """Approximate size of the received frame of a sample. It depends on the protocol."""
-DAY_S: Final = 86400.0
-"""One day."""
 CONNECT_TIMEOUT_S: Final = 2.0
 """Longest wait for a connection."""
 TIME_ERROR: Final = 5

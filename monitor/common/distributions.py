@@ -38,6 +38,14 @@ rounding.
 TINY: Final = 1e-300
 """Value that replaces zeros in the continued fraction."""
 
+Z95: Final = 1.959963984540054
+"""Quantile of the standard normal distribution for a two-sided probability of 95 %."""
+HALF_CHI2_95: Final = 0.5 * Z95**2
+"""Half of the 95 % quantile of χ² with one degree of freedom, by which a log-likelihood falls at the ends of a 95 %
+interval."""
+NORMAL_QUARTILE: Final = 0.6744897501960817
+"""Upper quartile of the standard normal distribution. It is also the median of the absolute value."""
+
 _NORMAL: Final = NormalDist()
 
 

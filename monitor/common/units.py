@@ -12,21 +12,22 @@ from typing import Final, Literal
 
 import numpy as np
 
+from drivers.quantities import DAY_S, HOUR_S
 from drivers.sample import AXES
+from drivers.units import G0
 
 Kind = Literal["gyro", "accel"]
 KINDS: Final[tuple[Kind, Kind]] = ("gyro", "accel")
 KIND_NAMES: Final = {"gyro": "Gyroscopes", "accel": "Accelerometers"}
 
 DEGREE: Final = 180.0 / math.pi  # degrees per radian
-HOUR: Final = 3600.0  # seconds per hour
 ROOT_HOUR: Final = 60.0  # √s per √h
-MILLI_G: Final = 9.80665e-3
+MILLI_G: Final = 1e-3 * G0
 """One thousandth of standard gravity [m/s²]."""
-MICRO_G: Final = 1e6 / 9.80665  # µg per m/s²
+MICRO_G: Final = 1e6 / G0  # µg per m/s²
 NO_VALUE: Final = "—"
 """Text for a missing value in tables."""
-DURATION_UNITS: Final = ((86_400, "d"), (3600, "h"), (60, "min"), (1, "s"))
+DURATION_UNITS: Final = ((DAY_S, "d"), (HOUR_S, "h"), (60, "min"), (1, "s"))
 """Units of durations [s], the largest first."""
 
 
@@ -59,22 +60,22 @@ COEFFICIENT_UNITS: Final[dict[Kind, dict[str, Unit]]] = {
     "gyro": {
         "Q": Unit(1e6, "µrad"),
         "N": Unit(DEGREE * ROOT_HOUR, "°/√h"),
-        "B": Unit(DEGREE * HOUR, "°/h"),
-        "K": Unit(DEGREE * HOUR * ROOT_HOUR, "°/h/√h"),
-        "R": Unit(DEGREE * HOUR * HOUR, "°/h/h"),
+        "B": Unit(DEGREE * HOUR_S, "°/h"),
+        "K": Unit(DEGREE * HOUR_S * ROOT_HOUR, "°/h/√h"),
+        "R": Unit(DEGREE * HOUR_S * HOUR_S, "°/h/h"),
     },
     "accel": {
         "Q": Unit(1e6, "µm/s"),
         "N": Unit(ROOT_HOUR, "m/s/√h"),
         "B": Unit(MICRO_G, "µg"),
         "K": Unit(MICRO_G * ROOT_HOUR, "µg/√h"),
-        "R": Unit(MICRO_G * HOUR, "µg/h"),
+        "R": Unit(MICRO_G * HOUR_S, "µg/h"),
     },
 }
 """Field unit of each noise coefficient, for gyroscopes and accelerometers."""
 
 DEVIATION_UNITS: Final[dict[Kind, Unit]] = {
-    "gyro": Unit(DEGREE * HOUR, "°/h"),
+    "gyro": Unit(DEGREE * HOUR_S, "°/h"),
     "accel": Unit(MICRO_G, "µg"),
 }
 """Field unit of Allan deviations."""

@@ -14,6 +14,7 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import NotReady
+from drivers.quantities import DAY_S
 from drivers.sample import Floats, Ints
 from monitor.common.units import format_utc
 from monitor.history.bucket import HistoryRow, Singles, merge_rows, select_columns
@@ -23,7 +24,6 @@ from monitor.history.time_ranges import TimeRange
 DEFAULT_POINTS: Final = 1000
 """Approximate number of buckets in a table; at most twice as many if old and new rows differ in width."""
 MAX_EVENTS: Final = 1000
-DAY_S: Final = 86_400
 BUCKET_WIDTHS_S: Final = (
     *(60, 300, 900, 1800, 3600, 10_800, 21_600, 43_200),
     *(days * DAY_S for days in (1, 2, 4, 7, 30, 90, 365)),
@@ -123,7 +123,7 @@ def read_history(
     held = reader.stored_range(device)
     if held is None:
         raise NotReady(f"{device}: no history yet")
-    span = clip_to_stored(span or TimeRange(held[1] - 86_400.0, held[1]), held)
+    span = clip_to_stored(span or TimeRange(held[1] - DAY_S, held[1]), held)
     step_s = bucket_width_s(
         replace(span, start_s=max(span.start_s, held[0]), end_s=min(span.end_s, held[1])), step_s, points
     )
@@ -221,7 +221,7 @@ def clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
     held
         Start and end of the stored rows, Unix time [s].
     """
-    start_s, end_s = max(span.start_s, held[0] - 86_400.0), min(span.end_s, held[1] + 86_400.0)
+    start_s, end_s = max(span.start_s, held[0] - DAY_S), min(span.end_s, held[1] + DAY_S)
     return replace(span, start_s=min(start_s, end_s), end_s=max(start_s, end_s))
 
 

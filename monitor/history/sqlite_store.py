@@ -29,13 +29,13 @@ import msgspec
 
 from drivers.errors import RecordingError
 from drivers.file_access import check_folder, check_regular
+from drivers.quantities import DAY_S
 from monitor.history.bucket import MAX_COLUMNS, STATES, HistoryRow, merge_rows, pack_statistics, unpack_statistics
 from monitor.history.time_ranges import TimeRange
 
 FILE_NAME: Final = "history.sqlite"
 VERSION: Final = 1
 APPLICATION: Final = 0x494D5548  # "IMUH"
-DAY_S: Final = 86_400
 LEVELS: Final = ((60, 7 * DAY_S), (900, 90 * DAY_S), (21_600, None))
 """Width of the rows of a level [s], and the age at which they are merged into the next level [s]; None: never."""
 MAX_EVENTS: Final = 20_000

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from typing import Final
 
 from drivers.errors import ConfigError
+from drivers.quantities import DAY_S, HOUR_S
 
 UNITS_S: Final = {
     "": 1.0,
@@ -22,9 +23,9 @@ UNITS_S: Final = {
     "s": 1.0,
     "m": 60.0,
     "min": 60.0,
-    "h": 3600.0,
-    "d": 86_400.0,
-    "w": 604_800.0,
+    "h": float(HOUR_S),
+    "d": float(DAY_S),
+    "w": 7.0 * DAY_S,
 }
 """Length of each unit [s]: the units of zenoh, and ``min``, which the configuration file uses for zenoh's ``m``."""
 MAX_DURATION_S: Final = 1e11

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from math import erf, exp, inf, log
 from typing import Final
 
+from monitor.common.distributions import Z95
 from monitor.noise.effect import Effect, Leak
 from monitor.noise.effects import (
     EFFECTS,
@@ -26,7 +27,7 @@ from monitor.reconcile.likelihood.effect_terms import (
     NOISE_SIZE_PARAMETERS,
     size,
 )
-from monitor.reconcile.likelihood.hypothesis import Z95, Hypothesis, shape_bounds, size_bounds
+from monitor.reconcile.likelihood.hypothesis import Hypothesis, shape_bounds, size_bounds
 from monitor.reconcile.preparation.axis import Axis
 from monitor.reconcile.result import (
     AxisResult,

@@ -23,13 +23,11 @@ from monitor.noise.effect import Leak
 from monitor.noise.effects import (
     AngleRandomWalk,
     Bias,
-    BiasInstability,
-    QuantizationNoise,
     RateRamp,
-    RateRandomWalk,
     SampleRateError,
 )
 from monitor.noise.model import NoiseModel
+from monitor.noise.standard_terms import UNIT_SOURCES
 from monitor.reconcile.description import describe_axis
 from monitor.reconcile.diagnostics.diagnostics import whiten_axis
 from monitor.reconcile.diagnostics.gap import Findings, NullDistribution, null_distributions, run_diagnostics
@@ -363,11 +361,10 @@ def fit_five_terms(recording: Recording, courses: RegressorCache, seed: int) -> 
     NoiseModel
         Model with the supported terms of each axis.
     """
-    start = (QuantizationNoise(Q=1.0), AngleRandomWalk(N=1.0), BiasInstability(B=1.0), RateRandomWalk(K=1.0))
     rng = np.random.default_rng(seed)
     none: dict[str, Effects] = dict.fromkeys(recording.values, ())
     axes = prepare_axes(recording.values, recording.rate_hz, none, recording.temperature_c, courses, rng)
-    return NoiseModel({name: _fit_terms(axis, start) for name, axis in axes.items()}, recording.rate_hz)
+    return NoiseModel({name: _fit_terms(axis, UNIT_SOURCES[:4]) for name, axis in axes.items()}, recording.rate_hz)
 
 
 def _fit_terms(axis: Axis, start: Effects) -> Effects:

@@ -19,6 +19,7 @@ from typing import Final
 
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Event
+from monitor.common.distributions import Z95
 from monitor.common.units import COEFFICIENT_NAMES, sensor_kind, unit_of
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
@@ -31,8 +32,6 @@ LIMIT_CROSSED: Final = "limit_crossed"
 """Kind of the event for a crossed limit."""
 LIMIT_BACK: Final = "limit_back"
 """Kind of the event for the return from a crossed limit."""
-Z95: Final = 1.959964
-"""Two-sided 95 % quantile of the standard normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,8 @@ from monitor.common.health import Health
 from monitor.daemon.output import Output
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.noise.effect import parameter_units
+from monitor.noise.standard_terms import STANDARD_TERMS
 from monitor.settings.loading import Metrics
 
 if TYPE_CHECKING:
@@ -42,7 +44,10 @@ MISSING_LIBRARY_TEXT: Final = 'prometheus-client is not installed: pip install "
 """Status message if the library is not installed."""
 STATES: Final = ("running", "waiting", "lost", "ended")
 """States of a device."""
-UNITS: Final = "gyroscopes Q rad, N rad/√s, B rad/s, K rad/s/√s, R rad/s²; accelerometers with m/s for rad"
+_GYRO_UNITS: Final = ", ".join(
+    f"{symbol} {parameter_units(term)[symbol][0]}" for symbol, term in STANDARD_TERMS.items()
+)
+UNITS: Final = f"gyroscopes {_GYRO_UNITS}; accelerometers with m/s for rad"
 """Text about the units of the coefficients."""
 
 Rows = Mapping[tuple[str, ...], float | None]

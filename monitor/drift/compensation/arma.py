@@ -23,6 +23,7 @@ import numpy as np
 from drivers.errors import NotReady
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
+from monitor.common.distributions import HALF_CHI2_95
 from monitor.common.minimization import minimize_bfgs
 
 Order = tuple[int, int]
@@ -35,8 +36,6 @@ MIN_VALUES: Final = 30
 """Smallest number of known values for an identification."""
 MAX_PARTIAL_AUTOCORRELATION: Final = 0.99999
 """Largest absolute value of a partial autocorrelation."""
-HALF_CHI2: Final = 1.920729
-"""Half of the 95 % quantile of χ² with one degree of freedom."""
 MAX_COEFFICIENTS: Final = 3
 """Number of coefficients of the highest order. With fewer coefficients, a root cannot nearly cancel θ in two ways."""
 MIN_MAXIMA_DISTANCE: Final = 0.1
@@ -314,7 +313,7 @@ def _likelihood_maxima(z: Floats, white: float, order: Order, u: Floats) -> list
             ):
                 found.append(one)
     best = max(_log_likelihood(z, white, order, one) for one in found)
-    return [one for one in found if best - _log_likelihood(z, white, order, one) < HALF_CHI2]
+    return [one for one in found if best - _log_likelihood(z, white, order, one) < HALF_CHI2_95]
 
 
 def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int, top: float) -> tuple[float, float]:
@@ -332,7 +331,7 @@ def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int,
         while abs(inside - limit) > 1e-9:  # The search moves outwards with growing steps.
             further = inside + np.sign(limit - value) * min(step, abs(limit - inside))
             fallen, moved = _profile_likelihood(z, white, order, which, float(further), near)
-            if top - fallen > HALF_CHI2:
+            if top - fallen > HALF_CHI2_95:
                 outside = float(further)
                 break
             inside, near, step = float(further), moved, 1.6 * step
@@ -342,7 +341,7 @@ def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int,
         for _ in range(BISECTION_STEPS):
             middle = 0.5 * (inside + outside)
             fallen, moved = _profile_likelihood(z, white, order, which, middle, near)
-            if top - fallen > HALF_CHI2:
+            if top - fallen > HALF_CHI2_95:
                 outside = middle
             else:
                 inside, near = middle, moved

@@ -13,6 +13,7 @@ import numpy as np
 from drivers.errors import ConfigError, NotReady
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
+from monitor.common.distributions import NORMAL_QUARTILE
 
 MAX_ORDER: Final = 8
 """Highest order of an autoregression."""
@@ -29,8 +30,6 @@ MAX_DOUBLINGS: Final = 60
 """Largest number of iterations of the doubling algorithm."""
 MAX_LEVELS: Final = 8
 """Highest number of levels of a wavelet decomposition."""
-SIGMA_OF_MAD: Final = 0.6745
-"""Median of the absolute value of standard normal noise. The median absolute deviation over this number is σ."""
 MISSING_PACKAGES: Final = 'EMD-signal and PyWavelets are not installed: pip install "imu-monitor[denoise]"'
 """Message for a missing optional package."""
 
@@ -127,7 +126,7 @@ def shrink_wavelets(x: Floats, learned: Floats) -> Floats:
     parts = pywt.wavedec(x, WAVELET, level=depth)
     quiet = pywt.wavedec(learned, WAVELET, level=depth)
     for at in range(1, depth + 1):
-        sigma = float(np.median(np.abs(quiet[at]))) / SIGMA_OF_MAD
+        sigma = float(np.median(np.abs(quiet[at]))) / NORMAL_QUARTILE
         parts[at] = pywt.threshold(parts[at], sigma * (2.0 * np.log(x.size)) ** 0.5, "soft")
     return np.asarray(pywt.waverec(parts, WAVELET)[: x.size])
 

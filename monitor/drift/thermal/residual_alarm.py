@@ -13,8 +13,8 @@ from typing import Final
 
 import numpy as np
 
+from monitor.common.distributions import Z95
 from monitor.drift.thermal.recursive_least_squares import PredictionInterval
-from monitor.drift.thermal.thermal_model import Z95
 
 MIN_OUTSIDE: Final = 4
 """Intervals outside their prediction on one side that raise a suspicion, and the number of intervals that are

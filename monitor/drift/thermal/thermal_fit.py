@@ -24,6 +24,7 @@ from typing import Final, TypeVar
 import numpy as np
 
 from drivers.errors import NotReady
+from drivers.quantities import HOUR_S
 from drivers.sample import Floats
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_dependence import find_hysteresis
@@ -211,7 +212,7 @@ def check_means(means: IntervalMeans) -> None:
     least = max(MIN_SWING_C, MIN_SWING_SIGMAS * noise)
     if swing < least:
         raise NotReady(
-            f"temperature hardly moved: by {swing:.2g} °C in {count * means.interval_s / 3600.0:.3g} h, and "
+            f"temperature hardly moved: by {swing:.2g} °C in {count * means.interval_s / HOUR_S:.3g} h, and "
             f"{least:.2g} °C are the least that anything can be said of"
         )
     if not np.ptp(means.bias[means.known]) > 0.0:

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats
+from monitor.common.distributions import Z95
 from monitor.drift.thermal.thermal_response import (
     ThermalModelForm,
     difference_equation,
@@ -21,8 +22,6 @@ from monitor.drift.thermal.thermal_response import (
 
 LOG_TIME_CONSTANT_STEP: Final = 1e-3
 """Step of the logarithm of a time constant for its numerical derivative."""
-Z95: Final = 1.959964
-"""Two-sided 95 % quantile of the standard normal distribution."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -27,7 +27,7 @@ import numpy as np
 from drivers.sample import AXES, Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import chi2_quantile
-from monitor.noise.effects.bias_instability import BiasInstability
+from monitor.noise.effects.bias_instability import FLICKER_AVAR, BiasInstability
 
 Q, N, B, K, R = range(5)
 
@@ -159,7 +159,7 @@ def covariance_table(n: int, factors: Ints) -> CovarianceTable:
 @cache
 def _sampled_flicker(m: int) -> float:
     """Return the deviation of sampled over continuous 1/f noise; the ratio is one except at the shortest τ."""
-    return float(np.sqrt(BiasInstability(B=1.0).avar(np.array([float(m)]), 1.0)[0] / (2.0 * np.log(2.0) / np.pi)))
+    return float(np.sqrt(BiasInstability(B=1.0).avar(np.array([float(m)]), 1.0)[0] / FLICKER_AVAR))
 
 
 def _slope_variance(n: int) -> Floats:

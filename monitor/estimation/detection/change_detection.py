@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import ConfigError
+from drivers.quantities import DAY_S
 from drivers.sample import AXES, Floats
 from monitor.common.units import format_rate
 from monitor.estimation.detection.change_kernel import (
@@ -157,7 +158,7 @@ class ChangeDetector:
         self.rate_hz = rate_hz
         self._octaves = min(max(floor(log2(MAX_CLUSTER_S * rate_hz)), 7), 20) + 1
         self._state = make_state(self._octaves)
-        looks = 86_400.0 * rate_hz * len(AXES)  # z² per day, and pairs of blocks per day
+        looks = DAY_S * rate_hz * len(AXES)  # z² per day, and pairs of blocks per day
         # computed from the lower tail, because 1 - p would be rounded to 1 for p below 1e-16
         once = -NormalDist().inv_cdf(min(0.5 * OTHER_SHARE * alarms_per_day / looks, 0.01))
         self._state.levels[:] = (

@@ -26,7 +26,7 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.estimation.fit.coefficient_fit import UNIT_SOURCES
+from monitor.noise.standard_terms import unit_allan_variances
 
 CHANGE_SYMBOLS: Final = "QNBK"
 """Symbols of the coefficients that can change."""
@@ -87,7 +87,7 @@ def identify_noise_change(octaves: Octaves, rate_hz: float) -> dict[str, tuple[f
         return {}
     tau0 = 1.0 / rate_hz
     tau = np.asarray(tau0 * 2.0 ** np.flatnonzero(ok), np.float64)
-    columns = np.stack([source.avar(tau, tau0) for source in UNIT_SOURCES[: len(CHANGE_SYMBOLS)]], axis=1)
+    columns = unit_allan_variances(tau, tau0)[:, : len(CHANGE_SYMBOLS)]
     v0, v1, n0, n1 = octaves.before[ok], octaves.after[ok], octaves.n_before[ok], octaves.n_after[ok]
     floor, _, _ = _select_letters(
         columns, v0, 2.0 * v0**2 / n0 + (SHAPE_TOLERANCE * v0) ** 2, np.zeros(len(CHANGE_SYMBOLS))

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import AXES, Floats
+from monitor.common.distributions import NORMAL_QUARTILE
 from monitor.estimation.allan.curve import AllanCurve
 
 Mask = NDArray[np.bool_]
@@ -79,8 +80,6 @@ It is odd, so that the median is a sample and distances from it are whole steps 
 """
 NEIGHBOURS: Final = 3
 """Number of neighbours on each side. Up to three outliers in a row are detected."""
-SIGMA_PER_MEDIAN: Final = 1.4826
-"""Ratio of σ to the median distance for Gaussian noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -285,7 +284,7 @@ def _outlier_share(part: Floats) -> float:
         return 0.0
     blocks = part.reshape(-1, BLOCK)
     away = np.abs(blocks - np.median(blocks, axis=1, keepdims=True))
-    least = OUTLIER_SIGMA * max(SIGMA_PER_MEDIAN * _interpolated_median(away, step), step)
+    least = OUTLIER_SIGMA * max(_interpolated_median(away, step) / NORMAL_QUARTILE, step)
     rows = np.flatnonzero(away > least)
     around = np.clip(rows[:, None] + np.arange(-NEIGHBOURS, NEIGHBOURS + 1), 0, part.size - 1)
     alone = np.abs(part[rows] - np.median(part[around], axis=1)) > least / 2.0

@@ -33,12 +33,9 @@ from monitor.common.distributions import normal_quantile
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.uncertainty import NOISES, PAIRS, AxisCovarianceTables, CovarianceTable, K
 from monitor.estimation.estimate import Estimate
-from monitor.noise.effects.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.bias_instability import BiasInstability
-from monitor.noise.effects.quantization_noise import QuantizationNoise
-from monitor.noise.effects.rate_random_walk import RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.noise.spectrum import MIN_FREQUENCY_CYCLES, Spectrum, frequency_grid
+from monitor.noise.standard_terms import STANDARD_TERMS
 
 MIN_EDF: Final = 2.0
 """Minimum degrees of freedom of a compared τ."""
@@ -186,8 +183,8 @@ class _Expected:
 
 def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Floats, NoiseModel]:
     """Return Q² N² B² K² of an axis at τ0 = 1, and the model of these terms alone."""
-    kinds = (QuantizationNoise, AngleRandomWalk, BiasInstability, RateRandomWalk)
     letters = ("Q", "N", "B", "K")
+    kinds = tuple(STANDARD_TERMS[letter] for letter in letters)
     powers = (2.0, 1.0, 0.0, -1.0)
     effects = tuple(effect for effect in model.effects[axis] if isinstance(effect, kinds))
     shape = np.zeros(NOISES)

@@ -21,6 +21,7 @@ import numpy as np
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
+from monitor.common.distributions import NORMAL_QUARTILE
 
 AXES: Final = 6
 GYROS: Final = 3
@@ -70,8 +71,6 @@ LOOK_EVERY: Final = 20
 """Number of blocks between two tests whether an episode has become steady."""
 WANDER: Final = 4.0
 """Largest ratio of the scatter of means to what the scatter within blocks explains. Above it, the means move."""
-SIGMA_OF_QUARTER: Final = 0.6745
-"""Upper quartile of the standard normal distribution."""
 MIN_VARIANCE: Final = 1e-30
 """Variance assigned to a constant."""
 MIN_BLOCK_SAMPLES: Final = 4
@@ -398,7 +397,7 @@ def _steady(size: int, s: MotionState) -> bool:
             continue
         if REFERENCE_BLOCKS - n > REFERENCE_BLOCKS // 10:
             return False
-        scatter = 0.5 * (_interpolate(ordered, n, 0.75) - _interpolate(ordered, n, 0.25)) / SIGMA_OF_QUARTER
+        scatter = 0.5 * (_interpolate(ordered, n, 0.75) - _interpolate(ordered, n, 0.25)) / NORMAL_QUARTILE
         n = _sort_recent(s, LOG_VARIANCE, a, 0, REFERENCE_BLOCKS, ordered)
         middle = _median(ordered, n)
         louder = 0
@@ -458,7 +457,7 @@ def _quantile(ordered: Floats, n: int, p: float) -> float:
 def _scatter(ordered: Floats, n: int) -> float:
     """Return the standard deviation estimated from the wider half between the quartiles."""
     low, middle, high = _quantile(ordered, n, 0.25), _quantile(ordered, n, 0.5), _quantile(ordered, n, 0.75)
-    return max(high - middle, middle - low) / SIGMA_OF_QUARTER
+    return max(high - middle, middle - low) / NORMAL_QUARTILE
 
 
 # --- output

@@ -36,21 +36,7 @@ from monitor.estimation.fit.coefficients import Coefficients, Status
 from monitor.estimation.fit.fit_kernel import WHITE, fit_axes
 from monitor.estimation.fit.least_squares import N, R
 from monitor.estimation.fit.term_selection import SharedInputs, empty_fit_output, empty_gains
-from monitor.noise.effect import Source
-from monitor.noise.effects.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.bias_instability import BiasInstability
-from monitor.noise.effects.quantization_noise import QuantizationNoise
-from monitor.noise.effects.rate_ramp import RateRamp
-from monitor.noise.effects.rate_random_walk import RateRandomWalk
-
-UNIT_SOURCES: Final[tuple[Source, ...]] = (
-    QuantizationNoise(Q=1.0),
-    AngleRandomWalk(N=1.0),
-    BiasInstability(B=1.0),
-    RateRandomWalk(K=1.0),
-    RateRamp(R=1.0),
-)
-"""Noise terms with unit coefficients. Their Allan variances are the columns of the fit."""
+from monitor.noise.standard_terms import unit_allan_variances
 
 TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 """Powers of the sample rate that convert Q N B K R from τ0 = 1 to SI."""
@@ -101,7 +87,7 @@ def design(factors: Ints, rate_hz: float) -> Design:
         Sample rate in Hz.
     """
     m = np.asarray(factors, np.float64)
-    columns = np.ascontiguousarray(np.stack([source.avar(m, 1.0) for source in UNIT_SOURCES], axis=1))
+    columns = np.ascontiguousarray(unit_allan_variances(m, 1.0))
     return Design(factors, rate_hz, columns)
 
 

@@ -5,11 +5,10 @@ from typing import Final
 import numpy as np
 
 from monitor.common.compiled import compiled
+from monitor.common.distributions import Z95
 from monitor.estimation.fit.least_squares import N, Q
 
-TWO_SIDED_95: Final = 1.959963984540054
-"""Quantile of the normal distribution for a two-sided probability of 95 %."""
-UPPER_BOUND_Z: Final = TWO_SIDED_95
+UPPER_BOUND_Z: Final = Z95
 """Quantile of an upper bound.
 
 It gives 97.5 % for a single fit. It still gives 95 % of the reported bounds when large terms are estimated instead and

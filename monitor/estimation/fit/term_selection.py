@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
+from monitor.common.distributions import Z95
 from monitor.estimation.allan.uncertainty import NOISES
-from monitor.estimation.fit.confidence_bounds import TWO_SIDED_95, UPPER_BOUND_Z, interval_end, quantile
+from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, interval_end, quantile
 from monitor.estimation.fit.least_squares import K, Q, R, invert, nonzero_terms, normal_equations, solve, weight_columns
 
 MAX_THETA_CHANGE: Final = 0.4
@@ -170,14 +171,14 @@ def select_terms(  # type: ignore[no-untyped-def]
             continue
         skewness = 2.0 * np.sqrt(forms[a, 2])
         if a != R:
-            enters[a] = max(thresholds[0], quantile(TWO_SIDED_95, skewness)) * np.sqrt(c0)
+            enters[a] = max(thresholds[0], quantile(Z95, skewness)) * np.sqrt(c0)
         threshold = thresholds[1] if entered[a] else thresholds[0]
-        low = interval_end(estimate[a], c0, c1, c2, skewness, TWO_SIDED_95)
-        high = interval_end(estimate[a], c0, c1, c2, skewness, -TWO_SIDED_95)
+        low = interval_end(estimate[a], c0, c1, c2, skewness, Z95)
+        high = interval_end(estimate[a], c0, c1, c2, skewness, -Z95)
         if theta[a] > 0.0 and not low < np.sqrt(theta[a]) < high:
             # other terms were held at zero, so θ differs from û: include the interval of θ
-            low = min(low, interval_end(theta[a], c0, c1, c2, skewness, TWO_SIDED_95))
-            high = max(high, interval_end(theta[a], c0, c1, c2, skewness, -TWO_SIDED_95))
+            low = min(low, interval_end(theta[a], c0, c1, c2, skewness, Z95))
+            high = max(high, interval_end(theta[a], c0, c1, c2, skewness, -Z95))
         # an absent term stays out while its interval includes zero
         seen = entered[a] or low > 0.0
         entered[a] = seen and a != R and theta[a] > 0.0 and estimate[a] > threshold * np.sqrt(c0)
@@ -326,8 +327,8 @@ def select_ramp(slope, slope_variance, thresholds, entered, theta, lo, hi, statu
     entered[R] = status[K] > 0 and abs(slope) > thresholds[1 if entered[R] else 0] * np.sqrt(most)
     theta[R] = slope * slope if entered[R] else max(slope * slope - noise, 0.0)
     status[R] = 2 if entered[R] else 1
-    lo[R] = max(abs(slope) - TWO_SIDED_95 * np.sqrt(most), 0.0) if entered[R] else 0.0
-    hi[R] = abs(slope) + (TWO_SIDED_95 if entered[R] else UPPER_BOUND_Z) * np.sqrt(most)
+    lo[R] = max(abs(slope) - Z95 * np.sqrt(most), 0.0) if entered[R] else 0.0
+    hi[R] = abs(slope) + (Z95 if entered[R] else UPPER_BOUND_Z) * np.sqrt(most)
     return noise, most
 
 

@@ -37,7 +37,7 @@ RESPONSE_CONSTANT: Final = 5.436556224293264
 
 FLICKER_AVAR: Final = float(2.0 * np.log(2.0) / np.pi)
 """Allan variance of continuous flicker noise with B = 1 (IEEE Std 952 eq. C.24)."""
-FLICKER_FLOOR: Final = FLICKER_AVAR**0.5
+FLICKER_FLOOR: Final = float(FLICKER_AVAR**0.5)
 """Allan deviation of continuous flicker noise divided by B, 0.664."""
 MAX_SAMPLED_FACTOR: Final = 128
 """Largest number of samples per cluster for which the sampled form of σ² is integrated. Above, it differs from the

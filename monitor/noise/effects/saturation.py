@@ -5,10 +5,11 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from drivers.quantities import HOUR_S
 from monitor.noise.effect import MemorylessTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
-OBSERVATION_S: Final = 3600.0
+OBSERVATION_S: Final = float(HOUR_S)
 """Time in seconds over which noise and slope must stay within the range."""
 NOISE_SIGMAS: Final = 6.0
 """Standard deviations of the noise that must stay within the range."""

@@ -18,8 +18,8 @@ from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_fit import UNIT_SOURCES
 from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
+from monitor.noise.standard_terms import UNIT_SOURCES
 from monitor.publishing.messages.message import Count, Message, decode_message, remove_control_characters
 
 MAX_AVERAGING_TIMES: Final = 1000

@@ -18,8 +18,8 @@ from monitor.common.units import DEVIATION_UNITS, KIND_NAMES, Kind, axes_of
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficient_fit import UNIT_SOURCES
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.noise.standard_terms import UNIT_SOURCES
 from monitor.publishing.plots.style import COLOURS, DARK, GREY, LABEL_BOX, draw_band, draw_legend_above, style_log_axis
 
 if TYPE_CHECKING:

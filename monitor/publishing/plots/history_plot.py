@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import NotReady
+from drivers.quantities import DAY_S
 from drivers.sample import AXES, Floats
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
 from monitor.estimation.fit.coefficients import SYMBOLS
@@ -141,7 +142,7 @@ def _draw_temperature(panel: "Axes", past: HistoryTable) -> None:
 
 def _draw_losses(panel: "Axes", past: HistoryTable) -> None:
     """Draw the number of missing samples by bucket, and the time in which the device was not running."""
-    t, width = _days(past.start_s), past.width_s / 86_400.0
+    t, width = _days(past.start_s), past.width_s / DAY_S
     missing = past.counts[:, [COUNTS.index(name) for name in ("lost", "bad", "overflowed")]].sum(axis=1)
     panel.bar(t, missing, width, align="edge", color=style.DARK)
     for at in np.flatnonzero(past.state >= STATES.index("waiting")):
@@ -211,4 +212,4 @@ def _with_gaps(past: HistoryTable, *columns: Floats) -> tuple[Floats, ...]:
 
 def _days(unix_s: "Floats | NDArray[np.int64]") -> Floats:
     """Convert Unix seconds to the dates of matplotlib: days since 1970."""
-    return np.asarray(unix_s, np.float64) / 86_400.0
+    return np.asarray(unix_s, np.float64) / DAY_S

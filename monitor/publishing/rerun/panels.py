@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+from monitor.common.distributions import Z95
 from monitor.common.health import Health
 from monitor.common.units import (
     COEFFICIENT_UNITS,
@@ -156,7 +157,7 @@ def drift_text(look: DriftUpdate) -> str:
         if not math.isfinite(expected):
             rows.append(f"| {axis} | not known yet | | | | |")
             continue
-        error = format_number(1.96 * unit.factor * float(look.error[at]), 2)
+        error = format_number(Z95 * unit.factor * float(look.error[at]), 2)
         now = f"{format_number(unit.factor * expected)} ± {error} {unit.name}"
         if model is None:
             rows.append(f"| {axis} | {now} | learning | | | |")

@@ -16,6 +16,7 @@ import numpy as np
 import rerun as rr
 
 from drivers.sample import AXES, Event, Floats
+from monitor.common.distributions import Z95
 from monitor.common.health import Health
 from monitor.common.units import (
     COEFFICIENT_UNITS,
@@ -56,7 +57,6 @@ TIMELINE: Final = "sample_time"
 TEMPERATURES_PER_S: Final = 5.0
 POINTS_BETWEEN_ESTIMATES: Final = 20
 """Number of coefficient points between two estimates, if the estimator provides values for every sample."""
-Z95: Final = 1.959964
 MAX_PAST_EVENTS: Final = 200
 """Largest number of stored events that are shown."""
 MAX_INTERVAL_RATIO: Final = 1.5  # intervals whose ends differ from the value by more than this factor are not shown

@@ -13,6 +13,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
+from drivers.quantities import DAY_S, HOUR_S
 from drivers.sample import Floats
 from monitor.common.units import KIND_NAMES, KINDS, Kind, axes_of, format_number, format_utc, unit_of
 from monitor.history.bucket import COUNTS, STATES
@@ -27,7 +28,7 @@ SPARKLINE_WIDTH: Final = 32
 MAX_EVENTS: Final = 20
 """Largest number of events that are printed."""
 NO_VALUE: Final = "—"
-WIDTH_UNITS: Final = ((86_400, "d"), (3600, "h"), (60, "min"), (1, "s"))
+WIDTH_UNITS: Final = ((DAY_S, "d"), (HOUR_S, "h"), (60, "min"), (1, "s"))
 """Units of bucket widths, the largest first."""
 
 

@@ -12,6 +12,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import chdtri, erfc
 
 from drivers.sample import Floats, Ints
+from monitor.common.distributions import Z95
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 from monitor.noise.spectrum import allan_of_density
 from monitor.reconcile.diagnostics.diagnostics import MAX_LAG_SAMPLES, WhitenedAxis, noise_deviation_over_time
@@ -24,8 +25,6 @@ TIME_BLOCKS: Final = 240
 """Number of blocks of a plot over time."""
 TEMPERATURE_BINS: Final = 24
 """Number of temperature intervals."""
-Z95: Final = 1.959964
-"""Number of standard deviations on each side of a 95 % interval."""
 LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}
 """Unit of the level by the first letter of the axis."""
 DENSITY_UNITS: Final = {"g": "(rad/s)²/Hz", "a": "(m/s²)²/Hz"}

@@ -20,6 +20,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
+from monitor.common.distributions import Z95
 from monitor.reconcile.result import ParameterInterval
 
 MAX_BLOCKS: Final = 1 << 15
@@ -39,8 +40,6 @@ FLICKER_TIME_RATIO: Final = 10.0
 FLICKER_CUTOFF_RATIO: Final = 20.0
 """Highest frequency at which flicker noise is modelled, relative to the frequency at which it equals the white noise.
 """
-INTERVAL_SIGMAS: Final = 1.96
-"""Number of standard deviations on each side of a 95 % interval."""
 CURVATURE_STEP: Final = 0.1
 """Step in the logarithm of a parameter for the numerical curvature at the maximum."""
 ODDS_STEP: Final = 1e-3
@@ -89,7 +88,7 @@ class LikelihoodMaximum(NamedTuple):
 
     def bounds(self, k: int) -> ParameterInterval:
         """Return parameter ``k`` with its 95 % interval, or without an interval if it is wider than the search."""
-        value, wide = float(self.at[k]), INTERVAL_SIGMAS * float(self.deviation[k])
+        value, wide = float(self.at[k]), Z95 * float(self.deviation[k])
         return (
             ParameterInterval(value, value * exp(-wide), value * exp(wide))
             if wide < MAX_LOG_PARAMETER_RANGE

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from monitor.common.distributions import HALF_CHI2_95, Z95
 from monitor.noise.effect import Effect
 from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS, size
 from monitor.reconcile.preparation.axis import Axis, Effects, Likely
@@ -20,10 +21,6 @@ from monitor.reconcile.result import ParameterInterval
 
 RESIZE_PENALTY_NATS: Final = 5.0
 """Log-likelihood gain in nats that justifies another size of a noise effect of the model."""
-Z95: Final = 1.959964
-"""Number of standard deviations on each side of a 95 % interval."""
-CHI2_HALF_NATS: Final = 1.920729
-"""Decrease of the log-likelihood at the ends of a 95 % interval of one parameter, in nats: χ²(0.95; 1)/2."""
 GOLDEN: Final = 0.6180339887498949
 """Inverse of the golden ratio."""
 
@@ -205,7 +202,7 @@ def size_bounds(likely: Likely, index: int) -> ParameterInterval:
 def shape_bounds(axis: Axis, hypothesis: Hypothesis, index: int, name: str) -> ParameterInterval:
     """Return a shape parameter with its 95 % interval from the profile likelihood.
 
-    Each end of the interval is the value at which the log-likelihood has fallen by ``CHI2_HALF_NATS``.
+    Each end of the interval is the value at which the log-likelihood has fallen by ``HALF_CHI2_95``.
 
     Parameters
     ----------
@@ -228,11 +225,11 @@ def shape_bounds(axis: Axis, hypothesis: Hypothesis, index: int, name: str) -> P
     ends = []
     for sign in (-1.0, 1.0):
         step = 1e-6
-        while step < 2.0 and fall(exp(sign * step)) < CHI2_HALF_NATS:
+        while step < 2.0 and fall(exp(sign * step)) < HALF_CHI2_95:
             step *= 2.0
         lo, hi = 0.5 * step, step
         for _ in range(8):
             middle = 0.5 * (lo + hi)
-            lo, hi = (middle, hi) if fall(exp(sign * middle)) < CHI2_HALF_NATS else (lo, middle)
+            lo, hi = (middle, hi) if fall(exp(sign * middle)) < HALF_CHI2_95 else (lo, middle)
         ends.append(value * exp(sign * hi))
     return ParameterInterval(value, ends[0], ends[1])

@@ -19,6 +19,7 @@ from scipy.special import bdtrc, chdtrc, gammaln, ndtr, ndtri, pdtrc
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
+from monitor.common.distributions import NORMAL_QUARTILE, Z95
 from monitor.reconcile.preparation.value_statistics import Interval, Mask
 
 LINEAR_BINS: Final = 240
@@ -48,8 +49,6 @@ MIN_MIXTURE_GAIN_NATS: Final = 0.01
 """Smallest gain in nats of a second Gaussian."""
 MAX_Z: Final = 37.0
 """Value of z that is used if the probability underflows in 64 bits."""
-Z95: Final = 1.959964
-"""Number of standard deviations on each side of a 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +93,7 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
     good = np.isfinite(w)
     n = int(good.sum())
     some = np.abs(w[good][:: max(1, n // 20_000)])
-    unit = float(np.median(some)) / 0.6744897501960817 if n >= 100 else 0.0
+    unit = float(np.median(some)) / NORMAL_QUARTILE if n >= 100 else 0.0
     if not unit > 0.0:
         return None
     counts, squares = _bin_magnitudes(w, unit)

@@ -19,9 +19,9 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
+from monitor.common.distributions import Z95
 from monitor.reconcile.likelihood import poisson_steps
 from monitor.reconcile.likelihood.hidden_state import (
-    INTERVAL_SIGMAS,
     BackgroundNoise,
     ModelComparison,
     StateSpaceNoise,
@@ -53,7 +53,7 @@ class SingleStepsFit(NamedTuple):
         found: dict[str, ParameterInterval] = {}
         for k in range(self.times.size):
             time, early, late = (float(t[k]) * block_s for t in (self.times, self.earliest, self.latest))
-            height, wide = float(self.heights[k]), INTERVAL_SIGMAS * float(self.deviations[k])
+            height, wide = float(self.heights[k]), Z95 * float(self.deviations[k])
             found[f"time_{k + 1}"] = ParameterInterval(time, early, late)
             found[f"height_{k + 1}"] = ParameterInterval(height, height - wide, height + wide)
         return found
@@ -169,7 +169,7 @@ def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[
 def _time_interval(means: Floats, noise: StateSpaceNoise, blocks: list[int], k: int) -> tuple[float, float]:
     """Return the 95 % interval of the time of step ``k``, in blocks, with the other steps fixed."""
     scores = _shock_gains(means, noise, blocks[:k] + blocks[k + 1 :])
-    worse = np.flatnonzero(scores < scores[blocks[k]] - INTERVAL_SIGMAS**2)
+    worse = np.flatnonzero(scores < scores[blocks[k]] - Z95**2)
     before, after = worse[worse < blocks[k]], worse[worse > blocks[k]]
     return float(before[-1] if before.size else 0), float(after[0] if after.size else means.size)
 

@@ -12,10 +12,11 @@ from typing import Any, Final
 
 import numpy as np
 
+from monitor.common.distributions import HALF_CHI2_95
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.reconcile.diagnostics.diagnostics import periodogram, whiten_axis
-from monitor.reconcile.likelihood.hypothesis import CHI2_HALF_NATS, GOLDEN, fit_with_given_sizes
+from monitor.reconcile.likelihood.hypothesis import GOLDEN, fit_with_given_sizes
 from monitor.reconcile.preparation.axis import Axis, Effects
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidates import find_spectral_peaks
@@ -201,13 +202,13 @@ def _maximise_gain(gain: Any, x: float, width: float) -> float:
 
 
 def _interval_end(gain: Any, x: float, top: float, step: float) -> float:
-    """Return the point on one side of the maximum at which the gain has fallen by ``CHI2_HALF_NATS``."""
+    """Return the point on one side of the maximum at which the gain has fallen by ``HALF_CHI2_95``."""
     near, far = x, x + step
     for _ in range(12):
-        if top - gain(far) > CHI2_HALF_NATS:
+        if top - gain(far) > HALF_CHI2_95:
             break
         near, far = far, x + 2.0 * (far - x)
     for _ in range(10):
         middle = 0.5 * (near + far)
-        near, far = (near, middle) if top - gain(middle) > CHI2_HALF_NATS else (middle, far)
+        near, far = (near, middle) if top - gain(middle) > HALF_CHI2_95 else (middle, far)
     return far

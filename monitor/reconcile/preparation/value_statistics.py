@@ -22,8 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr, xlogy
 
+from drivers.quantities import HOUR_S
 from drivers.sample import Floats
+from drivers.units import DEGREE, G0
 from monitor.common.compiled import compiled
+from monitor.common.distributions import Z95
 from monitor.estimation.detection.resolution import GRID_TOLERANCE, SIGMA_PER_MEAN_DISTANCE
 
 Mask = NDArray[np.bool_]
@@ -51,14 +54,12 @@ Gaussian.
 """
 MIN_EXPECTED_COINCIDENCES: Final = 1e-3
 """Lower limit of the expected number of coincidences."""
-TEXT_UNITS: Final = (1.0, np.pi / 180.0, np.pi / 180.0 / 3600.0, 9.80665)
+TEXT_UNITS: Final = (1.0, DEGREE, DEGREE / HOUR_S, G0)
 """Units of the texts that values may come from, in SI units: SI, °/s, °/h, g."""
 MIN_DISTINCT_DECIMALS: Final = 8
 """Number of different decimals that distinguishes a text from chance. A text with fewer decimals is coarse anyway."""
 PREDICTOR_TAPS: Final = 8
 """Number of neighbours on each side that predict a sample."""
-Z95: Final = 1.959964
-"""Number of standard deviations on each side of a 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from drivers.sample import Floats
-from monitor.reconcile.likelihood.hypothesis import Z95
+from monitor.common.distributions import Z95
 from monitor.reconcile.result import ParameterInterval
 
 MIN_AGREEMENT_PROBABILITY: Final = 0.01

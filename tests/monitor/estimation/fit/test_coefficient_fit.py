@@ -10,12 +10,13 @@ from scipy.stats import binom
 from drivers.sample import AXES
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
 from monitor.estimation.allan.uncertainty import covariance_table, intervals
-from monitor.estimation.fit.coefficient_fit import UNIT_SOURCES, Fit, design, fit
+from monitor.estimation.fit.coefficient_fit import Fit, design, fit
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.noise.effect import Source
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
+from monitor.noise.standard_terms import UNIT_SOURCES
 
 RATE_HZ = 100.0
 MIX: tuple[Source, ...] = (
