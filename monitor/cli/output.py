@@ -78,9 +78,9 @@ def progress() -> Iterator[ProgressCallback]:
 
 def compile_kernels(tell: ProgressCallback) -> None:
     """Compile the kernels for the analysis of recordings in parallel, if they are not in the cache on disk."""
-    from monitor.daemon import kernel_compilation
+    from monitor.daemon import kernel_compilation, kernel_parts
 
-    for group in kernel_compilation.GROUPS:
+    for group in kernel_parts.GROUPS:
         if not kernel_compilation.is_warm(group):
             with contextlib.suppress(OSError):  # without a cache on disk, each kernel is compiled at its first call
                 for _ in kernel_compilation.prepare_kernels(

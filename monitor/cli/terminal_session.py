@@ -253,26 +253,22 @@ class _ErrorStream(io.TextIOBase):
 
 def _configure_logging(config: "Config") -> None:
     """Configure structlog to write structured lines to standard error."""
-    import logging
-
     import structlog
 
-    from monitor.daemon.operations.log_level import LEVEL
+    from monitor.daemon.operations.log_level import set_log_level
 
     json = config.log.format == "json"
-    LEVEL.name = config.log.level
     structlog.configure(
         processors=[
-            LEVEL,
             structlog.processors.add_log_level,
             structlog.processors.TimeStamper(fmt="iso", utc=True),
             _without_secrets,
             structlog.processors.JSONRenderer() if json else structlog.dev.ConsoleRenderer(colors=sys.stderr.isatty()),
         ],
-        wrapper_class=structlog.make_filtering_bound_logger(logging.DEBUG),
         logger_factory=structlog.PrintLoggerFactory(cast("TextIO", _ErrorStream())),
-        cache_logger_on_first_use=True,
+        cache_logger_on_first_use=False,  # a reload may change the level
     )
+    set_log_level(config.log.level)
 
 
 def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]") -> "MutableMapping[str, Any]":

@@ -13,7 +13,7 @@ from monitor.cli import output
 def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True)] = False) -> None:
     """Compile the numerical kernels and keep them on disk, so that the next start is quick; then end."""
     from monitor.common.compiled import cache_folder
-    from monitor.daemon import kernel_compilation
+    from monitor.daemon import kernel_compilation, kernel_parts
 
     if from_stdin:
         kernel_compilation.compile_from_stdin(sys.stdin, sys.stdout)
@@ -23,7 +23,7 @@ def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True
             "compiled kernels cannot be kept, because no cache folder can be written; set NUMBA_CACHE_DIR to a folder "
             "that can"
         )
-    cold = [group for group in kernel_compilation.GROUPS if not kernel_compilation.is_warm(group)]
+    cold = [group for group in kernel_parts.GROUPS if not kernel_compilation.is_warm(group)]
     begun_s = time.monotonic()
     with output.progress() as show:
 

@@ -17,9 +17,10 @@ from drivers.sample import Chunk, Floats, SampleBlock
 from drivers.timing.sample_clock import SampleClock
 from monitor.common.health import Health
 from monitor.daemon.device_status import DeviceStatus
+from monitor.daemon.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.limits import LimitMonitor, read_model_in_force
 from monitor.daemon.output import Output
-from monitor.daemon.pipeline import DevicePipeline, KernelReadiness
+from monitor.daemon.pipeline import DevicePipeline
 from monitor.daemon.result_publisher import ResultPublisher
 from monitor.daemon.ring_buffer import RingBuffer
 from monitor.daemon.storage.recorder import Recorder

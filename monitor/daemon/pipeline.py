@@ -10,8 +10,6 @@ restart of the program, ``replay`` passes the end of the recording through the p
 from collections import deque
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field
-from threading import Event as Flag
 from typing import Final
 
 import numpy as np
@@ -20,6 +18,7 @@ from drivers.errors import ConfigError
 from drivers.sample import AXES, Event, Floats, SampleBlock
 from monitor.common.compiled import interpreted
 from monitor.daemon.arma_worker import ArmaWorker
+from monitor.daemon.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.drift.thermal.live_thermal import LiveThermal, ThermalUpdate
 from monitor.estimation.detection.model_gap import ModelComparison
@@ -29,42 +28,8 @@ from monitor.estimation.window_snapshot import TemperatureRing, WindowSnapshot
 from monitor.noise.model import NoiseModel
 from monitor.settings.loading import Device
 
-MAX_INTERPRETED_HZ: Final = 250.0
-"""Maximum total sample rate of the devices whose kernels are interpreted. A sample takes up to 0.8 ms."""
 MAX_PIECE_SAMPLES: Final = 512
 """Samples that are processed before the noise is tested for a change. A fast replay brings thousands at once."""
-
-
-@dataclass(slots=True)
-class KernelReadiness:
-    """Flags of the compiled kernels, see ``monitor.daemon.kernel_compilation``.
-
-    Attributes
-    ----------
-    window : threading.Event
-        Set if the kernels of the Allan deviation are compiled.
-    fit : threading.Event
-        Set if the kernels of the noise coefficients are compiled.
-    all : threading.Event
-        Set if all kernels of the service are compiled.
-
-    Until then, the kernels of devices with low sample rates are interpreted by Python.
-    """
-
-    window: Flag = field(default_factory=Flag)
-    fit: Flag = field(default_factory=Flag)
-    all: Flag = field(default_factory=Flag)
-    progress: str = ""
-    """Progress of the compilation as one line of text; empty if nothing is being compiled."""
-    interpretable_hz: float = MAX_INTERPRETED_HZ
-    """Total sample rate of further devices whose kernels can be interpreted."""
-
-    def reserve_interpreter(self, rate_hz: float) -> bool:
-        """Return True if the kernels of one more device of this sample rate can be interpreted."""
-        if rate_hz > self.interpretable_hz:
-            return False
-        self.interpretable_hz -= rate_hz
-        return True
 
 
 class DevicePipeline:

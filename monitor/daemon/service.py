@@ -18,32 +18,27 @@ from typing import TYPE_CHECKING, Final
 
 import structlog
 
-from drivers.errors import ConfigError, NotReady, RecordingError
+from drivers.errors import ConfigError
 from drivers.links.replay_link import ReplayLink
 from drivers.recordings.segment import SegmentMetadata
 from monitor.common.health import Health, format_service_status
-from monitor.daemon import kernel_compilation, reload
+from monitor.daemon import reload
+from monitor.daemon.command_handler import CommandHandler
 from monitor.daemon.device_worker import DeviceWorker
+from monitor.daemon.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.hooks import Hooks
-from monitor.daemon.operations.live_reconcile import Job, Reconciler
-from monitor.daemon.operations.log_level import LEVEL
+from monitor.daemon.operations.live_reconcile import Reconciler
+from monitor.daemon.operations.log_level import set_log_level
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.output import Output
-from monitor.daemon.outputs import HistoryOutput, TableOutput, ViewerOutput, ZenohOutput
-from monitor.daemon.pipeline import KernelReadiness
+from monitor.daemon.outputs import TableOutput, ViewerOutput, ZenohOutput
 from monitor.daemon.reload import ConfigChange
 from monitor.daemon.storage.recorder import Recorder, origin
-from monitor.history import reading as past
-from monitor.history.query import parse_query
+from monitor.daemon.stored_history import StoredHistory
 from monitor.history.reading import HistoryTable
-from monitor.history.sqlite_store import FILE_NAME, open_history
-from monitor.history.time_ranges import TimeRange
-from monitor.history.writer import HistoryWriter
-from monitor.publishing.messages.history import HistoryMessage
-from monitor.publishing.messages.results import ResetMessage
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.terminal.queued_writer import QueuedWriter
-from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
+from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings.loading import Config, Device, Storage, VirtualTable
 
 if TYPE_CHECKING:
@@ -78,7 +73,7 @@ class Service:
         Further outputs, for example the table in the terminal.
     reconciler : Reconciler, optional
         Executes ``command/reconcile``. By default a new ``Reconciler``.
-    unit : Unit, optional
+    unit : SystemdNotifier, optional
         Notifies systemd. By default nothing is sent.
     writers : mapping of str to QueuedWriter, optional
         Text outputs by name, such as "terminal" and "log". Their states become part of the status.
@@ -86,7 +81,7 @@ class Service:
     Raises
     ------
     ConfigError
-        A simulated sensor or a model in force cannot be used.
+        If a simulated sensor or a model in force cannot be used.
     """
 
     def __init__(
@@ -101,7 +96,6 @@ class Service:
         self._writers = dict(writers or {})
         self._unit = unit or SystemdNotifier()
         self._started_s = time.monotonic()
-        self._reconciler = reconciler or Reconciler()
         self._wake = threading.Event()
         self._ready = KernelReadiness()
         self._stop = threading.Event()
@@ -110,24 +104,24 @@ class Service:
         self.recorder = _build_recorder(config)
         self.outputs: list[Output] = []
         self.workers: list[DeviceWorker] = []
-        self._self_timed_devices: set[str] = set()  # devices whose sample times do not come from the host clock
         for device in config.devices:
             self._register_device(*self._build_device(device))
-        self.history = _build_history_writer(config)
-        recall = None if self.history is None else self._answer_history_query
-        self.zenoh = ZenohPublisher(config.zenoh, [worker.name for worker in self.workers], recall)
-        self.viewer = _build_view(config, self._load_viewer_history)
+        storage = config.storage
+        self.history = StoredHistory(storage.folder) if storage is not None and storage.history else None
+        answer_query = None if self.history is None else self.history.answer_query
+        self.zenoh = ZenohPublisher(config.zenoh, [worker.name for worker in self.workers], answer_query)
+        self._commands = CommandHandler(self.zenoh, reconciler or Reconciler())
+        self.viewer = _build_view(config, self._read_viewer_history)
         self._viewer_url = ""  # address of the viewer's web page that was announced last
         self.hooks = Hooks(config.hooks, self.zenoh.put_key)
-        self.outputs += [ZenohOutput(self.zenoh), self.hooks, *more]
         self.metrics = _build_metrics_output(config)
+        self.outputs += [ZenohOutput(self.zenoh), self.hooks, *more]
         if self.metrics is not None:
             self.outputs.append(self.metrics)
         if self.viewer is not None:
             self.outputs.append(ViewerOutput(self.viewer))
-        self._history_output = None if self.history is None else HistoryOutput(self.history)
-        if self._history_output is not None:
-            self.outputs.append(self._history_output)
+        if self.history is not None:
+            self.outputs.append(self.history.output)
 
     def stop(self) -> None:
         """Request the end of the main loop. May be called from any thread."""
@@ -147,7 +141,7 @@ class Service:
         seconds : float, optional
             Duration in seconds. By default the service runs until ``stop`` is called or all replays have ended.
         """
-        threading.Thread(target=self._compile_kernels, name="warm-up", daemon=True).start()
+        threading.Thread(target=self._ready.compile, args=(self._wake,), name="warm-up", daemon=True).start()
         try:
             self._start()
             self.loop(None if seconds is None else time.monotonic() + seconds)
@@ -156,13 +150,9 @@ class Service:
 
     def _start(self) -> None:
         """Start all outputs, devices and background threads."""
-        if self.history is not None:
-            self.history.start()
-        self.zenoh.start()
-        if self.metrics is not None:
-            self.metrics.start()
-        if self.viewer is not None:
-            self.viewer.start()
+        for output in (self.history, self.zenoh, self.metrics, self.viewer):
+            if output is not None:
+                output.start()
         for imu in self.virtual.values():
             imu.start()
         for worker in self.workers:
@@ -185,8 +175,9 @@ class Service:
         while not self._stop.is_set():
             now_s = time.monotonic()
             self._work_devices(now_s)
-            self._handle_commands()
-            self._publish_reconcile_events()
+            workers = {worker.name: worker for worker in self.workers}
+            self._commands.handle_commands(workers)
+            self._commands.publish_reconciled(workers)
             if now_s >= status_s:
                 status_s = now_s + STATUS_INTERVAL_S
                 self._publish_status()
@@ -210,85 +201,35 @@ class Service:
 
     def states(self) -> dict[str, str]:
         """Return the state of each output by its name: "ok", or a text that describes the problem."""
-        states = {"zenoh": self.zenoh.state}
-        if self.viewer is not None:
-            states["viewer"] = self.viewer.state
-        if self.recorder is not None:
-            states["recording"] = self.recorder.state
-        if self.history is not None:
-            states["history"] = self.history.state
-        if self.metrics is not None:
-            states["metrics"] = self.metrics.state
-        if self.hooks.hooks:
-            states["hook"] = self.hooks.state
-        return states | {name: writer.state for name, writer in self._writers.items()}
+        outputs = {
+            "zenoh": self.zenoh,
+            "viewer": self.viewer,
+            "recording": self.recorder,
+            "history": self.history,
+            "metrics": self.metrics,
+            "hook": self.hooks if self.hooks.hooks else None,
+            **self._writers,
+        }
+        return {name: output.state for name, output in outputs.items() if output is not None}
 
-    def _rebuild_windows(self, workers: Sequence[DeviceWorker]) -> None:
-        """Rebuild the windows of devices from their recordings, as soon as all kernels are compiled."""
-        self._ready.all.wait()
-        for worker in workers:
-            worker.rebuild()
-
-    def _load_viewer_history(self, device: str) -> HistoryTable | None:
+    def _read_viewer_history(self, device: str) -> HistoryTable | None:
         """Return the stored results that the viewer shows when it opens, or None if there are none.
 
         The thread of the viewer calls this function. A device whose samples bring their own times, such as a replayed
         recording, has no stored results.
         """
         history_s = self.config.viewer.history
-        if self.history is None or history_s is None or device in self._self_timed_devices:
+        self_timed = any(worker.name == device and worker.driver.times_are_unix for worker in self.workers)
+        if self.history is None or history_s is None or self_timed:
             return None
         assert isinstance(history_s, float)
-        now_s = time.time()
-        try:
-            with open_history(self.history.path) as reader:
-                return past.read_history(reader, device, TimeRange(now_s - history_s, now_s))
-        except (NotReady, RecordingError):  # no results yet; the writer reports errors of the file
-            return None
+        return self.history.read_newest(device, history_s)
 
-    def _answer_history_query(self, device: str, parameters: str) -> bytes:
-        """Answer a query for the history of a device. Each query calls this function in a thread of its own.
-
-        Raises
-        ------
-        ImuError
-            The query is invalid, or the history has no data to answer it.
-        """
-        assert self.history is not None
-        assert self._history_output is not None
-        asked = parse_query(parameters, time.time())
-        with open_history(self.history.path) as reader:
-            found = past.read_history(reader, device, asked.span, asked.selects, asked.step_s)
-            newest_s = reader.newest_s(device)
-        return HistoryMessage.reply(found, asked, newest_s, self._history_output.received.get(device, 0)).encode()
-
-    def _compile_kernels(self) -> None:
-        """Compile the kernels in a thread, so that a first start delays neither samples nor status."""
-        begun_s = time.monotonic()
-        flags = {kernel_compilation.WINDOW: self._ready.window, kernel_compilation.FIT: self._ready.fit}
-        try:
-            for part in kernel_compilation.prepare_kernels(kernel_compilation.SERVICE, self._show_progress):
-                if part in flags:
-                    flags[part].set()
-                    self._wake.set()
-            if self._ready.progress:
-                _log.info("kernels are compiled and kept for the next start", seconds=round(time.monotonic() - begun_s))
-        except OSError as error:
-            _log.warning("compiled kernels cannot be kept, the next start will be slow again", error=str(error))
-        finally:
-            self._ready.progress = ""
-            # the main loop compiles the kernels that failed here, or ends with their error; without these flags it
-            # would wait forever
-            for flag in (self._ready.window, self._ready.fit, self._ready.all):
-                flag.set()
-            self._wake.set()
-
-    def _show_progress(self, progress: kernel_compilation.Progress) -> None:
-        """Show the progress of the compilation in the status, and log its begin."""
-        if not self._ready.progress:
-            _log.info("compiling kernels, as none are kept for this version on this machine")
-        self._ready.progress = f"{progress} {progress.bar}"
-        self._wake.set()
+    def _rebuild_windows(self, workers: Sequence[DeviceWorker]) -> None:
+        """Rebuild the windows of devices from their recordings, as soon as all kernels are compiled."""
+        self._ready.all.wait()
+        for worker in workers:
+            worker.rebuild()
 
     def _build_device(self, device: Device) -> "tuple[DeviceWorker, VirtualImu | None]":
         """Build the worker of a device, and its virtual IMU if the device is simulated, without opening either."""
@@ -303,8 +244,6 @@ class Service:
     def _register_device(self, worker: DeviceWorker, imu: "VirtualImu | None") -> None:
         """Add a worker, and its virtual IMU if the device is simulated, to the service."""
         self.workers = [*self.workers, worker]
-        if worker.driver.times_are_unix:
-            self._self_timed_devices.add(worker.name)
         if imu is not None:
             self.virtual[worker.name] = imu
 
@@ -317,7 +256,7 @@ class Service:
             change = reload.compare_with_file(self.config, {worker.name: worker.model for worker in self.workers})
             built = [self._build_device(device) for device in change.added]
         except ConfigError as error:
-            _log.error("not reloaded, all goes on as it was", error=str(error))
+            _log.error("not reloaded, the running configuration stays in force", error=str(error))
         else:
             self._apply(change, built)
             (_log.warning if change.restart else _log.info)("reloaded", text=change.text())
@@ -335,11 +274,11 @@ class Service:
             next(worker for worker in self.workers if worker.name == device.name).set_limits(device)
         self.config = change.config
         self.hooks.hooks = change.config.hooks
-        LEVEL.name = change.config.log.level
+        set_log_level(change.config.log.level)
         for worker, imu in built:
             self._register_device(worker, imu)
         order = [device.name for device in change.config.devices]
-        self.workers.sort(key=lambda worker: order.index(worker.name))
+        self.workers = sorted(self.workers, key=lambda worker: order.index(worker.name))
         if self.viewer is not None:
             self.viewer.set_devices(_device_infos(change.config.devices))
         for worker, imu in built:
@@ -368,7 +307,6 @@ class Service:
         if self.recorder is not None:
             self.recorder.remove(worker.name)
             self._work_until(lambda: self.recorder is None or not self.recorder.is_recording(worker.name))
-        self._self_timed_devices.discard(worker.name)
         for output in self.outputs:
             output.device_removed(worker.name)
 
@@ -405,9 +343,9 @@ class Service:
     def _publish_recorder_events(self) -> None:
         """Publish the events of the recorder."""
         workers = {worker.name: worker for worker in self.workers}
-        for told in self.recorder.take_events() if self.recorder is not None else ():
-            if told.device in workers:
-                workers[told.device].publish_event(told.kind, told.text)
+        for event in self.recorder.take_events() if self.recorder is not None else ():
+            if event.device in workers:
+                workers[event.device].publish_event(event.kind, event.text)
 
     def _announce_viewer_url(self) -> None:
         """Log the address of the viewer's web page each time it changes. A viewer in a window has no address."""
@@ -422,67 +360,17 @@ class Service:
             if isinstance(output, TableOutput):
                 output.viewer_at(page)
 
-    def _handle_commands(self) -> None:
-        """Execute the commands that arrived over zenoh since the last round."""
-        workers = {worker.name: worker for worker in self.workers}
-        while not self.zenoh.commands.empty():
-            command = self.zenoh.commands.get_nowait()
-            if command.device in workers:
-                self._execute_command(command, workers[command.device])
-            else:
-                command.refuse("the device was taken out of the configuration")
-
-    def _execute_command(self, command: Command, worker: DeviceWorker) -> None:
-        """Execute one command for a device, and answer it."""
-        match command.verb:
-            case "reset":
-                worker.reset()
-                received = worker.driver.counts.received
-                message = ResetMessage.of(worker.name, worker.timeline.now_unix_s(), received, "the window is empty")
-                command.answer(message.encode())
-                _log.info("reset", device=worker.name)
-            case "reconcile":
-                self._reconcile(command, worker)
-            case other:
-                command.refuse(f'unknown command "{other}"; known are reset, reconcile')
-
-    def _reconcile(self, command: Command, worker: DeviceWorker) -> None:
-        """Start a reconciliation with a copy of the window; a thread of its own sends the answer."""
-        held = worker.window_snapshot()
-        if held is None:
-            command.refuse("no samples yet")
-            return
-        received, device = worker.driver.counts.received, worker.device
-        newest_s = worker.timeline.unix_s(worker.pipeline.newest_ns)
-        job = Job(worker.name, newest_s, received, *held, device.model, device.reconcile_folder)
-        self._reconciler.start(job, command)
-
-    def _publish_reconcile_events(self) -> None:
-        """Publish an event for each reconciliation that has finished."""
-        workers = {worker.name: worker for worker in self.workers}
-        for finished in self._reconciler.take():
-            if finished.device in workers:
-                workers[finished.device].publish_event("reconciled", finished.text)
-
     def _close(self) -> None:
         """Stop the devices, publish their remaining samples, and close all outputs."""
         self._unit.stopping()
         try:
             self._drain()
         finally:
-            self._reconciler.close()
-            self._publish_reconcile_events()
-            if self.recorder is not None:
-                self.recorder.close()
-            self.hooks.close()
-            if self.metrics is not None:
-                self.metrics.close()
-            if self.viewer is not None:
-                self.viewer.close()
-            self.zenoh.close()
-            if self.history is not None and self._history_output is not None:
-                self._history_output.end()
-                self.history.close()
+            self._commands.close()
+            self._commands.publish_reconciled({worker.name: worker for worker in self.workers})
+            for output in (self.recorder, self.hooks, self.metrics, self.viewer, self.zenoh, self.history):
+                if output is not None:
+                    output.close()
 
     def _drain(self) -> None:
         """Stop the readers, and publish the samples that are left in the ring buffers."""
@@ -531,13 +419,6 @@ def memory_bytes() -> int:
     import resource
 
     return pages * resource.getpagesize()
-
-
-def _build_history_writer(config: Config) -> HistoryWriter | None:
-    """Return the writer of the history file, or None if no history is kept."""
-    if config.storage is None or not config.storage.history:
-        return None
-    return HistoryWriter(config.storage.folder / FILE_NAME, time.time)
 
 
 def _build_metrics_output(config: Config) -> "MetricsOutput | None":

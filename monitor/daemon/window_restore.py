@@ -17,7 +17,7 @@ from drivers.sample import AXES, Event, Ints, SampleBlock, make_block
 from drivers.timing.sample_clock import LastSample, SampleClock
 from monitor.daemon.device_timeline import DeviceTimeline
 from monitor.daemon.pipeline import DevicePipeline
-from monitor.daemon.storage.recorder import RecordingTail
+from monitor.daemon.storage.recording_tail import RecordingTail
 from monitor.settings.loading import Device
 
 MIN_REPLAY_S: Final = 600.0

@@ -166,12 +166,12 @@ def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None
 def test_a_damaged_history_is_said_in_the_status_and_to_who_asks(asked: tuple[Service, Any]) -> None:
     service, client = asked
     assert service.history is not None
-    path = service.history.path
+    path = service.history.writer.path
     path.with_name(FILE_NAME + "-wal").unlink(missing_ok=True)
     path.write_bytes(b"no more" * 1000)
     (reply,) = client.get("imu/bench-1/history", timeout=PATIENCE_S)
     assert "damaged" in json.loads(bytes(reply.err.payload))["error"]
-    service.history.put_event("bench-1", StoredEvent(T0, "moved", "once more"))
+    service.history.writer.put_event("bench-1", StoredEvent(T0, "moved", "once more"))
     wait_for(lambda: "damaged" in service.states()["history"])
     (aside,) = path.parent.glob(f"{FILE_NAME}.aside-*Z")
     assert aside.read_bytes() == b"no more" * 1000

@@ -2,18 +2,18 @@
 
 The main loop stores the newest health and estimate of each device and continues. A thread of the server answers each
 scrape from the stored values, so a scrape does not delay the main loop. A scrape that hangs is ended after TIMEOUT_S.
-If AT_ONCE scrapes are active, the next one is rejected. If the port is in use, the output reports it and tries again.
+If MAX_SCRAPES scrapes are active, the next one is rejected. If the port is in use, the output reports it and retries.
 
 All values are in SI units. A coefficient with an upper bound only has ``hi`` and no value. A coefficient that could not
 be estimated has no entry.
 """
 
+import socket
 import socketserver
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from http.server import BaseHTTPRequestHandler
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
@@ -28,6 +28,7 @@ from monitor.noise.standard_terms import STANDARD_TERMS
 from monitor.settings.loading import Metrics
 
 if TYPE_CHECKING:
+    from prometheus_client import CollectorRegistry, MetricsHandler
     from prometheus_client.core import Metric
 
 RETRY_S: Final = 5.0
@@ -177,14 +178,11 @@ class _Server(socketserver.ThreadingTCPServer):
     daemon_threads = True
     block_on_close = False
 
-    def __init__(self, address: tuple[str, int], registry: Any) -> None:
-        self.registry = registry
-        self.room = threading.Semaphore(MAX_SCRAPES)
+    def __init__(self, address: tuple[str, int], registry: "CollectorRegistry") -> None:
+        self._free = threading.Semaphore(MAX_SCRAPES)
         if ":" in address[0]:
-            import socket
-
             self.address_family = socket.AF_INET6
-        super().__init__(address, _Scrape)
+        super().__init__(address, _make_handler(registry))
 
     def get_request(self) -> Any:
         """Accept the next connection; if there are no file descriptors left, pause before the next attempt."""
@@ -196,13 +194,13 @@ class _Server(socketserver.ThreadingTCPServer):
 
     def process_request(self, request: Any, client_address: Any) -> None:
         """Start a thread for a scrape, or reject the scrape if too many are active."""
-        if not self.room.acquire(blocking=False):
+        if not self._free.acquire(blocking=False):
             self.shutdown_request(request)
             return
         try:
             super().process_request(request, client_address)
         except RuntimeError:  # the system allows no more threads
-            self.room.release()
+            self._free.release()
             raise
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -210,35 +208,27 @@ class _Server(socketserver.ThreadingTCPServer):
         try:
             super().process_request_thread(request, client_address)
         finally:
-            self.room.release()
+            self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         """Ignore the error of a connection that its client has closed."""
 
 
-class _Scrape(BaseHTTPRequestHandler):
-    """Handler of one scrape."""
+def _make_handler(registry: "CollectorRegistry") -> "type[MetricsHandler]":
+    """Return a handler that serves the metrics of a registry at PATH only, within TIMEOUT_S."""
+    from prometheus_client import MetricsHandler
 
-    timeout = TIMEOUT_S
-    server: _Server
+    class Handler(MetricsHandler):
+        timeout = TIMEOUT_S
 
-    def do_GET(self) -> None:
-        """Send the metrics in the format that the client accepts."""
-        from prometheus_client.exposition import choose_encoder
+        def do_GET(self) -> None:  # noqa: N802 - the library's name
+            if self.path.partition("?")[0] == PATH:
+                super().do_GET()
+            else:
+                self.send_error(404, f"the metrics are at {PATH}")
 
-        if self.path.partition("?")[0] != PATH:
-            self.send_error(404, f"only {PATH} is here")
-            return
-        encode, kind = choose_encoder(self.headers.get("Accept", ""))
-        body = encode(self.server.registry)
-        self.send_response(200)
-        self.send_header("Content-Type", kind)
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
-        self.wfile.write(body)
-
-    def log_message(self, format: str, *arguments: Any) -> None:  # noqa: A002 - the library's name
-        """Log nothing, because there is a scrape every few seconds."""
+    Handler.registry = registry
+    return Handler
 
 
 def _device_metrics(healths: Mapping[str, Health]) -> "Iterator[Metric]":

@@ -185,7 +185,7 @@ def test_two_daemons_on_one_folder_record_each_sample_once(tmp_path: Path) -> No
             first.process.send_signal(signal.SIGKILL)
             first.process.wait()
             had = numbers(folder / "imu")
-            eventually(lambda: second.says("recording_back", "recording goes on"), second.log())
+            eventually(lambda: second.says("recording_back", "recording continues"), second.log())
             eventually(lambda: len(numbers(folder / "imu")) > len(had) + 2 * RATE, "the second records")
             assert second.end() == 0
             assert "Traceback" not in first.log() + second.log()

@@ -55,10 +55,10 @@ class Recorder(event.Listener):  # type: ignore[misc]
 
 def stages() -> Iterator[str]:
     """Yield the name of each part after it has been compiled by this process."""
-    from monitor.daemon import kernel_compilation
+    from monitor.daemon import kernel_parts
 
     yield "imports"
-    for group in kernel_compilation.GROUPS:
+    for group in kernel_parts.GROUPS:
         for part in group.parts:
             part.prepare()
             yield part.name

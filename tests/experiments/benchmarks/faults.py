@@ -257,7 +257,7 @@ def cable(folder: Path, times: int) -> Outcome:
             rig.board.plug()
             wait_for(lambda: rig.station.driver.state == "running", "samples after it")
         said = rig.said.wait("the device is gone")
-        return rig.outcome(f"cable out and in, {times} times", said)
+        return rig.outcome(f"cable unplugged and plugged in, {times} times", said)
 
 
 def garbage(folder: Path, times: int) -> Outcome:
@@ -278,7 +278,7 @@ def garbage(folder: Path, times: int) -> Outcome:
         rig.board.spoil = spoil
         wait_for(lambda: done >= bursts, "the bursts", 10.0 * PATIENCE_S)
         rig.board.spoil = lambda data: data
-        return rig.outcome(f"{bursts} bursts of rubbish", _at_worst(rig))
+        return rig.outcome(f"{bursts} bursts of random bytes", _at_worst(rig))
 
 
 def half_baud(folder: Path, times: int) -> Outcome:
@@ -288,7 +288,7 @@ def half_baud(folder: Path, times: int) -> Outcome:
         said = rig.said.wait("no sample in")
         rig.board.spoil = lambda data: data
         rig.well()
-        return rig.outcome("half the baud rate, until it is said", said)
+        return rig.outcome("half the baud rate, until the message", said)
 
 
 def at_half_the_baud_rate(data: bytes) -> bytes:
@@ -415,7 +415,7 @@ def full_disk(folder: Path, times: int) -> Outcome:
             rig.flows()
             ballast.unlink()
             wait_for(lambda: rig.service.states()["recording"] == "ok", "the recording")
-            outcome = rig.outcome("disk full, then room again", said)
+            outcome = rig.outcome("disk full, then free again", said)
         _check_recording(small / "store", outcome)
         return outcome
     finally:
@@ -507,7 +507,7 @@ def router(folder: Path, times: int) -> Outcome:
             process = _router(endpoint)
             back = time.monotonic()
             wait_for(lambda: heard[-1] > back, "a status after it")
-            note = f"heard again {heard[-1] - back:.1f} s after the router was back"
+            note = f"messages again {heard[-1] - back:.1f} s after the router's start"
             return rig.outcome("router killed and started again", said, note)
     finally:
         process.kill()

@@ -14,7 +14,7 @@ from drivers.sample import concatenate_blocks, make_block
 from drivers.settings_model import read_settings
 from monitor.daemon import device_worker
 from monitor.daemon.device_worker import DeviceWorker
-from monitor.daemon.pipeline import KernelReadiness
+from monitor.daemon.kernel_readiness import KernelReadiness
 from monitor.estimation.fit.coefficients import Status
 from monitor.settings import loading as settings
 from monitor.settings.loading import Device, Driver

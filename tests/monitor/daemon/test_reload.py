@@ -229,7 +229,7 @@ def test_a_hang_up_reloads_and_systemd_is_told(tmp_path: Path) -> None:
     lines = [json.loads(line) for line in said.decode().splitlines()]
     told = [(line["event"], line["level"]) for line in lines if "reloaded" in line["event"]]
     # the new level is warning: what was done is no warning, that the file is wrong is more than one
-    assert told == [("not reloaded, all goes on as it was", "error")]
+    assert told == [("not reloaded, the running configuration stays in force", "error")]
     order = [line.partition("=")[0] for line in systemd.heard if not line.startswith(("STATUS=", "WATCHDOG="))]
     again = ["RELOADING", "MONOTONIC_USEC", "READY"]
     assert order == ["READY", *again, *again, "STOPPING"]

@@ -14,7 +14,7 @@ from structlog.testing import capture_logs
 from drivers.recordings import save_samples
 from drivers.sample import Event
 from monitor.common.health import Health
-from monitor.daemon import kernel_compilation
+from monitor.daemon import kernel_compilation, kernel_parts
 from monitor.daemon.output import Output
 from monitor.daemon.outputs import TableOutput
 from monitor.daemon.service import Service
@@ -122,7 +122,7 @@ def test_a_recording_that_waits_for_kernels_leaves_nothing_outside_of_its_own_ti
     n, compiled, prepare = 2000, threading.Event(), kernel_compilation.prepare_kernels
 
     def held_back(
-        group: kernel_compilation.KernelGroup, tell: Callable[[kernel_compilation.Progress], None]
+        group: kernel_parts.KernelGroup, tell: Callable[[kernel_compilation.Progress], None]
     ) -> Iterator[str]:
         compiled.wait(PATIENCE_S)
         yield from prepare(group, tell)
@@ -279,9 +279,9 @@ def test_a_recording_that_shows_no_rate_says_so(tmp_path: Path) -> None:
 
 def test_kernels_that_cannot_be_kept_hold_nothing_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full_disk(
-        _group: kernel_compilation.KernelGroup, _tell: Callable[[kernel_compilation.Progress], None]
+        _group: kernel_parts.KernelGroup, _tell: Callable[[kernel_compilation.Progress], None]
     ) -> Iterator[str]:
-        yield kernel_compilation.WINDOW
+        yield kernel_parts.WINDOW
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(kernel_compilation, "prepare_kernels", full_disk)

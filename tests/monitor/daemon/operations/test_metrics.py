@@ -127,7 +127,7 @@ def test_a_port_that_is_taken_is_said_and_tried_again(monkeypatch: pytest.Monkey
 
 
 def test_those_who_connect_and_say_nothing_keep_nobody_out_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("monitor.daemon.operations.metrics._Scrape.timeout", 1.0)
+    monkeypatch.setattr("monitor.daemon.operations.metrics.TIMEOUT_S", 1.0)
     with serving() as output:
         wait_for(lambda: output.state == "ok")
         mute = [socket.create_connection(("127.0.0.1", output.port)) for _ in range(3 * MAX_SCRAPES)]

@@ -19,8 +19,8 @@ from drivers.recordings import load_samples, segment
 from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentWriter
 from drivers.sample import Chunk, SampleBlock, concatenate_blocks, make_block
 from monitor.daemon.device_worker import DeviceWorker
-from monitor.daemon.pipeline import KernelReadiness
-from monitor.daemon.storage import recorder as room
+from monitor.daemon.kernel_readiness import KernelReadiness
+from monitor.daemon.storage import recorder, recording_track, retention
 from monitor.daemon.storage.recorder import Recorder, origin
 from monitor.settings.loading import Device, Driver, Storage
 from tests.support.loopback_link import LoopbackLink
@@ -45,14 +45,15 @@ def written(folder: Path) -> list[segment.SegmentPiece]:
 
 def all_written(keeper: Recorder) -> None:
     """Wait until the recorder has written all that it was given."""
-    wait_for(lambda: not any(track.waiting or track.held for track in keeper._tracks.values()))
+    wait_for(lambda: not any(track.waiting for track in keeper._tracks.values()))
 
 
 @pytest.fixture(autouse=True)
 def _brisk(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(room, "WRITE_INTERVAL_S", 0.02)
-    monkeypatch.setattr(room, "RETRY_S", 0.1)
-    monkeypatch.setattr(room, "DELETE_INTERVAL_S", 0.05)
+    monkeypatch.setattr(recorder, "WRITE_INTERVAL_S", 0.02)
+    monkeypatch.setattr(recorder, "RETRY_S", 0.1)
+    monkeypatch.setattr(recording_track, "RETRY_S", 0.1)
+    monkeypatch.setattr(recorder, "DELETE_INTERVAL_S", 0.05)
 
 
 def test_every_value_counter_and_hole_comes_back(tmp_path: Path) -> None:
@@ -212,7 +213,7 @@ def test_a_disk_that_fails_stops_the_recording_with_an_event_until_it_can_go_on(
 
 
 def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, monkeypatch) -> None:
-    monkeypatch.setattr(room, "MAX_QUEUE_BYTES", 500 * room.SAMPLE_BYTES)
+    monkeypatch.setattr(recording_track, "MAX_QUEUE_BYTES", 500 * recording_track.SAMPLE_BYTES)
     keeper = Recorder(Storage(folder=tmp_path), [SAMPLES], Broken)
     keeper.start()
     for first in range(0, 20_000, 2000):
@@ -242,7 +243,7 @@ def test_old_segments_go_when_both_their_names_and_their_number_say_so(tmp_path:
     for name in names:
         (folder / name).write_bytes(b"x")
     (folder / "notes.txt").write_text("mine")
-    room.retention.delete_old([folder], keep_s=350.0, segment_s=100.0)
+    retention.delete_old([folder], keep_s=350.0, segment_s=100.0)
     assert [path.name for path in segment.list_segments(folder)] == names[5:]
     assert (folder / "notes.txt").exists()
 
@@ -254,7 +255,7 @@ def test_neither_a_clock_set_wrong_nor_many_restarts_delete_what_is_new(tmp_path
     began = [1.7e9 + step_s * i for i in range(9)] + [1.7e9 + newest_s]
     for i, unix_s in enumerate(began):
         (folder / segment.segment_name(i, unix_s)).write_bytes(b"x")
-    room.retention.delete_old([folder], keep_s=2000.0 if step_s > 1.0 else 350.0, segment_s=100.0)
+    retention.delete_old([folder], keep_s=2000.0 if step_s > 1.0 else 350.0, segment_s=100.0)
     assert len(segment.list_segments(folder)) == 10
 
 
@@ -265,21 +266,21 @@ def test_the_oldest_of_all_devices_go_while_the_disk_is_too_full(tmp_path: Path,
         for i in range(5):
             (folder / segment.segment_name(i, 1.7e9 + 100.0 * i + at)).write_bytes(b"x")
     left = lambda: [len(segment.list_segments(folder)) for folder in folders]  # noqa: E731
-    monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.1 * sum(left()))
-    assert room.retention.delete_until_free(tmp_path, folders, share=0.75) == ""
+    monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.1 * sum(left()))
+    assert retention.delete_until_free(tmp_path, folders, share=0.75) == ""
     assert left() == [3, 4]
-    assert "no older segment is left" in room.retention.delete_until_free(tmp_path, folders, share=0.2)
+    assert "no older segment is left" in retention.delete_until_free(tmp_path, folders, share=0.2)
     assert left() == [2, 2]
 
 
 def test_a_disk_that_others_have_filled_stops_the_recording(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.95)
+    monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.95)
     keeper = Recorder(Storage(folder=tmp_path), [SAMPLES])
     keeper.start()
     keeper.samples("bench", rows(0, 10), 0)
     wait_for(lambda: "95 % full" in keeper.state)
     keeper.samples("bench", rows(10, 10), 0)  # waits until there is room
-    monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.5)
+    monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.5)
     wait_for(lambda: keeper.state == "ok")
     keeper.close(PATIENCE_S)
     assert len(concatenate_blocks([piece.samples for piece in written(tmp_path / "bench")])) == 20
@@ -501,7 +502,7 @@ def test_a_second_recorder_without_counts_goes_on_by_time_and_says_what_is_missi
 
 
 def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.1)
+    monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.1)
     first = Recorder(Storage(folder=tmp_path), [SAMPLES])
     first.start()
     first.samples("bench", rows(0, 100), 0)
@@ -509,7 +510,7 @@ def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
     for i in range(2, 8):
         (tmp_path / "bench" / segment.segment_name(i, 1.0e9)).write_bytes(b"old")
     (tmp_path / "bench" / "00000099_x.arrows.part").write_bytes(b"of the first")
-    monkeypatch.setattr(room.retention, "used_disk_share", lambda _: 0.99)
+    monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.99)
     monkeypatch.setattr(first, "_delete_old", lambda: None)
     before = sorted(path.name for path in tmp_path.rglob("*"))
     second = Recorder(Storage(folder=tmp_path, keep_s=10.0, segment_s=10.0), [SAMPLES])
@@ -582,7 +583,7 @@ def test_a_file_that_is_changed_while_it_is_written_is_noticed_and_another_begun
     tamper(path)
     wait_for(lambda: "ok, but" in keeper.state)
     assert f"{path} was " in keeper.state
-    assert "with 100 rows in it; a new one is begun" in keeper.state
+    assert "with 100 rows in it; a new file is begun" in keeper.state
     assert [one.kind for one in keeper.take_events()] == ["recording_stopped", "recording_back"]
     keeper.samples("bench", rows(100, 100), 0)
     wait_for(lambda: any(one != path and one.stat().st_size > 9000 for one in segment.list_segments(folder)))
@@ -661,7 +662,7 @@ def test_something_else_in_place_of_the_folder_is_said_until_it_is_gone(tmp_path
 
 
 def test_a_folder_that_cannot_be_used_costs_only_what_has_no_room_in_memory(tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.setattr(room, "MAX_QUEUE_BYTES", 500 * room.SAMPLE_BYTES)
+    monkeypatch.setattr(recording_track, "MAX_QUEUE_BYTES", 500 * recording_track.SAMPLE_BYTES)
     (tmp_path / "store").write_text("in the way")
     keeper = Recorder(Storage(folder=tmp_path / "store"), [SAMPLES])
     keeper.start()

@@ -1,0 +1,83 @@
+"""Execution of the commands that arrive over zenoh: ``reset`` and ``reconcile``."""
+
+from collections.abc import Mapping
+
+import structlog
+
+from monitor.daemon.device_worker import DeviceWorker
+from monitor.daemon.operations.live_reconcile import Job, Reconciler
+from monitor.publishing.messages.results import ResetMessage
+from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
+
+_log = structlog.get_logger("imu-monitor")
+
+
+class CommandHandler:
+    """Executor of the commands for all devices.
+
+    Parameters
+    ----------
+    zenoh : ZenohPublisher
+        Publisher with the queue of commands.
+    reconciler : Reconciler
+        Executes ``command/reconcile``.
+    """
+
+    def __init__(self, zenoh: ZenohPublisher, reconciler: Reconciler) -> None:
+        self._zenoh = zenoh
+        self._reconciler = reconciler
+
+    def handle_commands(self, workers: Mapping[str, DeviceWorker]) -> None:
+        """Execute the commands that arrived since the last call.
+
+        Parameters
+        ----------
+        workers : mapping of str to DeviceWorker
+            Worker of each device by its name.
+        """
+        while not self._zenoh.commands.empty():
+            command = self._zenoh.commands.get_nowait()
+            if command.device in workers:
+                self._execute(command, workers[command.device])
+            else:
+                command.refuse("the device was removed from the configuration")
+
+    def publish_reconciled(self, workers: Mapping[str, DeviceWorker]) -> None:
+        """Publish an event for each reconciliation that has finished since the last call.
+
+        Parameters
+        ----------
+        workers : mapping of str to DeviceWorker
+            Worker of each device by its name.
+        """
+        for finished in self._reconciler.take():
+            if finished.device in workers:
+                workers[finished.device].publish_event("reconciled", finished.text)
+
+    def close(self) -> None:
+        """Kill the running reconciliations and refuse their queries."""
+        self._reconciler.close()
+
+    def _execute(self, command: Command, worker: DeviceWorker) -> None:
+        """Execute one command for a device, and answer it."""
+        match command.verb:
+            case "reset":
+                worker.reset()
+                now_s, received = worker.timeline.now_unix_s(), worker.driver.counts.received
+                command.answer(ResetMessage.of(worker.name, now_s, received, "the window is empty").encode())
+                _log.info("reset", device=worker.name)
+            case "reconcile":
+                self._reconcile(command, worker)
+            case other:
+                command.refuse(f'unknown command "{other}"; known commands are reset and reconcile')
+
+    def _reconcile(self, command: Command, worker: DeviceWorker) -> None:
+        """Start a reconciliation with a copy of the window; a thread of its own sends the answer."""
+        window = worker.window_snapshot()
+        if window is None:
+            command.refuse("no samples yet")
+            return
+        received, device = worker.driver.counts.received, worker.device
+        newest_s = worker.timeline.unix_s(worker.pipeline.newest_ns)
+        job = Job(worker.name, newest_s, received, *window, device.model, device.reconcile_folder)
+        self._reconciler.start(job, command)

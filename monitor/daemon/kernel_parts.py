@@ -1,0 +1,130 @@
+"""Numerical kernels that are compiled before they are needed, in parts, with a call of each kernel of a part.
+
+A call with the argument types of the program makes Numba compile a kernel, or load the kernel from the cache on disk.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from drivers.extras import missing_packages
+from drivers.sample import SampleBlock, make_block
+from monitor.drift.compensation.arma import fit_arma
+from monitor.drift.compensation.compensator import Compensator
+from monitor.drift.thermal import thermal_response
+from monitor.estimation.detection.change_detection import ChangeDetector
+from monitor.estimation.detection.signal_monitor import SignalMonitor
+from monitor.estimation.estimator import Estimator
+
+
+@dataclass(frozen=True, slots=True)
+class KernelPart:
+    """Kernels that are compiled together."""
+
+    name: str  # name of the computation, as shown to the user
+    prepare: Callable[[], None]  # calls each kernel with every signature that the program uses
+
+
+@dataclass(frozen=True, slots=True)
+class KernelGroup:
+    """Parts that are needed together. A part comes after the parts whose kernels it uses."""
+
+    name: str
+    parts: tuple[KernelPart, ...]
+
+
+def _samples(n: int) -> SampleBlock:
+    """Return a block of ``n`` samples with value zero."""
+    return make_block(np.arange(n, dtype=np.int64), np.zeros((n, 6)))
+
+
+def _call_window() -> None:
+    Estimator(100.0, 1.0).update(_samples(100))
+
+
+def _call_fit() -> None:
+    estimator = Estimator(100.0, 1.0)
+    estimator.update(_samples(100))
+    estimator.get()
+
+
+def _call_motion_detection() -> None:
+    SignalMonitor(100.0, alarms_per_day=0.0).update(_samples(100))
+
+
+def _call_change_detection() -> None:
+    SignalMonitor(100.0).update(_samples(100))
+    ChangeDetector(100.0).restart()
+
+
+def _call_compensation() -> None:
+    compensator = Compensator(100.0)
+    compensator.compensate(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))
+    compensator.set_model(0, fit_arma(*compensator.identification_data(0), [(2, 1)]))
+    compensator.compensate(np.zeros((1, 6)), lost=1)
+    _ = compensator.error
+
+
+def _call_slow_statistics() -> None:
+    estimator = Estimator(100.0, 1.0)
+    estimator.update(_samples(100))
+    estimator.restart(0, 10)
+    while estimator.step_slow_statistics() is None:
+        pass
+
+
+def _call_refit() -> None:
+    Estimator(100.0, 1.0, every_sample=True).update(_samples(100))
+
+
+def _call_temperature_lag() -> None:
+    thermal_response.first_order_lag(np.zeros(2), 0.5)
+
+
+def _call_analysis() -> None:
+    from monitor.estimation.analysis import analyze  # imported here because the service does not need it
+
+    analyze([_samples(100)], 100.0)
+
+
+def _call_reconciliation() -> None:
+    from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
+    from monitor.noise.model import NoiseModel
+    from monitor.reconcile.reconcile import Recording, reconcile  # imported here because the service does not need it
+
+    model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4), BiasInstability(B=3e-5), RateRandomWalk(K=1e-6))})
+    series, rng = model.simulate(4200, 10.0, 1)[:, 2], np.random.default_rng(1)
+    size = float(np.std(series))
+    series += 4.0 * size * (rng.integers(0, 2, 42).repeat(100) + (np.arange(4200) > 2100))
+    series[::500] += 20.0 * size
+    reconcile(Recording({"gz": series}, 10.0, np.linspace(20.0, 30.0, 4200)), model, seed=1)
+
+
+WINDOW: Final = "Allan deviation"
+"""Name of the part after which a window can be filled."""
+FIT: Final = "noise coefficients"
+"""Name of the part after which coefficients can be fitted."""
+SERVICE: Final = KernelGroup(
+    "service",
+    (
+        KernelPart(WINDOW, _call_window),
+        KernelPart("motion detection", _call_motion_detection),
+        KernelPart(FIT, _call_fit),
+        KernelPart("change detection", _call_change_detection),
+        KernelPart("drift compensation", _call_compensation),
+        KernelPart("total and Hadamard deviation", _call_slow_statistics),
+        KernelPart("refit at every sample", _call_refit),
+        KernelPart("temperature lag", _call_temperature_lag),
+    ),
+)
+"""Parts that the running service needs, in the order in which it needs them."""
+_ANALYSIS: Final = KernelPart("analysis of recordings", _call_analysis)
+_RECONCILIATION: Final = KernelPart("reconciliation", _call_reconciliation)
+COMMANDS: Final = KernelGroup(
+    "commands", (_ANALYSIS,) if missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION)
+)
+"""Parts that only the commands on recordings need. A few kernels of rare cases are compiled at their first call."""
+GROUPS: Final = (SERVICE, COMMANDS)
+"""All groups."""

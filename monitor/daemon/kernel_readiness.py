@@ -1,0 +1,68 @@
+"""Flags of the compiled kernels of the service, and their compilation in the background."""
+
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import Final
+
+import structlog
+
+from monitor.daemon import kernel_compilation, kernel_parts
+
+MAX_INTERPRETED_HZ: Final = 250.0
+"""Maximum total sample rate of the devices whose kernels are interpreted. A sample takes up to 0.8 ms."""
+
+_log = structlog.get_logger("imu-monitor")
+
+
+@dataclass(slots=True)
+class KernelReadiness:
+    """Flags of the compiled kernels. Until a flag is set, Python interprets the kernels of devices with low rates."""
+
+    window: threading.Event = field(default_factory=threading.Event)
+    """Set if the kernels of the Allan deviation are compiled."""
+    fit: threading.Event = field(default_factory=threading.Event)
+    """Set if the kernels of the noise coefficients are compiled."""
+    all: threading.Event = field(default_factory=threading.Event)
+    """Set if all kernels of the service are compiled."""
+    progress: str = ""
+    """Progress of the compilation as one line of text; empty if nothing is being compiled."""
+    interpretable_hz: float = MAX_INTERPRETED_HZ
+    """Total sample rate of further devices whose kernels can be interpreted."""
+
+    def reserve_interpreter(self, rate_hz: float) -> bool:
+        """Return True if the kernels of one more device of this sample rate can be interpreted."""
+        if rate_hz > self.interpretable_hz:
+            return False
+        self.interpretable_hz -= rate_hz
+        return True
+
+    def compile(self, wake: threading.Event) -> None:
+        """Compile the kernels, and set each flag and ``wake`` as soon as its kernels are compiled; call it in a thread.
+
+        If the compilation fails, all flags are set nevertheless. The main loop then compiles the kernels that are
+        missing, or ends with their error. Without the flags it would wait forever.
+        """
+        begin_s = time.monotonic()
+
+        def show(progress: kernel_compilation.Progress) -> None:
+            if not self.progress:
+                _log.info("compiling kernels, because none are kept for this version on this machine")
+            self.progress = f"{progress} {progress.bar}"
+            wake.set()
+
+        try:
+            for part in kernel_compilation.prepare_kernels(kernel_parts.SERVICE, show):
+                flag = {kernel_parts.WINDOW: self.window, kernel_parts.FIT: self.fit}.get(part)
+                if flag is not None:
+                    flag.set()
+                    wake.set()
+            if self.progress:
+                _log.info("kernels are compiled and kept for the next start", seconds=round(time.monotonic() - begin_s))
+        except OSError as error:
+            _log.warning("compiled kernels cannot be kept, the next start will be slow again", error=str(error))
+        finally:
+            self.progress = ""
+            for flag in (self.window, self.fit, self.all):
+                flag.set()
+            wake.set()

@@ -1,0 +1,71 @@
+"""End of an existing recording, from which the daemon resumes after a restart."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from drivers.errors import ConfigError, RecordingError
+from drivers.recordings import segment
+from drivers.recordings.segment import SegmentMetadata, SegmentPiece
+
+
+@dataclass(frozen=True, slots=True)
+class RecordingTail:
+    """End of the recording of one device."""
+
+    origin: SegmentMetadata
+    paths: tuple[Path, ...]  # oldest first
+    newest: SegmentPiece
+
+    def pieces(self, span_s: float) -> Iterator[SegmentPiece]:
+        """Yield the last ``span_s`` seconds of the recording, oldest first, as far as the mounting is the same."""
+        begin_ns = int(self.newest.samples.t_ns[-1]) - round(span_s * 1e9)
+        for path in self._segments_since(begin_ns):
+            for piece in segment.read_samples(path):
+                if piece.samples.t_ns[-1] >= begin_ns:
+                    yield piece
+
+    def _segments_since(self, begin_ns: int) -> list[Path]:
+        """Return the newest segments with the same axis mounting, back to the one that contains ``begin_ns``."""
+        chosen: deque[Path] = deque()
+        for path in reversed(self.paths):
+            try:
+                if segment.read_metadata(path).axes != self.origin.axes:
+                    break
+                first = next(segment.read_samples(path), None)
+            except (RecordingError, OSError):
+                continue
+            if first is None:
+                continue
+            chosen.appendleft(path)
+            if first.samples.t_ns[0] <= begin_ns:
+                break
+        return list(chosen)
+
+
+def find_tail(origin: SegmentMetadata, folder: Path) -> RecordingTail | None:
+    """Return the end of the recording in a folder, or None if there is nothing to resume from.
+
+    Files that are not valid segments are skipped and left in place.
+
+    Parameters
+    ----------
+    origin : SegmentMetadata
+        Description of the recording. A recording with another axis mounting is not resumed.
+    folder : Path
+        Folder of the segments.
+    """
+    paths = segment.list_segments(folder)
+    while paths:
+        path = paths[-1]
+        try:
+            if segment.read_metadata(path).axes != origin.axes:
+                return None
+            newest = segment.read_last_piece(path)
+        except (RecordingError, ConfigError, OSError):
+            newest = None
+        if newest is not None:
+            return RecordingTail(origin, tuple(paths), newest)
+        paths.pop()
+    return None
