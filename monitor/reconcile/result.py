@@ -6,13 +6,15 @@ the data of one plot: the measurement of one axis and the expectation of the mod
 units of the axis. Times are in seconds from the start of the recording.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 from drivers.sample import Floats
 from monitor.noise.model import NoiseModel
 
+Z95: Final = 1.959964
+"""Number of standard deviations on each side of a 95 % interval."""
 Decision = Literal["agrees", "explained", "partly_explained", "unexplained"]
 """Decision for an axis or a recording."""
 StepKind = Literal["added", "retuned"]
@@ -139,3 +141,13 @@ class Reconciliation:
     duration_s: float
     seed: int
     notes: tuple[str, ...] = field(default=())
+
+
+def combine_decisions(verdicts: Iterable[Decision]) -> Decision:
+    """Combine the decisions of all axes into the decision for the recording."""
+    every = set(verdicts)
+    if every <= {"agrees"}:
+        return "agrees"
+    if every <= {"agrees", "explained"}:
+        return "explained"
+    return "unexplained" if every <= {"agrees", "unexplained"} else "partly_explained"

@@ -27,6 +27,7 @@ from scipy.special import gammaincc, gammaln, polygamma, psi
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.reconcile.preparation.value_statistics import Interval
+from monitor.reconcile.result import Z95
 
 MIN_SEGMENT_SAMPLES: Final = 16
 """Smallest number of samples on each side of a step."""
@@ -52,8 +53,6 @@ MIN_SQUARES_PER_CELL: Final = 64
 """Number of squares in each cell from which a row of cells of several pieces is tested for a constant power."""
 MIN_SQUARES_FOR_DECREASE: Final = 8
 """Number of squares in a cell below which a low power is no evidence."""
-Z95: Final = 1.959964
-"""Number of standard deviations on each side of a 95 % interval."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -75,8 +75,9 @@ def distance(effect: str, a: ParameterInterval | None, b: ParameterInterval | No
 
     Examples
     --------
-    >>> distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(17.32)) is None, distance("sinusoidal", ParameterInterval(17.3), ParameterInterval(19.0))
-    (False, None)
+    >>> distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(17.30))
+    0.0
+    >>> distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(19.00))
     """
     if a is None or b is None:
         return 0.0

@@ -16,8 +16,7 @@ import numpy as np
 from scipy.special import chdtrc
 
 from drivers.sample import Floats
-from monitor.reconcile.likelihood.hypothesis import Z95
-from monitor.reconcile.result import ParameterInterval
+from monitor.reconcile.result import Z95, ParameterInterval
 
 MIN_AGREEMENT_PROBABILITY: Final = 0.01
 """Probability below which recordings disagree. It is small because a report contains many parameters."""
@@ -55,7 +54,7 @@ def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
 
     Examples
     --------
-    >>> both = pool_parameter([ParameterInterval(10.0, 8.04, 11.96), ParameterInterval(12.0, 10.04, 13.96)])  # ± 1 standard deviation each
+    >>> both = pool_parameter([ParameterInterval(10.0, 8.04, 11.96), ParameterInterval(12.0, 10.04, 13.96)])
     >>> print(both.bounds.value, round(both.chi2, 3), both.freedom)
     11.0 2.0 1
     """
