@@ -26,7 +26,8 @@ from drivers.recordings.writing import atomic_write_path
 from drivers.sample import AXES
 from monitor.estimation.regular_grid import resample_with_temperature
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.reconcile import Recording, reconcile
+from monitor.reconcile.preparation.recording import Recording
+from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.report import SCHEMA, encode_report
 from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.several_recordings import comparison_report

@@ -92,7 +92,8 @@ def _call_analysis() -> None:
 def _call_reconciliation() -> None:
     from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
     from monitor.noise.model import NoiseModel
-    from monitor.reconcile.reconcile import Recording, reconcile  # imported here because the service does not need it
+    from monitor.reconcile.preparation.recording import Recording
+    from monitor.reconcile.reconcile import reconcile  # imported here because the service does not need it
 
     model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4), BiasInstability(B=3e-5), RateRandomWalk(K=1e-6))})
     series, rng = model.simulate(4200, 10.0, 1)[:, 2], np.random.default_rng(1)

@@ -1,8 +1,5 @@
-"""Conversion of a search into readable results: steps with parameters, confidence and a justification that can be
-checked.
-"""
+"""Conversion of a search into readable results: steps with parameters, confidence and a justification."""
 
-from collections.abc import Mapping
 from math import erf, exp, inf, log
 from typing import Final
 
@@ -20,15 +17,9 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.diagnostics.gap import NullDistribution, score_findings
-from monitor.reconcile.likelihood.effect_terms import (
-    DETERMINISTIC_SIZE_PARAMETERS,
-    NATURAL_DIAGNOSTIC,
-    NOISE_SIZE_PARAMETERS,
-    size,
-)
+from monitor.reconcile.diagnostics.null_distribution import AxisNull, score_findings
+from monitor.reconcile.likelihood.effect_terms import NATURAL_DIAGNOSTIC, SIZE_PARAMETERS, size
 from monitor.reconcile.likelihood.hypothesis import Hypothesis, shape_bounds, size_bounds
-from monitor.reconcile.preparation.axis import Axis
 from monitor.reconcile.result import (
     AxisResult,
     Decision,
@@ -60,60 +51,75 @@ MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence of an alternative effect that is reported."""
 
 
-def describe_axis(
-    search: Search, null: Mapping[str, NullDistribution], final: Mapping[str, NullDistribution]
-) -> AxisResult:
+def describe_axis(search: Search, null: AxisNull, final: AxisNull) -> AxisResult:
     """Return the result of one axis.
 
     Parameters
     ----------
     search : Search
         Search on the axis.
-    null : mapping of str to Null
+    null : AxisNull
         Null distributions under the model under test, which decided the search.
-    final : mapping of str to Null
+    final : AxisNull
         Null distributions under the extended model, which decide which differences are left over.
     """
-    looks = [DiagnosticSnapshot(score_findings(one.seen, null), one.views) for one in search.rounds]
-    end = DiagnosticSnapshot(score_findings(search.seen, final), search.views)
-    looks.append(
-        end if search.before is None else DiagnosticSnapshot(score_findings(search.before[1], null), search.before[0])
+    looks = [DiagnosticSnapshot(score_findings(one.findings, null), one.plots) for one in search.rounds]
+    end = DiagnosticSnapshot(score_findings(search.findings, final), search.plots)
+    if search.before is None:
+        looks.append(end)
+    else:
+        plots, findings = search.before
+        looks.append(DiagnosticSnapshot(score_findings(findings, null), plots))
+    steps = tuple(
+        _describe_step(search, search.rounds[at], index, kind, looks[at], looks[at + 1])
+        for at, index, kind in _remaining_changes(search)
     )
-    steps: list[ReconciliationStep] = []
-    left = sorted(range(search.state.given, len(search.state.effects)))
+    left_over = (*(score for score in end.scores if score.passes), *_noise_floor_score(search, end))
+    decision = _axis_decision(bool(steps), bool(left_over))
+    return AxisResult(search.state.axis.name, decision, looks[0], steps, left_over, end)
+
+
+def _remaining_changes(search: Search) -> list[tuple[int, int, StepKind]]:
+    """Return the changes that remain at the end: the index of the round, the index of the effect, and the kind."""
+    state = search.state
+    found: list[tuple[int, int, StepKind]] = []
+    left = list(range(state.given, len(state.effects)))
+    resized: tuple[int, ...] = ()
     for at, one in enumerate(search.rounds):
         last = one.state.effects[-1]
-        index = next((i for i in left if type(search.state.effects[i]) is type(last)), None)
-        if index is not None and len(one.state.effects) > one.state.given and one.trials[0].effect is not None:
+        index = next((i for i in left if type(state.effects[i]) is type(last)), None)
+        if index is not None and one.state.found and one.trials[0].effect is not None:
             left.remove(index)
-            steps.append(_describe_step(search, one, index, "added", looks[at], looks[at + 1]))
-        before = search.rounds[at - 1].state.likely.noises if at else ()
-        for noise in one.state.likely.noises:
-            if noise < search.state.given and noise not in before and noise in search.state.likely.noises:
-                steps.append(_describe_step(search, one, noise, "retuned", looks[at], looks[at + 1]))
-    left_over = (*(score for score in end.scores if score.passes), *_noise_floor_score(search, end))
-    return AxisResult(
-        search.axis.name, _axis_decision(bool(steps), bool(left_over)), looks[0], tuple(steps), left_over, end
-    )
+            found.append((at, index, "added"))
+        for noise in one.state.fit.noises:
+            if noise < state.given and noise not in resized and noise in state.fit.noises:
+                found.append((at, noise, "retuned"))
+        resized = one.state.fit.noises
+    return found
 
 
 def _noise_floor_score(search: Search, look: DiagnosticSnapshot) -> tuple[Score, ...]:
     """Score the white noise floor after a low-pass filter that was found.
 
-    No effect produces this noise, so it is reported as left over if it is larger than chance. Its gap is the gap that
-    the low-pass filter alone would leave, and at most the gap without a low-pass filter.
+    No effect produces this noise. A noise floor that is larger than chance is reported as left over. Its gap is the gap
+    that the low-pass filter alone would leave, and at most the gap without a low-pass filter.
     """
-    state, axis = search.state, search.axis
+    state, axis = search.state, search.state.axis
     limit = next((effect for effect in state.found if isinstance(effect, BandwidthLimit)), None)
-    if limit is None or not state.likely.behind > 0.0:
+    if limit is None or not state.fit.floor > 0.0:
         return ()
-    without = axis.fit(state.effects, state.likely.held, floor=False)
-    most = max(one.seen["psd"].gain for one in search.rounds)
-    gain = max(min(state.likely.log_likelihood - without.log_likelihood, most), 0.0)
-    psd = next(score for score in look.scores if score.lens == "psd")
+    without = axis.fit(state.effects, state.fit.held, floor=False)
+    most = max(one.findings["psd"].gain for one in search.rounds)
+    gain = max(min(state.fit.log_likelihood - without.log_likelihood, most), 0.0)
+    psd = _score_of("psd", look)
     place = Location(frequency=(limit.cutoff, 0.5 * axis.rate_hz))
     score = Score("psd", place, (2.0 * gain) ** 0.5, psd.null95, psd.threshold)
     return (score,) if score.passes else ()
+
+
+def _score_of(lens: str, look: DiagnosticSnapshot) -> Score:
+    """Return the score of one diagnostic."""
+    return next(score for score in look.scores if score.lens == lens)
 
 
 def _axis_decision(steps: bool, left: bool) -> Decision:
@@ -124,41 +130,41 @@ def _axis_decision(steps: bool, left: bool) -> Decision:
 
 
 def _describe_step(
-    search: Search,
-    search_round: Round,
-    index: int,
-    kind: StepKind,
-    before: DiagnosticSnapshot,
-    after: DiagnosticSnapshot,
+    search: Search, done: Round, index: int, kind: StepKind, before: DiagnosticSnapshot, after: DiagnosticSnapshot
 ) -> ReconciliationStep:
     """Return the result of one step of the search."""
-    effect = search.state.effects[index]
+    effect, trial = search.state.effects[index], done.trials[0]
     score = _triggering_score(effect, kind, before)
-    later = next(other for other in after.scores if other.lens == score.lens)
-    proof = search_round.proof
-    unseen: tuple[Score | None, Score | None] = None, None
-    if not proof.reason:
-        unseen = (
-            Score(score.lens, score.where, proof.before, score.null95, score.threshold),
-            Score(score.lens, score.where, proof.after, later.null95, later.threshold),
-        )
-    confidence, others = _confidence_and_runners_up(effect.name if kind == "added" else RETUNE, search_round.trials)
-    if kind == "retuned" and search_round.trials[0].name != RETUNE:  # the size changed together with an added effect
+    later = _score_of(score.lens, after)
+    confidence, others = _confidence_and_runners_up(effect.name if kind == "added" else RETUNE, done.trials)
+    if kind == "retuned" and trial.name != RETUNE:  # the size changed together with an added effect
         confidence, others = _resize_confidence(search.state, index), ()
+    held_out_before, held_out_after = _held_out_scores(done, score, later)
     return ReconciliationStep(
         found=score,
         kind=kind,
         effect=effect.name,
-        parameters=_parameters_with_bounds(search.axis, search.state, index, search_round.trials[0], kind),
+        parameters=_parameters_with_bounds(search.state, index, trial, kind),
         confidence=confidence,
         runners_up=others,
         before=score,
         after=later,
-        held_out_before=unseen[0],
-        held_out_after=unseen[1],
-        held_out_reason=proof.reason,
-        because=_justification(effect, kind, score, later, others, search_round.trials[0]),
+        held_out_before=held_out_before,
+        held_out_after=held_out_after,
+        held_out_reason=done.validation.reason,
+        because=_justification(effect, kind, score, later, others, trial),
         look=after,
+    )
+
+
+def _held_out_scores(done: Round, score: Score, later: Score) -> tuple[Score | None, Score | None]:
+    """Return the scores of the cross-validation before and after a step, or None without cross-validation."""
+    validation = done.validation
+    if validation.reason:
+        return None, None
+    return (
+        Score(score.lens, score.where, validation.before, score.null95, score.threshold),
+        Score(score.lens, score.where, validation.after, later.null95, later.threshold),
     )
 
 
@@ -188,13 +194,12 @@ def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[fl
     whole = sum(exp(value - top) for value in best.values())
     chances = {other: exp(value - top) / whole for other, value in best.items()}
     others = sorted(
-        (c, other)
-        for other, c in chances.items()
-        if other in EFFECTS and other != name and c >= MIN_RUNNER_UP_CONFIDENCE
+        (chance, other)
+        for other, chance in chances.items()
+        if other in EFFECTS and other != name and chance >= MIN_RUNNER_UP_CONFIDENCE
     )
-    return chances.get(name, chances[max(best, key=lambda one: best[one])]), tuple(
-        RunnerUp(other, chance) for chance, other in reversed(others[-MAX_RUNNERS_UP:])
-    )
+    runners_up = tuple(RunnerUp(other, chance) for chance, other in reversed(others[-MAX_RUNNERS_UP:]))
+    return chances.get(name, chances[max(best, key=lambda one: best[one])]), runners_up
 
 
 def _resize_confidence(state: Hypothesis, index: int) -> float:
@@ -203,14 +208,14 @@ def _resize_confidence(state: Hypothesis, index: int) -> float:
     It follows from the distance of the logarithms of the two sizes, in standard errors.
     """
     now, before = size(state.effects[index]), size(state.model[index])
-    error = state.likely.error(index)
+    error = state.fit.error(index)
     if not (now > 0.0 and before > 0.0 and error > 0.0):
         return 1.0  # the effect vanished, or the model had none
     return erf(abs(log(now / before)) * now / error / 2.0**0.5)
 
 
 def _parameters_with_bounds(
-    axis: Axis, state: Hypothesis, index: int, trial: Trial, kind: StepKind
+    state: Hypothesis, index: int, trial: Trial, kind: StepKind
 ) -> dict[str, ParameterInterval]:
     """Return the parameters of an effect with their 95 % intervals."""
     effect = state.effects[index]
@@ -219,29 +224,30 @@ def _parameters_with_bounds(
     found: dict[str, ParameterInterval] = {}
     if isinstance(effect, Leak):
         found["source"] = ParameterInterval(effect.source)
-    named = (NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS).get(type(effect))
-    if named is not None:
-        found[named] = size_bounds(state.likely, index)
+    size_name = SIZE_PARAMETERS.get(type(effect))
+    if size_name is not None:
+        found[size_name] = size_bounds(state.fit, index)
     if isinstance(effect, TemperatureBias):
         found["reference"] = ParameterInterval(effect.reference)
         if effect.quadratic is not None:
             found["quadratic"] = _quadratic_bounds(state, index)
     for shape in SHAPE_PARAMETERS.get(type(effect), ()) if kind == "added" else ():
-        found[shape] = shape_bounds(axis, state, index, shape)
+        found[shape] = shape_bounds(state.fit, index, shape)
     if isinstance(effect, BandwidthLimit):
         found["order"] = ParameterInterval(float(effect.order))
     if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
         # fitting the frequency as well doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
-        error = 2.0 * Z95 * state.likely.error(index) / effect.amplitude
+        error = 2.0 * Z95 * state.fit.error(index) / effect.amplitude
         found["phase"] = ParameterInterval(effect.phase, effect.phase - error, effect.phase + error)
     return found
 
 
 def _quadratic_bounds(state: Hypothesis, index: int) -> ParameterInterval:
     """Return the quadratic temperature coefficient with its 95 % interval."""
-    place = next(place for at, place in state.likely.courses if at == index)
-    value = float(state.likely.fitted.beta[place.start + 1])
-    error = Z95 * float(state.likely.fitted.beta_covariance[place.start + 1, place.start + 1]) ** 0.5
+    fitted = state.fit.fitted
+    column = next(place for at, place in state.fit.regressors if at == index).start + 1
+    value = float(fitted.beta[column])
+    error = Z95 * float(fitted.beta_covariance[column, column]) ** 0.5
     return ParameterInterval(value, value - error, value + error)
 
 

@@ -17,136 +17,176 @@ from typing import Any, Final
 import numpy as np
 from scipy.special import expit
 
-from drivers.errors import NotReady
-from drivers.sample import AXES, Floats
+from drivers.sample import AXES
 from monitor.noise.effect import Leak
 from monitor.noise.effects import (
+from monitor.noise.standard_terms import UNIT_SOURCES
     AngleRandomWalk,
     Bias,
     RateRamp,
     SampleRateError,
 )
 from monitor.noise.model import NoiseModel
-from monitor.noise.standard_terms import UNIT_SOURCES
 from monitor.reconcile.description import describe_axis
-from monitor.reconcile.diagnostics.diagnostics import whiten_axis
-from monitor.reconcile.diagnostics.gap import Findings, NullDistribution, null_distributions, run_diagnostics
+from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, null_distributions, run_diagnostics
+from monitor.reconcile.likelihood.axis import Axis, Effects, RegressorCache
 from monitor.reconcile.likelihood.effect_terms import with_size
 from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
-from monitor.reconcile.preparation.axis import Axis, Effects, RegressorCache
-from monitor.reconcile.preparation.prepare import MIN_SAMPLES, prepare_axes, without_sources
-from monitor.reconcile.preparation.sample_rate_test import SAMPLE_RATE_PENALTY_NATS as CLOCK_PRICE
-from monitor.reconcile.preparation.sample_rate_test import (
+from monitor.reconcile.likelihood.whitening import whiten_axis
+from monitor.reconcile.preparation.recording import Recording, select_usable_axes
+from monitor.reconcile.result import (
+    AxisResult,
+    Decision,
+    Location,
+    Reconciliation,
+    ReconciliationStep,
+    Score,
+    combine_decisions,
+)
+from monitor.reconcile.search.axis_preparation import prepare_axes, without_sources
+from monitor.reconcile.search.candidates import PENALTY_NATS
+from monitor.reconcile.search.sample_rate_error import (
+    SAMPLE_RATE_PENALTY_NATS,
     SampleRateErrorEstimate,
     detect_sample_rate_error,
     in_stated_time,
 )
-from monitor.reconcile.result import AxisResult, Decision, Location, Reconciliation, ReconciliationStep, Score
-from monitor.reconcile.search.candidates import PENALTY_NATS
 from monitor.reconcile.search.search import Search, search_axis
 
 SIMULATED_RECORDINGS: Final = 6
-"""Number of simulated recordings that determine a null distribution: with six axes, 36 gains for each diagnostic."""
-
-TEMPERATURE_SMOOTHING_FRACTION: Final = 0.001
-"""Length of the moving average of the temperature, as a fraction of the recording. Heat is slow and thermometers are
-noisy."""
-
-MIN_VALID_FRACTION: Final = 0.5
-"""Smallest fraction of samples of an axis that must be present."""
+"""Number of simulated recordings that determine a null distribution. With six axes, each diagnostic has 36 gains."""
 MIN_TERM_GAIN_NATS: Final = 3.0
 """Log-likelihood gain in nats that a term of the first fit must reach to be kept."""
 ProgressCallback = Callable[[str], None]
 """Function that is called with the name of each stage."""
-
 MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Function with the signature of ``map``, such as the ``map`` method of a thread pool."""
 
 
 @dataclass(frozen=True, slots=True)
-class Recording:
-    """Measured samples of one recording, with its sample rate and temperature."""
+class RunContext:
+    """Recording, with the seed and the cached regressors of one reconciliation."""
 
-    values: Mapping[str, Floats]  # axis -> [n] SI; NaN = missing
-    rate_hz: float
-    temperature_c: Floats | None = None  # [n] °C; NaN = missing
+    recording: Recording
+    seed: int
+    regressors: RegressorCache
+    map: MapFunction  # distributes work over axes and simulated recordings
+
+    def prepare(self, recording: Recording, effects: Mapping[str, Effects], seed: int) -> dict[str, Axis]:
+        """Return the prepared axes of the measured recording or of a simulated one with the same temperature.
+
+        Parameters
+        ----------
+        recording : Recording
+            Recording to prepare.
+        effects : mapping of str to tuple of Effect
+            Effects of each axis.
+        seed : int
+            Seed of the draws that replace missing samples.
+        """
+        return prepare_axes(recording, effects, self.regressors, np.random.default_rng(seed))
+
+
+@dataclass(frozen=True, slots=True)
+class SearchResults:
+    """Results of the search on all axes of one recording."""
+
+    searches: dict[str, Search]
+    sample_rate_error: SampleRateErrorEstimate | None
 
     @property
-    def samples(self) -> int:
-        """Number of samples of each axis."""
-        return next(iter(self.values.values())).size
+    def extended(self) -> dict[str, Search]:
+        """Searches that changed the model."""
+        return {name: search for name, search in self.searches.items() if search.rounds}
 
 
-def diagnose_simulations(
-    model: NoiseModel,
-    template: Recording,
-    courses: RegressorCache,
+def reconcile(
+    recording: Recording,
+    model: NoiseModel | None,
     seed: int,
     each: MapFunction = map,
-    runs: int = SIMULATED_RECORDINGS,
-    only: Collection[str] | None = None,
-) -> dict[str, list[Findings]]:
-    """Run the diagnostics on recordings that are simulated from a model.
+    tell: ProgressCallback = lambda _what: None,
+) -> Reconciliation:
+    """Compare a recording with a model and find the effects that the model lacks.
 
     Parameters
     ----------
-    model : NoiseModel
-        Model to simulate.
-    template : Recording
-        Recording whose axes, length, sample rate and temperature the simulations copy.
-    courses : Courses
-        Cached regressors for the same length, sample rate and temperature.
+    recording : Recording
+        Recording with at least ``MIN_SAMPLES`` samples for each axis.
+    model : NoiseModel or None
+        Model under test. If None, the five classic terms are fitted first.
     seed : int
-        Seed of the first simulation. Each further simulation uses the next integer.
+        Seed of all simulations and random draws. The same seed gives the same result.
     each : callable, optional
-        Function with the signature of ``map`` that distributes the simulations.
-    runs : int, optional
-        Number of simulated recordings.
-    only : collection of str, optional
-        Names of the axes to diagnose. If None, all axes are diagnosed.
+        Function with the signature of ``map`` that distributes work over axes and simulated recordings.
+    tell : callable, optional
+        Function that is called with the name of each stage.
 
     Returns
     -------
-    dict of str to list of Findings
-        For each axis, the findings of each simulated recording.
+    Reconciliation
+        Decision, effects and remaining differences of each axis.
+
+    Raises
+    ------
+    NotReady
+        If there are too few samples or no axis can be compared with the model.
     """
-    effects = effects_by_axis(model, template)
-    wanted = [name for name in template.values if only is None or name in only]
+    recording, notes = select_usable_axes(recording, model)
+    regressors = RegressorCache(recording.samples, recording.rate_hz, recording.temperature_c)
+    run = RunContext(recording, seed, regressors, each)
+    if model is None:
+        tell("fitting the five terms")
+    tested = model or fit_five_terms(run)
+    tell("simulating the model")
+    simulated = _diagnose_simulations(tested, run, seed, recording.values)
+    null = null_distributions(simulated, len(simulated))
+    tell("searching for missing effects")
+    found = _search_all_axes(run, tested, null)
+    extended = _add_found_effects(tested, found)
+    final = null
+    if found.extended or found.sample_rate_error:
+        tell("simulating the extended model")
+        changed = recording.values if found.sample_rate_error else found.extended
+        simulated |= _diagnose_simulations(extended, run, seed + SIMULATED_RECORDINGS, changed)
+        final = null_distributions(simulated, len(simulated))
+    tell("describing the result")
+    axes = {name: describe_axis(one, null[name], final[name]) for name, one in found.searches.items()}
+    if found.sample_rate_error is not None:
+        axes = _add_sample_rate_step(axes, found.sample_rate_error, null)
+    return Reconciliation(
+        verdict=combine_decisions([one.verdict for one in axes.values()]),
+        axes=axes,
+        baseline=tested,
+        model=extended,
+        fitted_first=model is None,
+        rate_hz=recording.rate_hz,
+        samples=recording.samples,
+        duration_s=recording.samples / recording.rate_hz,
+        seed=seed,
+        notes=notes,
+    )
 
-    def one(run: int) -> dict[str, Findings]:
-        drawn = model.simulate(template.samples, template.rate_hz, seed + run, template.temperature_c)
-        raw = {axis: drawn[:, AXES.index(axis)] for axis in template.values}
-        rng = np.random.default_rng(seed + run)
-        axes = prepare_axes(raw, template.rate_hz, effects, template.temperature_c, courses, rng)
-        return {
-            name: run_diagnostics(whiten_axis(axes[name], fit_with_given_sizes(axes[name], effects[name]).likely))
-            for name in wanted
-        }
 
-    seen = list(each(one, range(runs)))
-    return {axis: [run[axis] for run in seen] for axis in wanted}
+def fit_five_terms(run: RunContext) -> NoiseModel:
+    """Fit the terms Q, N, B, K and R to each axis and keep the terms that the data support."""
+    axes = run.prepare(run.recording, dict.fromkeys(run.recording.values, ()), run.seed)
+    return NoiseModel({name: _fit_terms(axis) for name, axis in axes.items()}, run.recording.rate_hz)
 
 
-def smooth_temperature(temperature_c: Floats) -> Floats:
-    """Return the temperature with missing samples interpolated and with thermometer noise averaged out.
-
-    Parameters
-    ----------
-    temperature_c : ndarray of float64, shape (n,)
-        Temperature in °C. NaN marks a missing sample. At least one sample must be finite.
-
-    Returns
-    -------
-    ndarray of float64, shape (n,)
-        Smoothed temperature in °C.
-    """
-    known = np.flatnonzero(np.isfinite(temperature_c))
-    whole = np.interp(np.arange(temperature_c.size), known, temperature_c[known])
-    half = int(0.5 * TEMPERATURE_SMOOTHING_FRACTION * whole.size)
-    if half < 1:
-        return whole
-    sums = np.concatenate([[0.0], np.cumsum(np.pad(whole - whole[0], half, mode="edge"))])
-    return np.asarray((sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1) + whole[0])
+def _fit_terms(axis: Axis) -> Effects:
+    """Fit the classic terms to one axis and drop each term that gains too little likelihood."""
+    best = axis.fit([with_size(effect, axis.rms) for effect in UNIT_SOURCES[:4]])
+    with_ramp = axis.fit((*best.effects, RateRamp(R=axis.rms)))
+    if with_ramp.log_likelihood - best.log_likelihood > PENALTY_NATS["rate_ramp"]:
+        best = with_ramp
+    for at in range(len(best.effects) - 1, -1, -1):
+        if isinstance(best.effects[at], (AngleRandomWalk, RateRamp)):
+            continue
+        less = axis.fit(best.effects[:at] + best.effects[at + 1 :])
+        if best.log_likelihood - less.log_likelihood < MIN_TERM_GAIN_NATS:
+            best = less
+    return best.effects
 
 
 def effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
@@ -172,300 +212,54 @@ def effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effect
     }
 
 
-@dataclass(frozen=True, slots=True)
-class SearchResults:
-    """Results of the search on all axes of one recording."""
+def _diagnose_simulations(
+    model: NoiseModel, run: RunContext, first_seed: int, names: Collection[str]
+) -> dict[str, list[Findings]]:
+    """Run the diagnostics on simulations of a model that have the axes, length and temperature of the recording.
 
-    searches: dict[str, Search]
-    clock: SampleRateErrorEstimate | None
+    The result has, for each of the named axes, the findings of each simulated recording.
+    """
+    template = run.recording
+    effects = effects_by_axis(model, template)
+
+    def diagnose(seed: int) -> dict[str, Findings]:
+        drawn = model.simulate(template.samples, template.rate_hz, seed, template.temperature_c)
+        simulated = replace(template, values={axis: drawn[:, AXES.index(axis)] for axis in template.values})
+        axes = run.prepare(simulated, effects, seed)
+        return {
+            name: run_diagnostics(whiten_axis(fit_with_given_sizes(axes[name], effects[name]).fit)) for name in names
+        }
+
+    findings = list(run.map(diagnose, range(first_seed, first_seed + SIMULATED_RECORDINGS)))
+    return {axis: [one[axis] for one in findings] for axis in names}
 
 
-def search_all_axes(
-    recording: Recording,
-    model: NoiseModel,
-    null: Mapping[str, Mapping[str, NullDistribution]],
-    courses: RegressorCache,
-    seed: int,
-    each: MapFunction,
-) -> SearchResults:
+def _search_all_axes(run: RunContext, model: NoiseModel, null: Mapping[str, AxisNull]) -> SearchResults:
     """Search every axis for missing effects.
 
     The sample rate is tested first. If two axes each seem to leak into the other, the search is repeated on one of them
     without that source.
-
-    Parameters
-    ----------
-    recording : Recording
-        Recording to explain.
-    model : NoiseModel
-        Model under test.
-    null : mapping of str to mapping of str to Null
-        Null distribution for each axis and diagnostic.
-    courses : Courses
-        Cached regressors for the same length, sample rate and temperature.
-    seed : int
-        Seed of all random draws.
-    each : callable
-        Function with the signature of ``map`` that distributes the axes.
     """
-    effects = effects_by_axis(model, recording)
-    rng = np.random.default_rng(seed)
-    axes = prepare_axes(recording.values, recording.rate_hz, effects, recording.temperature_c, courses, rng)
-    clock = detect_sample_rate_error(axes, effects)
-    if clock is not None:
-        ratio = float(clock.ratio.value)
-        effects = {
-            name: tuple(in_stated_time(effect, ratio) for effect in of_axis) for name, of_axis in effects.items()
-        }
+    effects = effects_by_axis(model, run.recording)
+    axes = run.prepare(run.recording, effects, run.seed)
+    error = detect_sample_rate_error(axes, effects)
+    if error is not None:
+        ratio = float(error.ratio.value)
+        effects = {name: tuple(in_stated_time(effect, ratio) for effect in of) for name, of in effects.items()}
 
-    def one(name: str) -> Search:
-        return search_axis(axes[name], effects[name], null[name], np.random.default_rng([seed, AXES.index(name)]))
+    def search(name: str) -> Search:
+        rng = np.random.default_rng([run.seed, AXES.index(name)])
+        return search_axis(axes[name], effects[name], null[name], rng)
 
-    found = dict(zip(axes, each(one, axes), strict=True))
-    for name, innocent in _reversed_leak_sources(found, null).items():
-        axes[name] = without_sources(axes[name], innocent)
-        found[name] = one(name)
-    return SearchResults(found, clock)
+    found = dict(zip(axes, run.map(search, axes), strict=True))
+    for name, wrong_sources in _reversed_leak_sources(found, null).items():
+        axes[name] = without_sources(axes[name], wrong_sources)
+        found[name] = search(name)
+    return SearchResults(found, error)
 
 
-def reconcile(
-    recording: Recording,
-    model: NoiseModel | None,
-    seed: int,
-    each: MapFunction = map,
-    tell: ProgressCallback = lambda _what: None,
-) -> Reconciliation:
-    """Compare a recording with a model and find the effects that the model lacks.
-
-    Parameters
-    ----------
-    recording : Recording
-        Recording with at least ``FEWEST`` samples for each axis.
-    model : NoiseModel or None
-        Model under test. If None, the five classic terms are fitted first.
-    seed : int
-        Seed of all simulations and random draws. The same seed gives the same result.
-    each : callable, optional
-        Function with the signature of ``map`` that distributes work over axes and simulated recordings.
-    tell : callable, optional
-        Function that is called with the name of each stage.
-
-    Returns
-    -------
-    Reconciliation
-        Decision, effects and remaining differences of each axis.
-
-    Raises
-    ------
-    NotReady
-        If there are too few samples or no axis can be compared with the model.
-    """
-    recording, notes = select_usable_axes(recording, model)
-    courses = RegressorCache(recording.samples, recording.rate_hz, recording.temperature_c)
-    if model is None:
-        tell("fitting the five terms")
-    tested = model or fit_five_terms(recording, courses, seed)
-    tell("simulating the model")
-    simulated = diagnose_simulations(tested, recording, courses, seed, each)
-    null = null_distributions(simulated, len(simulated))
-    tell("looking for what is missing")
-    found = search_all_axes(recording, tested, null, courses, seed, each)
-    rounds = {name: one for name, one in found.searches.items() if one.rounds}
-    augmented = add_found_effects(tested, found)
-    final = null
-    if rounds or found.clock:
-        tell("simulating the new model")
-        changed = None if found.clock else rounds
-        simulated |= diagnose_simulations(
-            augmented, recording, courses, seed + SIMULATED_RECORDINGS, each, only=changed
-        )
-        final = null_distributions(simulated, len(simulated))
-    tell("writing down")
-    axes = {name: describe_axis(one, null[name], final[name]) for name, one in found.searches.items()}
-    if found.clock is not None:
-        axes = add_sample_rate_step(axes, found.clock, null)
-    return Reconciliation(
-        verdict=combine_decisions([one.verdict for one in axes.values()]),
-        axes=axes,
-        baseline=tested,
-        model=augmented,
-        fitted_first=model is None,
-        rate_hz=recording.rate_hz,
-        samples=recording.samples,
-        duration_s=recording.samples / recording.rate_hz,
-        seed=seed,
-        notes=notes,
-    )
-
-
-def select_usable_axes(recording: Recording, model: NoiseModel | None) -> tuple[Recording, tuple[str, ...]]:
-    """Select the axes that can be compared.
-
-    Parameters
-    ----------
-    recording : Recording
-        Recording to check.
-    model : NoiseModel or None
-        Model under test. If None, every axis with enough samples and varying values is kept.
-
-    Returns
-    -------
-    recording : Recording
-        Recording with the selected axes and the smoothed temperature.
-    notes : tuple of str
-        One sentence for each axis that was left out.
-
-    Raises
-    ------
-    NotReady
-        If there are too few samples or no axis is left.
-    """
-    if recording.samples < MIN_SAMPLES:
-        raise NotReady(
-            f"{recording.samples} samples; {MIN_SAMPLES} are the least that anything can be said of "
-            f"({MIN_SAMPLES / recording.rate_hz:.0f} s at {recording.rate_hz:g} Hz)"
-        )
-    notes, kept = [], {}
-    for name, y in recording.values.items():
-        there = y[np.isfinite(y)]
-        if there.size < MIN_SAMPLES or there.size < MIN_VALID_FRACTION * y.size:
-            notes.append(f"{name}: {there.size} of {y.size} samples are there; left out")
-        elif np.ptp(there) == 0.0:
-            notes.append(f"{name}: all samples are the same; left out")
-        elif model is not None and not model.effects.get(name):
-            notes.append(f"{name}: the model says nothing of it; left out")
-        else:
-            kept[name] = y
-    if not kept:
-        raise NotReady("no axis to compare: " + "; ".join(notes))
-    warmth = recording.temperature_c
-    if warmth is not None:
-        warmth = smooth_temperature(warmth) if np.isfinite(warmth).any() else None
-    return Recording(kept, recording.rate_hz, warmth), tuple(notes)
-
-
-def fit_five_terms(recording: Recording, courses: RegressorCache, seed: int) -> NoiseModel:
-    """Fit the terms Q, N, B, K and R to each axis and keep the terms that the data support.
-
-    Parameters
-    ----------
-    recording : Recording
-        Recording to fit.
-    courses : Courses
-        Cached regressors for the same length, sample rate and temperature.
-    seed : int
-        Seed of the draws that replace missing samples.
-
-    Returns
-    -------
-    NoiseModel
-        Model with the supported terms of each axis.
-    """
-    rng = np.random.default_rng(seed)
-    none: dict[str, Effects] = dict.fromkeys(recording.values, ())
-    axes = prepare_axes(recording.values, recording.rate_hz, none, recording.temperature_c, courses, rng)
-    return NoiseModel({name: _fit_terms(axis, UNIT_SOURCES[:4]) for name, axis in axes.items()}, recording.rate_hz)
-
-
-def _fit_terms(axis: Axis, start: Effects) -> Effects:
-    """Fit the classic terms to one axis and drop each term that gains too little likelihood."""
-    scale = float(np.sqrt(np.mean(axis.coefficients**2)))
-    best = axis.fit([with_size(effect, scale) for effect in start])
-    with_ramp = axis.fit((*best.effects, RateRamp(R=scale)))
-    if with_ramp.log_likelihood - best.log_likelihood > PENALTY_NATS["rate_ramp"]:
-        best = with_ramp
-    for at in range(len(best.effects) - 1, -1, -1):
-        effect = best.effects[at]
-        if isinstance(effect, (AngleRandomWalk, RateRamp)):
-            continue
-        less = axis.fit(best.effects[:at] + best.effects[at + 1 :])
-        if best.log_likelihood - less.log_likelihood < MIN_TERM_GAIN_NATS:
-            best = less
-    return best.effects
-
-
-def add_found_effects(model: NoiseModel, found: SearchResults) -> NoiseModel:
-    """Return the model with all effects that were found.
-
-    Parameters
-    ----------
-    model : NoiseModel
-        Model under test.
-    found : SearchResults
-        Results of the search.
-    """
-    ratio = float(found.clock.ratio.value) if found.clock else 1.0
-    effects = dict(model.effects)
-    for name, one in found.searches.items():
-        if not one.rounds:
-            continue
-        bias = tuple(effect for effect in model.effects.get(name, ()) if isinstance(effect, Bias))
-        effects[name] = bias + tuple(in_stated_time(effect, 1.0 / ratio) for effect in one.state.effects)
-    if found.clock is not None:
-        effects[found.clock.axis] = (*effects[found.clock.axis], SampleRateError(ratio=ratio))
-    return NoiseModel(effects, model.sample_rate_hz, model.temperature)
-
-
-def add_sample_rate_step(
-    axes: Mapping[str, AxisResult], clock: SampleRateErrorEstimate, null: Mapping[str, Mapping[str, NullDistribution]]
-) -> dict[str, AxisResult]:
-    """Return the results with a step for the wrong sample rate, on the axis that shows the error most clearly.
-
-    Parameters
-    ----------
-    axes : mapping of str to AxisResult
-        Results of all axes.
-    clock : Clock
-        Detected sample rate error.
-    null : mapping of str to mapping of str to Null
-        Null distribution for each axis and diagnostic.
-    """
-    one = axes[clock.axis]
-    half = abs(clock.frequency[1] - clock.frequency[0])
-    where = Location(frequency=(min(clock.frequency) - 0.01 * half, max(clock.frequency) + 0.01 * half))
-    limit = null[clock.axis]["lines"]
-    before, null95, threshold = (float(np.sqrt(2.0 * x)) for x in (clock.gain, limit.null95, limit.threshold))
-    after = next(score for score in one.start.scores if score.lens == "lines")
-    score = Score("lines", where, before, null95, threshold)
-    step = ReconciliationStep(
-        found=score,
-        kind="added",
-        effect=SampleRateError.name,
-        parameters={"ratio": clock.ratio},
-        confidence=float(expit(clock.gain - CLOCK_PRICE)),
-        runners_up=(),
-        before=score,
-        after=after,
-        held_out_before=None,
-        held_out_after=None,
-        held_out_reason="the clock is one for the whole recording",
-        because=(
-            f"What the model has at {clock.frequency[0]:.6g} Hz is seen at {clock.frequency[1]:.6g} Hz, and all axes "
-            f"agree with one ratio of the clocks."
-        ),
-        look=one.start,
-    )
-    verdict = one.verdict if one.verdict in ("explained", "partly_explained") else "explained"
-    if one.left_over:
-        verdict = "partly_explained"
-    return {**axes, clock.axis: replace(one, steps=(step, *one.steps), verdict=verdict)}
-
-
-def combine_decisions(verdicts: Iterable[Decision]) -> Decision:
-    """Combine the decisions of all axes into the decision for the recording."""
-    every = set(verdicts)
-    if every <= {"agrees"}:
-        return "agrees"
-    if every <= {"agrees", "explained"}:
-        return "explained"
-    return "unexplained" if every <= {"agrees", "unexplained"} else "partly_explained"
-
-
-def _reversed_leak_sources(
-    found: Mapping[str, Search], null: Mapping[str, Mapping[str, NullDistribution]]
-) -> dict[str, frozenset[str]]:
-    """Return, for each axis, the sources whose leak is wrongly assumed because the true leak has the opposite
-    direction."""
+def _reversed_leak_sources(found: Mapping[str, Search], null: Mapping[str, AxisNull]) -> dict[str, frozenset[str]]:
+    """Return, for each axis, the sources of leaks that in fact have the opposite direction."""
     gains = {
         (name, effect.source): step.trials[0].value
         for name, one in found.items()
@@ -476,8 +270,53 @@ def _reversed_leak_sources(
     for (name, source), gain in gains.items():
         if source not in found:
             continue
-        seen = found[source].seen["other_axes"]
-        suspected = seen.where.source == name and seen.gain > null[source]["other_axes"].threshold
+        finding = found[source].findings["other_axes"]
+        suspected = finding.where.source == name and finding.gain > null[source]["other_axes"].threshold
         if suspected or gains.get((source, name), np.inf) < gain:
             back[source] = back.get(source, frozenset()) | {name}
     return back
+
+
+def _add_found_effects(model: NoiseModel, found: SearchResults) -> NoiseModel:
+    """Return the model with all effects that were found."""
+    error = found.sample_rate_error
+    ratio = float(error.ratio.value) if error else 1.0
+    effects = dict(model.effects)
+    for name, search in found.extended.items():
+        bias = tuple(effect for effect in model.effects.get(name, ()) if isinstance(effect, Bias))
+        effects[name] = bias + tuple(in_stated_time(effect, 1.0 / ratio) for effect in search.state.effects)
+    if error is not None:
+        effects[error.axis] = (*effects[error.axis], SampleRateError(ratio=ratio))
+    return NoiseModel(effects, model.sample_rate_hz, model.temperature)
+
+
+def _add_sample_rate_step(
+    axes: Mapping[str, AxisResult], error: SampleRateErrorEstimate, null: Mapping[str, AxisNull]
+) -> dict[str, AxisResult]:
+    """Return the results with a step for the wrong sample rate, on the axis that shows the error most clearly."""
+    result = axes[error.axis]
+    stated, observed = error.frequency
+    margin = 0.01 * abs(observed - stated)
+    where = Location(frequency=(min(error.frequency) - margin, max(error.frequency) + margin))
+    limit = null[error.axis]["lines"]
+    before = Score("lines", where, *(float(np.sqrt(2.0 * x)) for x in (error.gain, limit.null95, limit.threshold)))
+    step = ReconciliationStep(
+        found=before,
+        kind="added",
+        effect=SampleRateError.name,
+        parameters={"ratio": error.ratio},
+        confidence=float(expit(error.gain - SAMPLE_RATE_PENALTY_NATS)),
+        runners_up=(),
+        before=before,
+        after=next(score for score in result.start.scores if score.lens == "lines"),
+        held_out_before=None,
+        held_out_after=None,
+        held_out_reason="the sample rate is common to the whole recording",
+        because=(
+            f"The feature of the model at {stated:.6g} Hz appears at {observed:.6g} Hz in the recording, and one ratio "
+            f"of true to stated sample rate agrees with all axes."
+        ),
+        look=result.start,
+    )
+    verdict: Decision = "partly_explained" if result.left_over else "explained"
+    return {**axes, error.axis: replace(result, steps=(step, *result.steps), verdict=verdict)}

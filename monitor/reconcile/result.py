@@ -6,7 +6,7 @@ the data of one plot: the measurement of one axis and the expectation of the mod
 units of the axis. Times are in seconds from the start of the recording.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -139,3 +139,13 @@ class Reconciliation:
     duration_s: float
     seed: int
     notes: tuple[str, ...] = field(default=())
+
+
+def combine_decisions(verdicts: Iterable[Decision]) -> Decision:
+    """Combine the decisions of all axes into the decision for the recording."""
+    every = set(verdicts)
+    if every <= {"agrees"}:
+        return "agrees"
+    if every <= {"agrees", "explained"}:
+        return "explained"
+    return "unexplained" if every <= {"agrees", "unexplained"} else "partly_explained"

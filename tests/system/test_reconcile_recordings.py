@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.reconcile import Recording, reconcile
+from monitor.reconcile.preparation.recording import Recording
+from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.result import Reconciliation, ReconciliationStep
 from tests.support.recordings import recordings
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from drivers.sample import AXES
+from monitor.common.distributions import Z95
 from monitor.common.units import DEVIATION_UNITS, format_duration
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.sage_husa import USED
@@ -16,7 +17,6 @@ if TYPE_CHECKING:
 
 ROW_INCHES: Final = (11.0, 2.6)
 UNIT: Final = DEVIATION_UNITS["gyro"]
-Z95: Final = 1.959964  # quantile of the normal distribution for a two-sided 95 % interval
 
 
 def save_compensation_plot(result: CompensationResult, path: Path) -> None:

@@ -58,9 +58,11 @@ DETERMINISTIC_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
 }
 """For each deterministic effect, the parameter that is its size."""
 
+SIZE_PARAMETERS: Final = NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS
+"""For each effect with a size, the parameter that is its size."""
+
 ONE_TIME_EFFECTS: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
 """Names of the effects that happen once. One part of a recording contains no information about another part."""
-
 
 NATURAL_DIAGNOSTIC: Final[dict[str, str]] = {
     "quantization_noise": "psd",
@@ -90,7 +92,7 @@ NATURAL_DIAGNOSTIC: Final[dict[str, str]] = {
 
 def size(effect: Effect) -> float:
     """Return the size of a noise effect or of a deterministic effect."""
-    return float(getattr(effect, (NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS)[type(effect)]))
+    return float(getattr(effect, SIZE_PARAMETERS[type(effect)]))
 
 
 def with_size(effect: Effect, value: float) -> Effect:
@@ -105,7 +107,7 @@ def with_size(effect: Effect, value: float) -> Effect:
     value : float
         New size, in the unit of the size parameter.
     """
-    name = (NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS)[type(effect)]
+    name = SIZE_PARAMETERS[type(effect)]
     unsigned = isinstance(effect, (RateRamp, Sinusoidal)) or type(effect) in NOISE_SIZE_PARAMETERS
     return replace(effect, **{name: abs(value) if unsigned else value})  # type: ignore[type-var]
 

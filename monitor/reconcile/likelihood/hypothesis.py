@@ -1,12 +1,12 @@
-"""Hypothesis about one axis: effects of the model, some of them with another size, and effects that were found.
+"""Hypotheses about one axis: effects of the model, some of them with another size, and effects that were found.
 
 The sizes in a model are kept unless the data contradict them. The size of a noise effect is fitted only if this gains
 more than ``RESIZE_PENALTY_NATS`` of log-likelihood. A model whose N is 5 % wrong thus gets another N and no new effect.
-A correct K keeps its size against everything that looks like a random walk. The sizes of new effects and of all
+A correct K keeps its size although other effects may look like a random walk. The sizes of new effects and of all
 deterministic effects (lines, slopes, temperature dependence) are always fitted.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from math import exp, log
 from typing import Any, Final
@@ -15,8 +15,8 @@ import numpy as np
 
 from monitor.common.distributions import HALF_CHI2_95, Z95
 from monitor.noise.effect import Effect
+from monitor.reconcile.likelihood.axis import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS, size
-from monitor.reconcile.preparation.axis import Axis, Effects, Likely
 from monitor.reconcile.result import ParameterInterval
 
 RESIZE_PENALTY_NATS: Final = 5.0
@@ -30,7 +30,12 @@ class Hypothesis:
     """Fitted effects of one axis."""
 
     model: Effects  # effects of the model under test with their original sizes; they come first in ``effects``
-    likely: Likely
+    fit: AxisFit
+
+    @property
+    def axis(self) -> Axis:
+        """Axis to which the effects are fitted."""
+        return self.fit.axis
 
     @property
     def given(self) -> int:
@@ -40,22 +45,26 @@ class Hypothesis:
     @property
     def found(self) -> Effects:
         """Effects that are not in the model under test."""
-        return self.likely.effects[self.given :]
+        return self.fit.effects[self.given :]
 
     @property
     def effects(self) -> Effects:
         """All effects with fitted sizes."""
-        return self.likely.effects
+        return self.fit.effects
 
     @property
     def freed(self) -> int:
         """Number of noise effects of the model whose size was fitted."""
-        return sum(at < self.given for at in self.likely.noises)
+        return sum(at < self.given for at in self.fit.noises)
 
     @property
     def score(self) -> float:
         """Log-likelihood less the penalty for the fitted sizes of the model, in nats."""
-        return self.likely.log_likelihood - RESIZE_PENALTY_NATS * self.freed
+        return self.fit.log_likelihood - RESIZE_PENALTY_NATS * self.freed
+
+    def refit(self, found: Sequence[Effect]) -> "Hypothesis":
+        """Return the same model with other effects added, as ``fit_with_fewest_changes`` fits them."""
+        return fit_with_fewest_changes(self.axis, found, self.model)
 
 
 def fit_with_given_sizes(axis: Axis, model: Effects) -> Hypothesis:
@@ -70,9 +79,7 @@ def fit_with_given_sizes(axis: Axis, model: Effects) -> Hypothesis:
     model : tuple of Effect
         Effects of the axis in the model under test.
     """
-    return Hypothesis(
-        model, axis.fit(model, frozenset(at for at, e in enumerate(model) if type(e) in NOISE_SIZE_PARAMETERS))
-    )
+    return Hypothesis(model, axis.fit(model, noise_indices(model)))
 
 
 def fit_with_fewest_changes(axis: Axis, found: Sequence[Effect], model: Effects) -> Hypothesis:
@@ -88,24 +95,26 @@ def fit_with_fewest_changes(axis: Axis, found: Sequence[Effect], model: Effects)
         Effects of the axis in the model under test.
     """
     effects = (*model, *found)
-    held = frozenset(at for at, effect in enumerate(model) if type(effect) in NOISE_SIZE_PARAMETERS)
+    held = noise_indices(model)
     best = Hypothesis(model, axis.fit(effects, held))
     if not held:
         return best
-    free = axis.fit(effects)
-    if free.log_likelihood - best.likely.log_likelihood < RESIZE_PENALTY_NATS:
+    free = Hypothesis(model, axis.fit(effects))
+    if free.fit.log_likelihood - best.fit.log_likelihood < RESIZE_PENALTY_NATS:
         return best
     while held:
         trials = [Hypothesis(model, axis.fit(effects, held - {at})) for at in sorted(held)]
         better = max(trials, key=lambda one: one.score)
         if better.score <= best.score:
             break
-        best, held = better, better.likely.held
-    # freeing sizes one at a time may miss that two sizes are wrong together
-    loose = Hypothesis(model, free)
-    if loose.score > best.score:
-        best = loose
-    return best
+        best, held = better, better.fit.held
+    # The loop misses the case that two sizes are wrong together.
+    return free if free.score > best.score else best
+
+
+def noise_indices(effects: Sequence[Effect]) -> frozenset[int]:
+    """Return the indices of the noise effects."""
+    return frozenset(at for at, effect in enumerate(effects) if type(effect) in NOISE_SIZE_PARAMETERS)
 
 
 def refine_shape(axis: Axis, effects: Effects, index: int, names: Sequence[str], reach: float = 1.5) -> Effects:
@@ -120,9 +129,9 @@ def refine_shape(axis: Axis, effects: Effects, index: int, names: Sequence[str],
     effects : tuple of Effect
         Effects of the axis.
     index : int
-        Index of the effect whose shape is varied.
+        Index of the effect whose shape is varied. A negative index counts from the end.
     names : sequence of str
-        Names of its shape parameters.
+        Names of the shape parameters.
     reach : float, optional
         Factor by which the first search extends up and down.
 
@@ -149,18 +158,40 @@ def with_shape(effects: Effects, index: int, name: str, value: float) -> Effects
     effects : tuple of Effect
         Effects of the axis.
     index : int
-        Index of the effect to change.
+        Index of the effect to change. A negative index counts from the end.
     name : str
         Name of the parameter.
     value : float
         New value, in the unit of the parameter.
     """
+    index %= len(effects)
     changed: Any = replace(effects[index], **{name: value})  # type: ignore[type-var]
     return (*effects[:index], changed, *effects[index + 1 :])
 
 
+def golden_section(function: Callable[[float], float], lo: float, hi: float, iterations: int) -> float:
+    """Return the position of the maximum of a function with one maximum, by golden-section search.
+
+    Parameters
+    ----------
+    function : callable
+        Function to maximise.
+    lo, hi : float
+        Ends of the interval to search.
+    iterations : int
+        Number of iterations. Each one shortens the interval by the golden ratio.
+    """
+    for _ in range(iterations):
+        a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
+        lo, hi = (lo, b) if function(a) > function(b) else (a, hi)
+    return 0.5 * (lo + hi)
+
+
 def _golden_section(axis: Axis, effects: Effects, index: int, name: str, lo: float, hi: float) -> float:
-    """Return the logarithm of the shape parameter with the largest likelihood within an interval."""
+    """Return the logarithm of the shape parameter with the largest likelihood within an interval.
+
+    Unlike ``golden_section``, this search evaluates the likelihood once per iteration.
+    """
 
     def value(x: float) -> float:
         return axis.fit(with_shape(effects, index, name, exp(x))).log_likelihood
@@ -179,48 +210,45 @@ def _golden_section(axis: Axis, effects: Effects, index: int, name: str, lo: flo
     return 0.5 * (lo + hi)
 
 
-def size_bounds(likely: Likely, index: int) -> ParameterInterval:
+def size_bounds(fit: AxisFit, index: int) -> ParameterInterval:
     """Return the size of an effect with its 95 % interval.
 
     The logarithm of a standard deviation, and the value of a signed size, is taken as Gaussian.
 
     Parameters
     ----------
-    likely : Likely
+    fit : AxisFit
         Fit that contains the effect.
     index : int
         Index of the effect.
     """
-    value, error = size(likely.effects[index]), likely.error(index)
-    if type(likely.effects[index]) in DETERMINISTIC_SIZE_PARAMETERS:
+    value, error = size(fit.effects[index]), fit.error(index)
+    if type(fit.effects[index]) in DETERMINISTIC_SIZE_PARAMETERS:
         return ParameterInterval(value, value - Z95 * error, value + Z95 * error)
     if not value > 0.0 or not np.isfinite(error):
         return ParameterInterval(value)
     return ParameterInterval(value, value * exp(-Z95 * error / value), value * exp(Z95 * error / value))
 
 
-def shape_bounds(axis: Axis, hypothesis: Hypothesis, index: int, name: str) -> ParameterInterval:
+def shape_bounds(fit: AxisFit, index: int, name: str) -> ParameterInterval:
     """Return a shape parameter with its 95 % interval from the profile likelihood.
 
     Each end of the interval is the value at which the log-likelihood has fallen by ``HALF_CHI2_95``.
 
     Parameters
     ----------
-    axis : Axis
-        Axis that was fitted.
-    hypothesis : Hypothesis
-        Fitted effects.
+    fit : AxisFit
+        Fit that contains the effect.
     index : int
         Index of the effect.
     name : str
         Name of the shape parameter.
     """
-    effects, held = hypothesis.effects, hypothesis.likely.held
-    value = float(getattr(effects[index], name))
-    top = hypothesis.likely.log_likelihood
+    value = float(getattr(fit.effects[index], name))
 
     def fall(factor: float) -> float:
-        return top - axis.fit(with_shape(effects, index, name, value * factor), held).log_likelihood
+        changed = with_shape(fit.effects, index, name, value * factor)
+        return fit.log_likelihood - fit.axis.fit(changed, fit.held).log_likelihood
 
     ends = []
     for sign in (-1.0, 1.0):

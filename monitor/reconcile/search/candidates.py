@@ -1,12 +1,13 @@
 """Candidate effects for one axis, with starting values from the data.
 
-Each function examines one family of effects. It returns effects whose shape parameters are the best of their family,
-given the effects that are already in the model. The caller fits their sizes. ``PENALTY_NATS`` is the penalty in nats
-that an effect must exceed. It consists of the gain that chance gives a true model, an allowance for effects that can
-occur at many places, and an allowance for fitted shape parameters. The values are empirical.
+Each function takes a whitened axis and examines one family of effects. It returns effects whose shape parameters are
+the best of their family, given the effects by which the axis was whitened. The caller fits the sizes. An effect must
+gain more than its penalty in ``PENALTY_NATS``. The penalty consists of the gain that chance gives a true model, an
+allowance for effects that can occur at many frequencies or times, and an allowance for fitted shape parameters. The
+values are empirical.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import numpy as np
@@ -31,9 +32,10 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.diagnostics.diagnostics import WhitenedAxis, find_line_peaks, power_gain, step_gains
-from monitor.reconcile.likelihood.hypothesis import Hypothesis, refine_shape
-from monitor.reconcile.preparation.axis import Axis, Effects
+from monitor.reconcile.diagnostics.diagnostics import find_line_peaks, power_gain, step_gains
+from monitor.reconcile.likelihood.axis import Axis, Effects
+from monitor.reconcile.likelihood.hypothesis import refine_shape
+from monitor.reconcile.likelihood.whitening import WhitenedAxis
 
 PENALTY_NATS: Final[dict[str, float]] = {
     "quantization_noise": 8.5,
@@ -67,108 +69,73 @@ SHAPES_PER_DECADE: Final = 4
 MAX_CORRELATION_FRACTION: Final = 0.1
 """Longest correlation time as a fraction of the recording. A longer correlation looks like a random walk."""
 MAX_TIME_CONSTANT_FRACTION: Final = 0.4
-"""Longest time constant of a transient or delay as a fraction of the recording. A longer one looks like a slope."""
+"""Longest time constant of a transient or delay as a fraction of the recording. A longer time constant looks like a
+slope.
+"""
 PEAK_SEPARATION_STEPS: Final = 24
 """Distance to each side, in quarters of a width, within which two windows contain the same peak."""
 MIN_DELAY_FRACTION: Final = 0.002
-"""Shortest temperature delay as a fraction of the recording. A shorter delay cannot be distinguished from none, because
-of the noise of the thermometer.
+"""Shortest temperature delay as a fraction of the recording. Because of the noise of the thermometer, a shorter delay
+cannot be detected.
 """
 MAX_PEAKS: Final = 2
 """Largest number of peaks that are examined."""
 FILTER_ORDERS: Final = (1, 2, 3, 4)
 """Orders of the low-pass filters that are tried."""
 
-CandidateFunction = Callable[[Axis, Hypothesis, WhitenedAxis], list[Effect]]
+CandidateFunction = Callable[[WhitenedAxis], list[Effect]]
 """Function that proposes effects of one family."""
 
 
-def propose_classic_terms(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
-    """Return the classic terms Q, N, B and K that the axis does not have yet.
-
-    Parameters
-    ----------
-    axis : Axis
-        Axis to fit.
-    state : Hypothesis
-        Fitted effects.
-    seen : Sight
-        Axis whitened by ``state``.
-    """
-    have = {type(effect) for effect in state.effects}
-    small = _start_size(axis)
+def propose_classic_terms(seen: WhitenedAxis) -> list[Effect]:
+    """Return the classic terms Q, N, B and K that the axis does not have yet."""
+    small = start_size(seen.axis)
     every = (QuantizationNoise(Q=small), AngleRandomWalk(N=small), BiasInstability(B=small), RateRandomWalk(K=small))
-    return [effect for effect in every if type(effect) not in have]
+    return [effect for effect in every if type(effect) not in seen.types]
 
 
-def propose_correlated_noise(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
-    """Return a list with the best exponentially correlated noise, or an empty list if its correlation time is out of
-    range.
-
-    Parameters
-    ----------
-    axis : Axis
-        Axis to fit.
-    state : Hypothesis
-        Fitted effects.
-    seen : Sight
-        Axis whitened by ``state``.
-    """
-    shortest, longest = 2.0 / axis.rate_hz, MAX_CORRELATION_FRACTION * axis.n / axis.rate_hz
-    if longest <= shortest:
-        return []
-    times_s = np.geomspace(shortest, longest, max(3, round(SHAPES_PER_DECADE * np.log10(longest / shortest))))
-    trials: list[Effect] = [
-        ExponentiallyCorrelated(sigma=_start_size(axis), correlation_time=float(t)) for t in times_s
-    ]
-    best = _most_likely(axis, state.effects, trials)
-    found = refine_shape(axis, (*state.effects, best), len(state.effects), ["correlation_time"], 2.0)[-1]
-    assert isinstance(found, ExponentiallyCorrelated)
-    return [found] if shortest <= found.correlation_time <= longest else []
+def propose_correlated_noise(seen: WhitenedAxis) -> list[Effect]:
+    """Return the best exponentially correlated noise, or nothing if its correlation time is out of range."""
+    return correlated_noise(seen.axis, seen.effects)
 
 
-def propose_resonances(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
-    """Return resonances at the peaks of the whitened spectrum.
-
-    Parameters
-    ----------
-    axis : Axis
-        Axis to fit.
-    state : Hypothesis
-        Fitted effects.
-    seen : Sight
-        Axis whitened by ``state``.
-    """
-    found: list[Effect] = []
-    for middle, width in find_spectral_peaks(seen):
-        trials: list[Effect] = [
-            Narrowband(sigma=_start_size(axis), frequency=middle, bandwidth=float(width * factor))
-            for factor in (0.3, 0.6, 1.0, 1.8)
-        ]
-        best = _most_likely(axis, state.effects, trials)
-        at = len(state.effects)
-        effects = refine_shape(axis, (*state.effects, best), at, ["bandwidth"], 2.5)
-        effects = refined_frequency(axis, effects, at)
-        effects = refine_shape(axis, effects, at, ["bandwidth"], 1.5)
-        found.append(effects[at])
-    return found
-
-
-def refined_frequency(axis: Axis, effects: Effects, index: int) -> Effects:
-    """Return the effects with the centre frequency of a resonance refined within its width.
+def correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
+    """Return the best exponentially correlated noise, or nothing if its correlation time is out of range.
 
     Parameters
     ----------
     axis : Axis
         Axis to fit.
     effects : tuple of Effect
-        Effects of the axis.
-    index : int
-        Index of the resonance.
+        Other effects of the axis.
     """
-    peak = effects[index]
-    assert isinstance(peak, Narrowband)
-    return refine_shape(axis, effects, index, ["frequency"], 1.0 + 0.7 * peak.bandwidth / peak.frequency)
+    shortest, longest = 2.0 / axis.rate_hz, MAX_CORRELATION_FRACTION * axis.n / axis.rate_hz
+    if longest <= shortest:
+        return []
+    times_s = np.geomspace(shortest, longest, max(3, round(SHAPES_PER_DECADE * np.log10(longest / shortest))))
+    best = _most_likely(
+        axis, effects, [ExponentiallyCorrelated(sigma=start_size(axis), correlation_time=float(t)) for t in times_s]
+    )
+    found = refine_shape(axis, (*effects, best), -1, ["correlation_time"], 2.0)[-1]
+    assert isinstance(found, ExponentiallyCorrelated)
+    return [found] if shortest <= found.correlation_time <= longest else []
+
+
+def propose_resonances(seen: WhitenedAxis) -> list[Effect]:
+    """Return resonances at the peaks of the whitened spectrum."""
+    axis, found = seen.axis, list[Effect]()
+    for middle, width in find_spectral_peaks(seen):
+        trials = [
+            Narrowband(sigma=start_size(axis), frequency=middle, bandwidth=float(width * factor))
+            for factor in (0.3, 0.6, 1.0, 1.8)
+        ]
+        effects = (*seen.effects, _most_likely(axis, seen.effects, trials))
+        effects = refine_shape(axis, effects, -1, ["bandwidth"], 2.5)
+        peak = effects[-1]
+        assert isinstance(peak, Narrowband)
+        effects = refine_shape(axis, effects, -1, ["frequency"], 1.0 + 0.7 * peak.bandwidth / peak.frequency)
+        found.append(refine_shape(axis, effects, -1, ["bandwidth"], 1.5)[-1])
+    return found
 
 
 def find_spectral_peaks(seen: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple[float, float]]:
@@ -176,7 +143,7 @@ def find_spectral_peaks(seen: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple
 
     Parameters
     ----------
-    seen : Sight
+    seen : WhitenedAxis
         Whitened axis.
     most : int, optional
         Largest number of peaks.
@@ -193,9 +160,8 @@ def find_spectral_peaks(seen: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple
     width = 8
     while width < n // 8:
         first = np.arange(width, n - 1 - width, max(1, width // 4))
-        gains = power_gain(
-            np.maximum((running[first + width] - running[first]) / width, 1.0), np.full(first.size, width)
-        )
+        power = np.maximum((running[first + width] - running[first]) / width, 1.0)
+        gains = power_gain(power, np.full(first.size, width))
         for _ in range(most):
             at = int(np.argmax(gains))
             middle = (first[at] + 0.5 * width) * step_hz
@@ -211,24 +177,13 @@ def find_spectral_peaks(seen: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple
     return chosen
 
 
-def propose_sinusoids(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
-    """Return sinusoids at the lines of the spectrum.
-
-    Parameters
-    ----------
-    axis : Axis
-        Axis to fit.
-    state : Hypothesis
-        Fitted effects.
-    seen : Sight
-        Axis whitened by ``state``.
-    """
-    found: list[Effect] = []
-    for gain, f_hz in find_line_peaks(seen.white, axis.rate_hz, MAX_PEAKS):
-        if gain > PENALTY_NATS["sinusoidal"] / 2.0:
-            best = line_frequency(seen, f_hz)
-            found.append(Sinusoidal(amplitude=_start_size(axis), frequency=best, phase=0.0))
-    return found
+def propose_sinusoids(seen: WhitenedAxis) -> list[Effect]:
+    """Return sinusoids at the lines of the spectrum."""
+    return [
+        Sinusoidal(amplitude=start_size(seen.axis), frequency=line_frequency(seen, f_hz), phase=0.0)
+        for gain, f_hz in find_line_peaks(seen.white, seen.axis.rate_hz, MAX_PEAKS)
+        if gain > PENALTY_NATS["sinusoidal"] / 2.0
+    ]
 
 
 def line_frequency(seen: WhitenedAxis, f_hz: float) -> float:
@@ -236,7 +191,7 @@ def line_frequency(seen: WhitenedAxis, f_hz: float) -> float:
 
     Parameters
     ----------
-    seen : Sight
+    seen : WhitenedAxis
         Whitened axis.
     f_hz : float
         Approximate frequency in Hz.
@@ -254,116 +209,75 @@ def line_frequency(seen: WhitenedAxis, f_hz: float) -> float:
     return 0.5 * (lo + hi)
 
 
-def propose_low_pass(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
-    """Return a list with the best low-pass filter, or an empty list if the effects already contain one or no filter
-    fits.
-
-    Parameters
-    ----------
-    axis : Axis
-        Axis to fit.
-    state : Hypothesis
-        Fitted effects.
-    seen : Sight
-        Axis whitened by ``state``.
-    """
-    if any(isinstance(effect, BandwidthLimit) for effect in state.effects):
+def propose_low_pass(seen: WhitenedAxis) -> list[Effect]:
+    """Return the best low-pass filter, or nothing if the effects already contain one or no filter fits."""
+    if BandwidthLimit in seen.types:
         return []
+    axis = seen.axis
     nyquist = 0.5 * axis.rate_hz
     cutoffs = nyquist * np.geomspace(0.04, 0.95, 11)
     found: list[Effect] = []
     for order in FILTER_ORDERS:
-        best = _most_likely(axis, state.effects, [BandwidthLimit(cutoff=float(f), order=order) for f in cutoffs])
-        at = len(state.effects)
-        effects = refine_shape(axis, (*state.effects, best), at, ["cutoff"], 1.4)
-        if effects[at].cutoff < 0.99 * nyquist:  # type: ignore[attr-defined]
-            found.append(effects[at])
-    return [_most_likely(axis, state.effects, found)] if found else []
+        best = _most_likely(axis, seen.effects, [BandwidthLimit(cutoff=float(f), order=order) for f in cutoffs])
+        refined = refine_shape(axis, (*seen.effects, best), -1, ["cutoff"], 1.4)[-1]
+        assert isinstance(refined, BandwidthLimit)
+        if refined.cutoff < 0.99 * nyquist:
+            found.append(refined)
+    return [_most_likely(axis, seen.effects, found)] if found else []
 
 
-def propose_drifts(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
-    """Return effects that follow time: a ramp, a transient after the start, and a step.
-
-    Parameters
-    ----------
-    axis : Axis
-        Axis to fit.
-    state : Hypothesis
-        Fitted effects.
-    seen : Sight
-        Axis whitened by ``state``.
-    """
-    length_s = axis.n / axis.rate_hz
-    have = {type(effect) for effect in state.effects}
+def propose_drifts(seen: WhitenedAxis) -> list[Effect]:
+    """Return effects that follow time: a ramp, a transient after the start, and a step."""
     found: list[Effect] = []
-    if RateRamp not in have:
-        found.append(RateRamp(R=_start_size(axis)))
-    if TurnOnTransient not in have:
-        times_s = np.geomspace(0.003, MAX_TIME_CONSTANT_FRACTION, 9) * length_s
-        trials: list[Effect] = [TurnOnTransient(amplitude=1.0, time_constant=float(t)) for t in times_s]
-        best = _most_likely(axis, state.effects, trials)
-        at = len(state.effects)
-        effects = refine_shape(axis, (*state.effects, best), at, ["time_constant"], 1.6)
-        if effects[at].time_constant <= MAX_TIME_CONSTANT_FRACTION * length_s:  # type: ignore[attr-defined]
-            found.append(effects[at])
-    if not have & {PoissonSteps, RandomTelegraph}:
-        gains, times = step_gains(seen)
-        found.append(BiasStep(time=float(times[int(np.argmax(gains))]), height=1.0))
+    if RateRamp not in seen.types:
+        found.append(RateRamp(R=start_size(seen.axis)))
+    if TurnOnTransient not in seen.types:
+        times_s = np.geomspace(0.003, MAX_TIME_CONSTANT_FRACTION, 9) * seen.axis.length_s
+        trials = [TurnOnTransient(amplitude=1.0, time_constant=float(t)) for t in times_s]
+        found += _best_time_constant(seen, trials, 1.6, 0.0)
+    if not seen.types & {PoissonSteps, RandomTelegraph}:
+        gains, times_s = step_gains(seen)
+        found.append(BiasStep(time=float(times_s[int(np.argmax(gains))]), height=1.0))
     return found
 
 
-def propose_temperature_effects(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
-    """Return effects that follow the temperature: linearly, quadratically or with a delay.
-
-    Parameters
-    ----------
-    axis : Axis
-        Axis to fit.
-    state : Hypothesis
-        Fitted effects.
-    seen : Sight
-        Axis whitened by ``state``.
-    """
-    if axis.temperature_c is None or np.ptp(axis.temperature_c) == 0.0:
+def propose_temperature_effects(seen: WhitenedAxis) -> list[Effect]:
+    """Return effects that follow the temperature: linearly, quadratically or with a delay."""
+    temperature_c = seen.axis.temperature_c
+    if temperature_c is None or np.ptp(temperature_c) == 0.0:
         return []
-    have = {type(effect) for effect in state.effects}
-    reference = float(round(axis.temperature_c.mean(), 2))
+    reference = float(round(temperature_c.mean(), 2))
     found: list[Effect] = []
-    if TemperatureBias not in have:
+    if TemperatureBias not in seen.types:
         found.append(TemperatureBias(coefficient=1.0, reference=reference))
         found.append(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0))
-    if TemperatureLag not in have:
-        length_s = axis.n / axis.rate_hz
-        times_s = np.geomspace(MIN_DELAY_FRACTION * length_s, MAX_TIME_CONSTANT_FRACTION * length_s, 9)
-        trials: list[Effect] = [
-            TemperatureLag(coefficient=1.0, reference=reference, time_constant=float(t)) for t in times_s
-        ]
-        best = _most_likely(axis, state.effects, trials)
-        at = len(state.effects)
-        effects = refine_shape(axis, (*state.effects, best), at, ["time_constant"], 2.2)
-        if MIN_DELAY_FRACTION * length_s < effects[at].time_constant <= MAX_TIME_CONSTANT_FRACTION * length_s:  # type: ignore[attr-defined]
-            found.append(effects[at])
+    if TemperatureLag not in seen.types:
+        shortest_s = MIN_DELAY_FRACTION * seen.axis.length_s
+        times_s = np.geomspace(shortest_s, MAX_TIME_CONSTANT_FRACTION * seen.axis.length_s, 9)
+        lags = [TemperatureLag(coefficient=1.0, reference=reference, time_constant=float(t)) for t in times_s]
+        found += _best_time_constant(seen, lags, 2.2, shortest_s)
     return found
 
 
-def propose_leaks(axis: Axis, state: Hypothesis, seen: WhitenedAxis) -> list[Effect]:
-    """Return leaks from the other axes.
+def _best_time_constant(
+    seen: WhitenedAxis, trials: Sequence[TurnOnTransient | TemperatureLag], reach: float, shortest_s: float
+) -> list[Effect]:
+    """Return the best effect with a refined time constant, or nothing if the time constant is out of range."""
+    best = _most_likely(seen.axis, seen.effects, trials)
+    refined = refine_shape(seen.axis, (*seen.effects, best), -1, ["time_constant"], reach)[-1]
+    assert isinstance(refined, (TurnOnTransient, TemperatureLag))
+    longest_s = MAX_TIME_CONSTANT_FRACTION * seen.axis.length_s
+    return [refined] if shortest_s < refined.time_constant <= longest_s else []
 
-    Parameters
-    ----------
-    axis : Axis
-        Axis to fit.
-    state : Hypothesis
-        Fitted effects.
-    seen : Sight
-        Axis whitened by ``state``.
-    """
-    have = {getattr(effect, "source", None) for effect in state.effects}
+
+def propose_leaks(seen: WhitenedAxis) -> list[Effect]:
+    """Return leaks from the other axes."""
+    known = {getattr(effect, "source", None) for effect in seen.effects}
     found: list[Effect] = []
-    for source in axis.others:
-        if source not in have:
-            same = (source in GYROS) == (axis.name in GYROS)
-            leak = CrossAxis if same else GSensitivity
+    for source in seen.axis.others:
+        if source not in known:
+            same_kind = (source in GYROS) == (seen.axis.name in GYROS)
+            leak = CrossAxis if same_kind else GSensitivity
             found.append(leak(source=source, coefficient=1.0))
     return found
 
@@ -384,11 +298,11 @@ DETERMINISTIC_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (
 """Functions that propose effects that follow time, temperature or another axis."""
 
 
-def _most_likely(axis: Axis, effects: Effects, trials: list[Effect]) -> Effect:
+def _most_likely(axis: Axis, effects: Effects, trials: Sequence[Effect]) -> Effect:
     """Return the effect with the largest likelihood, with all sizes free."""
     return max(trials, key=lambda one: axis.fit((*effects, one)).log_likelihood)
 
 
-def _start_size(axis: Axis) -> float:
+def start_size(axis: Axis) -> float:
     """Return a starting size that is small compared with the standard deviation of the samples."""
-    return 1e-3 * float(np.sqrt(np.mean(axis.coefficients**2)))
+    return 1e-3 * axis.rms

@@ -1,10 +1,10 @@
 """Cross-validation of a new effect on the two halves of a recording.
 
-The effect is fitted to one half of the recording, including all sizes. The other half is examined with the diagnostic
-that found the difference, with the model before and with the model after the step. Then the halves are exchanged. The
-effect is kept if the difference decreases and the likelihood of the unseen half increases. Some effects cannot be
-validated, because they happen once or because one half would gain less than ``MIN_HALF_GAIN_NATS``. They are kept, and
-the reason is reported.
+The effect is fitted to one half of the recording, including all sizes. The other half is tested with the diagnostic
+that found the difference, once with the model before the step and once with the model after the step. Then the halves
+are exchanged. The effect is kept if the difference decreases and the likelihood of the unseen half increases. Some
+effects cannot be validated, because they happen once or because one half would gain less than ``MIN_HALF_GAIN_NATS``.
+These effects are kept, and the reason is reported.
 """
 
 from collections.abc import Collection
@@ -17,23 +17,21 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Outliers, Resolution, SampleHold, Saturation, Sinusoidal
-from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, whiten_axis
-from monitor.reconcile.diagnostics.gap import NullDistribution
-from monitor.reconcile.likelihood.effect_terms import (
-    DETERMINISTIC_SIZE_PARAMETERS,
-    NOISE_SIZE_PARAMETERS,
-    ONE_TIME_EFFECTS,
-    size,
-)
-from monitor.reconcile.likelihood.hypothesis import Hypothesis
-from monitor.reconcile.preparation.axis import Axis, Effects, Likely, RegressorCache
+from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
+from monitor.reconcile.diagnostics.null_distribution import NullDistribution
+from monitor.reconcile.likelihood.axis import Axis, AxisFit, Effects, RegressorCache
+from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMETERS, ONE_TIME_EFFECTS, size
+from monitor.reconcile.likelihood.hypothesis import Hypothesis, noise_indices
+from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins, inverse_cosine_transform
-from monitor.reconcile.preparation.prepare import measure_value_statistics, repair_again
+from monitor.reconcile.search.axis_preparation import measure_value_statistics, repair_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
 """Smallest gain in nats that one half must be able to provide."""
 SAMPLE_EFFECTS: Final = (Resolution, Saturation, SampleHold, Outliers)
 """Effects that are visible in single samples and not in the spectrum."""
+TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too little evidence for the effect"
+"""Reason why a weak effect is not validated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +44,12 @@ class CrossValidation:
     reason: str  # why no validation was possible; the gaps are then NaN and the step is kept
 
 
+def not_validated(reason: str) -> CrossValidation:
+    """Return the result for a step that cannot be validated, with the reason."""
+    return CrossValidation(float("nan"), float("nan"), True, reason)
+
+
 def cross_validate(
-    axis: Axis,
     before: Hypothesis,
     after: Hypothesis,
     added: Effect | None,
@@ -59,87 +61,91 @@ def cross_validate(
 
     Parameters
     ----------
-    axis : Axis
-        Axis, repaired for the effects in ``after``.
     before, after : Hypothesis
-        Effects before and after the step, fitted to the whole axis.
+        Effects before and after the step, fitted to the whole axis. The axis of ``after`` is repaired for the effects
+        in ``after``.
     added : Effect or None
         Effect that was added. None means that only sizes of known noise effects were changed.
     lens : str
         Name of the diagnostic that found the difference.
-    null : Null
+    null : NullDistribution
         Null distribution of this diagnostic.
     rng : numpy.random.Generator
         Generator for the replacement samples.
     """
     if added is not None and added.name in ONE_TIME_EFFECTS:
-        return _not_applicable("it happens once")
-    parts = [slice(0, axis.n // 2), slice(axis.n - axis.n // 2, axis.n)]
+        return not_validated("the effect happens only once")
+    n = after.axis.n
+    parts = [slice(0, n // 2), slice(n - n // 2, n)]
     sources = {getattr(effect, "source", "") for effect in (*before.effects, *after.effects)}
-    repaired = [_half_axis(axis, part, after.effects, sources, rng) for part in parts]
+    repaired = [_half_axis(after.axis, part, after.effects, sources, rng) for part in parts]
     if isinstance(added, SAMPLE_EFFECTS):
-        halves = [_half_axis(axis, part, before.effects, sources, rng) for part in parts]
-        return _validate_sample_effect(halves, repaired, before, after, lens)
-    if (
-        type(added) in DETERMINISTIC_SIZE_PARAMETERS
-        and min(_expected_gain(half, after, len(after.effects) - 1) for half in repaired) < MIN_HALF_GAIN_NATS
-    ):
-        return _not_applicable("one half of the recording alone shows too little of it")
-    gain = after.likely.log_likelihood - before.likely.log_likelihood
-    if gain < 4.0 * MIN_HALF_GAIN_NATS:
-        return _not_applicable("one half of the recording alone shows too little of it")
+        halves = [_half_axis(after.axis, part, before.effects, sources, rng) for part in parts]
+        gap_before, gap_after = _summed_gap(halves, before, lens), _summed_gap(repaired, after, lens)
+        return CrossValidation(gap_before, gap_after, gap_after < gap_before, "")
+    if type(added) in DETERMINISTIC_SIZE_PARAMETERS:
+        gains = [_expected_gain(_fit_half(half, after), after.effects[-1]) for half in repaired]
+        if min(gains) < MIN_HALF_GAIN_NATS:
+            return not_validated(TOO_LITTLE_EVIDENCE)
+    if after.fit.log_likelihood - before.fit.log_likelihood < 4.0 * MIN_HALF_GAIN_NATS:
+        return not_validated(TOO_LITTLE_EVIDENCE)
+    return _exchange_halves(repaired, before, after, lens, null)
+
+
+def _fit_half(half: Axis, state: Hypothesis) -> AxisFit:
+    """Fit the effects of a hypothesis to one half of the axis."""
+    return half.fit(state.effects, state.fit.held)
+
+
+def _summed_gap(halves: list[Axis], state: Hypothesis, lens: str) -> float:
+    """Return the gap of a diagnostic in both halves together, each with its own fit."""
+    return sqrt(sum(DIAGNOSTICS[lens](whiten_axis(_fit_half(half, state))).gain for half in halves))
+
+
+def _exchange_halves(
+    halves: list[Axis], before: Hypothesis, after: Hypothesis, lens: str, null: NullDistribution
+) -> CrossValidation:
+    """Fit each half, with and without the step, and test the other half with this fit."""
     gaps = np.zeros(2)
     better = 0.0
     for learn, test in ((0, 1), (1, 0)):
         for at, state in enumerate((before, after)):
-            learned = repaired[learn].fit(state.effects, state.likely.held)
-            seen = _predict_half(repaired[test], learned)
-            gaps[at] += DIAGNOSTICS[lens](whiten_axis(repaired[test], seen)).gain
-            better += seen.log_likelihood * (2 * at - 1)
+            predicted = _predict_half(halves[test], _fit_half(halves[learn], state))
+            gaps[at] += DIAGNOSTICS[lens](whiten_axis(predicted)).gain
+            better += predicted.log_likelihood * (2 * at - 1)
     gap_before, gap_after = (sqrt(gain) for gain in gaps)
     below = gap_after < max(gap_before, sqrt(2.0 * null.threshold))
     return CrossValidation(gap_before, gap_after, bool(better > 0.0 and below), "")
 
 
-def _not_applicable(reason: str) -> CrossValidation:
-    """Return the result for a step that cannot be validated, with the reason."""
-    return CrossValidation(float("nan"), float("nan"), True, reason)
-
-
 def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[str], rng: np.random.Generator) -> Axis:
     """Return one half of an axis as an axis of its own."""
-    raw = axis.raw[part]
-    n = raw.size
-    warmth = None if axis.temperature_c is None else axis.temperature_c[part]
+    raw, y = axis.raw[part], axis.repaired[part]
+    temperature_c = None if axis.temperature_c is None else axis.temperature_c[part]
     others = {
-        name: cosine_transform(_part_of_series(one, part)) for name, one in axis.others.items() if name in sources
+        name: cosine_transform(inverse_cosine_transform(one)[part])
+        for name, one in axis.others.items()
+        if name in sources
     }
-    y = axis.repaired[part]
     half = Axis(
         axis.name,
         raw,
         y,
         cosine_transform(y),
-        frequency_bins(n, axis.rate_hz),
+        frequency_bins(raw.size, axis.rate_hz),
         others,
-        warmth,
+        temperature_c,
         measure_value_statistics(raw),
-        RegressorCache(n, axis.rate_hz, warmth),
+        RegressorCache(raw.size, axis.rate_hz, temperature_c),
     )
     return repair_again(half, effects, rng)
 
 
-def _part_of_series(coefficients: Floats, part: slice) -> Floats:
-    """Return a part of the series that has the given coefficients."""
-    return inverse_cosine_transform(coefficients)[part]
-
-
-def _expected_gain(half: Axis, state: Hypothesis, index: int) -> float:
-    """Return the gain in nats of a deterministic effect with the fitted size in one half: ½ Σ (β R)²/v."""
-    learned = half.fit(state.effects, state.likely.held)
-    effect = state.effects[index]
+def _expected_gain(fit: AxisFit, effect: Effect) -> float:
+    """Return the gain in nats of a deterministic effect of a given size beside the noise of a fit: ½ Σ (β R)²/v."""
+    half = fit.axis
     columns = half.columns(effect)
-    weight = half.bins.spread(half.used_bins / learned.fitted.variance)
+    weight = half.bins.spread(half.used_bins / fit.fitted.variance)
     if isinstance(effect, Sinusoidal):
         return 0.5 * effect.amplitude**2 * float((columns[0] ** 2 * weight).sum())
     quadratic = getattr(effect, "quadratic", None)
@@ -147,54 +153,37 @@ def _expected_gain(half: Axis, state: Hypothesis, index: int) -> float:
     return 0.5 * float((made**2 * weight).sum())
 
 
-def _predict_half(half: Axis, learned: Likely) -> Likely:
+def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
     """Return one half of an axis with the fit of the other half.
 
-    Noise effects keep the sizes that were learned. Deterministic effects keep them as far as they are known. The
-    learning half gives the sizes β₁ with covariance C₁, and the other half alone gives β₂ with C₂. The log-likelihood
-    is that of β₂ less the penalty for their distance Δ, ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln |C₁ + C₂|/|C₂|. The resulting sizes are
-    the weighted mean of both. The phase of a line is fitted anew.
+    Noise effects keep the sizes that were learned. For deterministic effects, the learning half gives the sizes β₁ with
+    covariance C₁, and the other half alone gives β₂ with C₂. The resulting sizes are the weighted mean of both. The
+    log-likelihood is that of β₂ less the penalty for the distance Δ of the sizes, ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln |C₁ +
+    C₂|/|C₂|. The phase of a line is fitted anew.
     """
     effects = learned.effects
-    held = frozenset(at for at, effect in enumerate(effects) if type(effect) in NOISE_SIZE_PARAMETERS)
-    free = half.fit(effects, held)
+    free = half.fit(effects, noise_indices(effects))
     beta = free.fitted.beta.copy()
-    for at, place in free.courses:
-        line = effects[at]
-        if isinstance(line, Sinusoidal):  # the phase is fitted anew, the amplitude is kept
-            beta[place] *= line.amplitude / max(float(np.hypot(*beta[place])), 1e-300)
-    free = half.with_beta(free, beta)
-    known = [
-        k
-        for at, place in free.courses
-        for k in range(place.start, place.stop)
-        if not isinstance(effects[at], Sinusoidal)
-    ]
+    known: list[int] = []
+    for at, place in free.regressors:
+        effect = effects[at]
+        if isinstance(effect, Sinusoidal):  # the phase is fitted anew, the amplitude is kept
+            beta[place] *= effect.amplitude / max(float(np.hypot(*beta[place])), 1e-300)
+        else:
+            known += range(place.start, place.stop)
+    free = free.with_beta(beta)
     if not known:
         return free
     pick = np.ix_(known, known)
     here, there = (_regularised(one.fitted.beta_covariance[pick]) for one in (free, learned))
     apart = free.fitted.beta[known] - learned.fitted.beta[known]
     both = here + there
-    price = 0.5 * float(apart @ np.linalg.pinv(both) @ apart)
-    price += 0.5 * float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(here)[1])
+    penalty = 0.5 * float(apart @ np.linalg.pinv(both) @ apart)
+    penalty += 0.5 * float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(here)[1])
     beta[known] -= here @ np.linalg.pinv(both) @ apart
-    fixed = half.with_beta(free, beta)
-    return replace(fixed, log_likelihood=free.log_likelihood - price)
+    return replace(free.with_beta(beta), log_likelihood=free.log_likelihood - penalty)
 
 
 def _regularised(covariance: Floats) -> Floats:
     """Return a covariance with a small addition to its diagonal, so that its determinant exists."""
     return covariance + np.diag(1e-9 * np.diag(covariance) + 1e-300)
-
-
-def _validate_sample_effect(
-    halves: list[Axis], repaired: list[Axis], before: Hypothesis, after: Hypothesis, lens: str
-) -> CrossValidation:
-    """Compare the halves before and after the repair of single samples."""
-    gaps = np.zeros(2)
-    for half, put_right in zip(halves, repaired, strict=True):
-        for at, (axis, state) in enumerate(((half, before), (put_right, after))):
-            gaps[at] += DIAGNOSTICS[lens](whiten_axis(axis, axis.fit(state.effects, state.likely.held))).gain
-    one, other = (sqrt(gain) for gain in gaps)
-    return CrossValidation(one, other, other < one, "")

@@ -1,14 +1,16 @@
 """Alternatives to Gaussian effects that have the same spectrum but another distribution.
 
 The pairs are correlated noise and random telegraph, random walk and Poisson steps, and single steps and Poisson steps.
-The search first finds the effect with a Gaussian likelihood. Here the alternative gets its own likelihood on the same
-axis, with all other effects unchanged. It replaces the effect if it is better by ``MIN_ALTERNATIVE_GAIN_NATS``.
+The search first finds the effect with a Gaussian likelihood. Here the alternative gets a full likelihood on the same
+axis, with all other effects unchanged. The alternative replaces the effect if the log-likelihood is larger by
+``MIN_ALTERNATIVE_GAIN_NATS``.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
+from drivers.sample import Floats
 from monitor.noise.effects import (
     AngleRandomWalk,
     BiasInstability,
@@ -18,28 +20,38 @@ from monitor.noise.effects import (
     RandomTelegraph,
     RateRandomWalk,
 )
+from monitor.reconcile.likelihood.axis import AxisFit, Effects
 from monitor.reconcile.likelihood.effect_terms import size
 from monitor.reconcile.likelihood.hidden_state import BackgroundNoise
 from monitor.reconcile.likelihood.hypothesis import Hypothesis
 from monitor.reconcile.likelihood.poisson_steps import compare_steps_with_random_walk
 from monitor.reconcile.likelihood.random_telegraph import compare_telegraph_with_correlated
 from monitor.reconcile.likelihood.single_steps import compare_steps_with_single_steps
-from monitor.reconcile.preparation.axis import Axis, Effects
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import ParameterInterval
+from monitor.reconcile.search.candidates import PENALTY_NATS, correlated_noise
+from monitor.reconcile.search.trials import Trial
 
 MIN_ALTERNATIVE_GAIN_NATS: Final = 3.0
 """Gain in nats that an alternative must reach. In 2 of 4000 simulated recordings, telegraph and correlated noise were
 confused in spite of a larger gain.
 """
 POISSON_PENALTY_NATS: Final = 1.0
-"""Additional gain in nats that Poisson steps must reach. A random walk is their limit and never fits better."""
+"""Additional gain in nats that Poisson steps must reach. A random walk is the limit of Poisson steps and never fits
+better.
+"""
 MAX_FREE_STEPS: Final = 2
 """Number of single steps without an additional penalty."""
 STEP_PENALTY_NATS: Final = 3.0
 """Penalty in nats for each further single step. A new effect costs more than a new step time."""
 MIN_FITTED_STEPS: Final = 5
 """Smallest limit for the number of single steps that are compared with Poisson steps."""
+MIN_SWITCHES: Final = 10
+"""Smallest number of switches of a telegraph that is preferred to Poisson steps. Fewer jumps may alternate in sign by
+chance.
+"""
+WALK_EFFECTS: Final = (BiasStep, RateRandomWalk)
+"""Effects that jump processes are compared with."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,14 +65,80 @@ class NonGaussianAlternative:
     whole: float = 0.0  # log-likelihood with Poisson steps: that of a random walk plus their gain over it
     rival: "NonGaussianAlternative | None" = None  # the alternative that this one was preferred to
 
+    def trials(self, value: float) -> tuple[Trial, ...]:
+        """Return the trials of this alternative to an effect with the given value in nats, and of the rival."""
+        effect = self.found[-1]
+        trial = Trial(effect.name, effect, value + self.gain, bounds=self.bounds, events=self.events)
+        return (trial, *(self.rival.trials(value) if self.rival else ()))
 
-def fit_telegraph_alternative(axis: Axis, state: Hypothesis, at: int) -> NonGaussianAlternative | None:
+
+def resolve_distribution(state: Hypothesis, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
+    """Replace a new effect by an effect with the same spectrum if this distribution fits better.
+
+    Parameters
+    ----------
+    state : Hypothesis
+        Fitted effects, of which the last one is new.
+    trials : list of Trial
+        Trials of which the first one was selected.
+
+    Returns
+    -------
+    state : Hypothesis
+        Fitted effects with the selected alternative.
+    trials : list of Trial
+        Trials with the alternatives included.
+    """
+    alternative, new = None, trials[0].effect
+    if isinstance(new, ExponentiallyCorrelated) and isinstance(state.effects[-1], ExponentiallyCorrelated):
+        alternative = fit_telegraph_alternative(state, len(state.effects) - 1)
+    elif isinstance(new, BiasStep):
+        alternative = compare_jump_processes(state)
+    if alternative is None:
+        return state, trials
+    added = alternative.trials(trials[0].value)
+    if alternative.gain <= MIN_ALTERNATIVE_GAIN_NATS:
+        return state, [trials[0], *added, *trials[1:]]
+    return state.refit(alternative.found), [*added, *trials]
+
+
+def compare_jump_processes(state: Hypothesis) -> NonGaussianAlternative | None:
+    """Return Poisson steps as alternative to a random walk or single steps, or a slow telegraph if it fits better.
+
+    The result is None if the axis has no random walk and no steps that Poisson steps could replace.
+    """
+    steps = fit_poisson_alternative(state)
+    if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
+        return steps
+    # Use the original random walk of the model. An increased random walk would leave nothing for a telegraph.
+    bare, held = _with_original_walks(state)
+    for noise in correlated_noise(state.axis, state.axis.fit(bare, held).effects):
+        other = Hypothesis(state.model, state.axis.fit((*bare, noise), held))
+        if size(other.found[-1]) == 0.0:
+            continue
+        telegraph = fit_telegraph_alternative(other, len(other.effects) - 1)
+        if telegraph is None or telegraph.events < MIN_SWITCHES:
+            continue
+        excess = other.fit.log_likelihood + telegraph.gain - steps.whole
+        excess -= PENALTY_NATS["random_telegraph"] - PENALTY_NATS["poisson_steps"]
+        if excess > 0.0:
+            return replace(telegraph, gain=steps.gain + excess, rival=steps)
+    return steps
+
+
+def _with_original_walks(state: Hypothesis) -> tuple[Effects, frozenset[int]]:
+    """Return the effects without found steps and walks, with the original walks of the model, and the fixed sizes."""
+    walks = frozenset(at for at, effect in enumerate(state.model) if isinstance(effect, WALK_EFFECTS))
+    known = [state.model[at] if at in walks else state.effects[at] for at in range(state.given)]
+    held = frozenset(at for at in range(state.given) if at in state.fit.held or at in walks)
+    return (*known, *(one for one in state.found if not isinstance(one, WALK_EFFECTS))), held
+
+
+def fit_telegraph_alternative(state: Hypothesis, at: int) -> NonGaussianAlternative | None:
     """Return a random telegraph as alternative to correlated noise.
 
     Parameters
     ----------
-    axis : Axis
-        Axis to fit.
     state : Hypothesis
         Fitted effects.
     at : int
@@ -73,74 +151,57 @@ def fit_telegraph_alternative(axis: Axis, state: Hypothesis, at: int) -> NonGaus
     """
     noise = state.effects[at]
     assert isinstance(noise, ExponentiallyCorrelated)
-    rest = _background_noise(state.effects, without=at)
+    rest = background_noise((*state.effects[:at], *state.effects[at + 1 :]))
     if not rest.white > 0.0:
         return None
-    contest = compare_telegraph_with_correlated(
-        inverse_cosine_transform(axis.residual(state.likely)),
-        1.0 / axis.rate_hz,
-        rest,
-        noise.sigma,
-        noise.correlation_time,
-    )
-    amplitude, dwell = (float(contest.first[name].value) for name in ("amplitude", "dwell_time"))
+    series, tau0_s = _residual_series(state.fit), 1.0 / state.axis.rate_hz
+    compared = compare_telegraph_with_correlated(series, tau0_s, rest, noise.sigma, noise.correlation_time)
+    amplitude, dwell = (float(compared.first[name].value) for name in ("amplitude", "dwell_time"))
     effect = RandomTelegraph(amplitude=amplitude, dwell_time=dwell)
     found = (*state.effects[state.given : at], *state.effects[at + 1 :], effect)
-    return NonGaussianAlternative(found, contest.gain, contest.first, contest.events)
+    return NonGaussianAlternative(found, compared.gain, compared.first, compared.events)
 
 
-def fit_poisson_alternative(axis: Axis, state: Hypothesis) -> NonGaussianAlternative | None:
+def fit_poisson_alternative(state: Hypothesis) -> NonGaussianAlternative | None:
     """Return Poisson steps as alternative to single steps or to an increased random walk.
 
-    Parameters
-    ----------
-    axis : Axis
-        Axis to fit.
-    state : Hypothesis
-        Fitted effects.
-
-    Returns
-    -------
-    NonGaussianAlternative or None
-        The alternative, or None if the axis has neither single steps nor an increased random walk.
+    The random walk of the model keeps the original size. The steps, or the increase of the random walk, are tested. The
+    result is None if the axis has neither single steps nor an increased random walk.
     """
-    steps = [effect for effect in state.found if isinstance(effect, BiasStep)]
+    steps = sum(isinstance(effect, BiasStep) for effect in state.found)
     walks = [at for at, effect in enumerate(state.effects) if isinstance(effect, RateRandomWalk)]
-    stronger = any(at >= state.given or at in state.likely.noises for at in walks)
-    if not steps and not stronger:
+    if not steps and not any(at >= state.given or at in state.fit.noises for at in walks):
         return None
-    # The random walk of the model keeps its original size. The steps, or the increase of the random walk, are tested.
-    bare = tuple(effect for effect in state.found if not isinstance(effect, (BiasStep, RateRandomWalk)))
-    sizes = tuple(
-        model if at in walks else now for at, (model, now) in enumerate(zip(state.model, state.effects, strict=False))
-    )
-    held = frozenset(at for at in range(state.given) if at in state.likely.held or at in walks)
-    without = axis.fit((*sizes, *bare), held)
-    known = max((size(sizes[at]) for at in walks if at < state.given), default=0.0)
-    walk = axis.fit((*sizes, *bare, RateRandomWalk(K=max(known, 1e-12))), held)
+    effects, held = _with_original_walks(state)
+    without = state.axis.fit(effects, held)
+    known = max((size(effects[at]) for at in walks if at < state.given), default=0.0)
+    walk = state.axis.fit((*effects, RateRandomWalk(K=max(known, 1e-12))), held)
     excess = size(walk.effects[-1])
-    rest = _background_noise(without.effects)
+    rest = background_noise(without.effects)
     if not (excess > 0.0 and rest.white > 0.0):
         return None
-    left, tau0_s = inverse_cosine_transform(axis.residual(without)), 1.0 / axis.rate_hz
-    contest = compare_steps_with_random_walk(left, tau0_s, rest, excess)
-    gain, whole = contest.gain, walk.log_likelihood + contest.gain
+    series, tau0_s = _residual_series(without), 1.0 / state.axis.rate_hz
+    compared = compare_steps_with_random_walk(series, tau0_s, rest, excess)
+    gain, whole = compared.gain, walk.log_likelihood + compared.gain
     if steps:
-        contest = compare_steps_with_single_steps(left, tau0_s, rest, excess, most=max(len(steps), MIN_FITTED_STEPS))
-        single = sum(name.startswith("time") for name in contest.second)
-        gain = contest.gain + STEP_PENALTY_NATS * max(single - MAX_FREE_STEPS, 0)
-    rate, height = (float(contest.first[name].value) for name in ("rate", "height"))
-    found = (*bare, PoissonSteps(rate=rate, height=height))
-    return NonGaussianAlternative(found, gain - POISSON_PENALTY_NATS, contest.first, contest.events, whole=whole)
+        compared = compare_steps_with_single_steps(series, tau0_s, rest, excess, most=max(steps, MIN_FITTED_STEPS))
+        single = sum(name.startswith("time") for name in compared.second)
+        gain = compared.gain + STEP_PENALTY_NATS * max(single - MAX_FREE_STEPS, 0)
+    rate, height = (float(compared.first[name].value) for name in ("rate", "height"))
+    found = (*effects[state.given :], PoissonSteps(rate=rate, height=height))
+    return NonGaussianAlternative(found, gain - POISSON_PENALTY_NATS, compared.first, compared.events, whole=whole)
 
 
-def _background_noise(effects: Effects, without: int | None = None) -> BackgroundNoise:
-    """Return the noise of an axis, without one effect, in the form that the likelihood ratios use."""
+def _residual_series(fit: AxisFit) -> Floats:
+    """Return the series, shape (n,), with all fitted deterministic effects removed."""
+    return inverse_cosine_transform(fit.residual())
+
+
+def background_noise(effects: Effects) -> BackgroundNoise:
+    """Return the noise of an axis as the likelihood ratios use it."""
     white = walk = flicker = 0.0
     correlated: list[tuple[float, float]] = []
-    for at, effect in enumerate(effects):
-        if at == without:
-            continue
+    for effect in effects:
         match effect:
             case AngleRandomWalk():
                 white += effect.N**2

@@ -20,7 +20,6 @@ from drivers.sample import AXES
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.reconcile import combine_decisions
 from monitor.reconcile.result import (
     AxisResult,
     Decision,
@@ -28,6 +27,7 @@ from monitor.reconcile.result import (
     Reconciliation,
     ReconciliationStep,
     StepKind,
+    combine_decisions,
 )
 from monitor.reconcile.several_recordings.absence import Absence, StrongestObservation, explain_absence
 from monitor.reconcile.several_recordings.effect_matching import (

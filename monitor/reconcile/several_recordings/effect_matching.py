@@ -75,11 +75,9 @@ def distance(effect: str, a: ParameterInterval | None, b: ParameterInterval | No
 
     Examples
     --------
-    >>> line = ParameterInterval(17.30)
-    >>> distance("sinusoidal", line, ParameterInterval(17.32)) is None
-    False
-    >>> distance("sinusoidal", line, ParameterInterval(19.0)) is None
-    True
+    >>> distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(17.30))
+    0.0
+    >>> distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(19.00))
     """
     if a is None or b is None:
         return 0.0

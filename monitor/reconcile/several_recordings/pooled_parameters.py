@@ -55,8 +55,7 @@ def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
 
     Examples
     --------
-    >>> intervals = [ParameterInterval(10.0, 8.04, 11.96), ParameterInterval(12.0, 10.04, 13.96)]  # ± 1.96 σ, σ = 1
-    >>> both = pool_parameter(intervals)
+    >>> both = pool_parameter([ParameterInterval(10.0, 8.04, 11.96), ParameterInterval(12.0, 10.04, 13.96)])
     >>> print(both.bounds.value, round(both.chi2, 3), both.freedom)
     11.0 2.0 1
     """

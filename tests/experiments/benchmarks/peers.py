@@ -32,7 +32,8 @@ import numpy as np
 
 from drivers.sample import AXES, Floats
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.reconcile import Recording, reconcile
+from monitor.reconcile.preparation.recording import Recording
+from monitor.reconcile.reconcile import reconcile
 from tests.experiments.benchmarks import five_terms, gmwm
 from tests.experiments.blind import run
 from tests.experiments.blind.cases import SINGLES, Case

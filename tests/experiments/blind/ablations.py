@@ -35,12 +35,13 @@ def as_it_is() -> Iterator[None]:
 def without_null() -> Iterator[None]:
     """Thresholds from a table instead of from simulated recordings."""
     from monitor.reconcile import reconcile
-    from monitor.reconcile.diagnostics import gap
+    from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
+    from monitor.reconcile.diagnostics.null_distribution import AxisNull, NullDistribution
 
-    def table(simulated: Mapping[str, Sequence[Any]], _looks: int) -> dict[str, dict[str, gap.NullDistribution]]:
-        return {axis: {lens: gap.NullDistribution(1.92, 3.32) for lens in gap.DIAGNOSTICS} for axis in simulated}
+    def table(simulated: Mapping[str, Sequence[Any]], _axes: int) -> dict[str, AxisNull]:
+        return {axis: dict.fromkeys(DIAGNOSTICS, NullDistribution(1.92, 3.32)) for axis in simulated}
 
-    with patch.object(reconcile, "nulls", table):
+    with patch.object(reconcile, "null_distributions", table):
         yield
 
 
@@ -49,10 +50,7 @@ def without_proof() -> Iterator[None]:
     """Nothing held out."""
     from monitor.reconcile.search import search
 
-    def believed(*_arguments: object) -> Any:
-        return search.CrossValidation(float("nan"), float("nan"), True, "not asked")
-
-    with patch.object(search, "proof", believed):
+    with patch.object(search, "cross_validate", lambda *_arguments: search.not_validated("switched off")):
         yield
 
 
@@ -60,13 +58,13 @@ def without_proof() -> Iterator[None]:
 def without_refit() -> Iterator[None]:
     """The model's own sizes stay whatever is added."""
     from monitor.reconcile.likelihood import hypothesis
-    from monitor.reconcile.search import search, trials
+    from monitor.reconcile.search import search
 
     def stiff(axis: Any, found: Sequence[Any], model: tuple[Any, ...]) -> Any:
-        held = frozenset(at for at, effect in enumerate(model) if type(effect) in hypothesis.NOISE_SIZE_PARAMETERS)
-        return hypothesis.Hypothesis(model, axis.fit((*model, *found), held))
+        return hypothesis.Hypothesis(model, axis.fit((*model, *found), hypothesis.noise_indices(model)))
 
-    with patch.object(search, "settled", stiff), patch.object(trials, "settled", stiff):
+    name = "fit_with_fewest_changes"
+    with patch.object(search, name, stiff), patch.object(hypothesis, name, stiff):
         yield
 
 
@@ -75,7 +73,7 @@ def without_withdrawal() -> Iterator[None]:
     """Names stay, whatever is left at their place."""
     from monitor.reconcile.search import search
 
-    with patch.object(search, "upheld", lambda state, *_others: state.found):
+    with patch.object(search, "supported_effects", lambda found, *_others: found):
         yield
 
 

@@ -10,12 +10,13 @@ from drivers.sample import AXES, Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, BiasInstability, RateRandomWalk
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, WhitenedAxis, whiten_axis
-from monitor.reconcile.diagnostics.gap import NullDistribution
+from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
+from monitor.reconcile.diagnostics.null_distribution import NullDistribution
+from monitor.reconcile.likelihood.axis import Axis, RegressorCache
 from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
-from monitor.reconcile.preparation.axis import Axis, RegressorCache
-from monitor.reconcile.preparation.prepare import prepare_axes
-from monitor.reconcile.reconcile import Recording
+from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
+from monitor.reconcile.preparation.recording import Recording
+from monitor.reconcile.search.axis_preparation import prepare_axes
 
 RATE_HZ = 100.0
 N, B, K = 1e-4, 2e-5, 2e-6  # rad/√s, rad/s, rad/s/√s
@@ -70,8 +71,8 @@ def axes(
     """As a search gets them."""
     n = next(iter(values.values())).size
     each = effects if isinstance(effects, Mapping) else dict.fromkeys(values, effects)
-    courses = RegressorCache(n, RATE_HZ, temperature_c)
-    return prepare_axes(values, RATE_HZ, each, temperature_c, courses, np.random.default_rng(seed))
+    given = Recording(values, RATE_HZ, temperature_c)
+    return prepare_axes(given, each, RegressorCache(n, RATE_HZ, temperature_c), np.random.default_rng(seed))
 
 
 def axis(y: Floats, effects: tuple[Effect, ...] = (), temperature_c: Floats | None = None) -> Axis:
@@ -81,7 +82,7 @@ def axis(y: Floats, effects: tuple[Effect, ...] = (), temperature_c: Floats | No
 
 def seen(one: Axis, effects: tuple[Effect, ...]) -> WhitenedAxis:
     """Beside a model as it stands."""
-    return whiten_axis(one, fit_with_given_sizes(one, effects).likely)
+    return whiten_axis(fit_with_given_sizes(one, effects).fit)
 
 
 def recording(

@@ -10,7 +10,7 @@ import pytest
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.description import describe_axis
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
-from monitor.reconcile.diagnostics.gap import NullDistribution
+from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.report import encode_report
 from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.search.search import search_axis
@@ -132,7 +132,9 @@ def test_verdicts_follow_from_steps_and_what_is_left():
     assert describe_axis(found("line"), STRICT, STRICT).verdict == "explained"
     left = describe_axis(found("line"), STRICT, ALWAYS)
     assert left.verdict == "partly_explained"
-    assert {score.lens for score in left.left_over} == {lens for lens, one in found("line").seen.items() if one.gain}
+    assert {score.lens for score in left.left_over} == {
+        lens for lens, one in found("line").findings.items() if one.gain
+    }
     assert describe_axis(found("line"), STRICT, UNREACHED).left_over == ()
 
 
@@ -147,5 +149,5 @@ def test_gaps_before_are_beside_the_model_that_decided_and_after_beside_the_new_
 def test_what_did_not_shrink_is_still_told():
     """A search whose last look sees as much as its first has a step and is partly explained."""
     one = found("line")
-    again = replace(one, seen=one.rounds[0].seen)
+    again = replace(one, findings=one.rounds[0].findings)
     assert describe_axis(again, STRICT, STRICT).verdict == "partly_explained"

@@ -22,18 +22,16 @@ from monitor.noise.effects import (
     TemperatureBias,
 )
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.preparation.axis import RegressorCache
-from monitor.reconcile.preparation.prepare import MIN_SAMPLES
-from monitor.reconcile.reconcile import (
+from monitor.reconcile.likelihood.axis import RegressorCache
+from monitor.reconcile.preparation.recording import (
+    MIN_SAMPLES,
     Recording,
-    combine_decisions,
-    effects_by_axis,
-    fit_five_terms,
-    reconcile,
     select_usable_axes,
     smooth_temperature,
 )
+from monitor.reconcile.reconcile import RunContext, effects_by_axis, fit_five_terms, reconcile
 from monitor.reconcile.report import encode_report
+from monitor.reconcile.result import combine_decisions
 from tests.monitor.reconcile.axes import (
     GYRO_AXES,
     MODEL,
@@ -80,7 +78,7 @@ def test_a_true_model_agrees(seed):
     assert {one.verdict for one in found.axes.values()} == {"agrees"}
     assert found.model.effects == MODEL.effects
     assert list(found.axes) == list(GYRO_AXES)
-    assert (found.samples, found.seconds, found.rate_hz, found.fitted_first) == (n, n / RATE_HZ, RATE_HZ, False)
+    assert (found.samples, found.duration_s, found.rate_hz, found.fitted_first) == (n, n / RATE_HZ, RATE_HZ, False)
     check_report(json.loads(encode_report(found)))
 
 
@@ -176,8 +174,7 @@ def test_only_terms_that_the_data_support_are_fitted():
         "gz": white(n, rng) + 1e-5 * time_s(n),
         "ax": NoiseModel({"ax": (WHITE, QuantizationNoise(Q=5e-6))}).simulate(n, RATE_HZ, 1)[:, 3].copy(),
     }
-    courses = RegressorCache(n, RATE_HZ, None)
-    found = fit_five_terms(Recording(values, RATE_HZ), courses, 1)
+    found = fit_five_terms(RunContext(Recording(values, RATE_HZ), 1, RegressorCache(n, RATE_HZ, None), map))
     kinds = {axis: {type(effect) for effect in effects} for axis, effects in found.effects.items()}
     assert kinds["gx"] == {AngleRandomWalk}
     assert kinds["gy"] >= {AngleRandomWalk, RateRandomWalk}
@@ -197,7 +194,7 @@ def drawn(**changed):
 
 
 def test_too_few_samples_say_how_many_are_needed():
-    with pytest.raises(NotReady, match=rf"{MIN_SAMPLES - 1} samples; {MIN_SAMPLES} are .*100 Hz"):
+    with pytest.raises(NotReady, match=rf"{MIN_SAMPLES - 1} samples; at least {MIN_SAMPLES} .*100 Hz"):
         select_usable_axes(recording(MODEL, MIN_SAMPLES - 1, 1), MODEL)
     assert select_usable_axes(drawn(), MODEL)[1] == ()
 

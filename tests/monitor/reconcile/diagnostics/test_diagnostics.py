@@ -9,13 +9,11 @@ from monitor.noise.effects import AngleRandomWalk, NoiseStep, RateRandomWalk, Re
 from monitor.reconcile.diagnostics import diagnostics
 from monitor.reconcile.diagnostics.diagnostics import (
     find_line_peaks,
-    noise_deviation_over_time,
     power_gain,
     regressor_gain,
     step_gains,
-    whiten_axis,
 )
-from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
+from monitor.reconcile.likelihood.whitening import noise_deviation_over_time
 from monitor.reconcile.preparation.cosine_bins import cosine_transform
 from tests.monitor.reconcile.axes import RATE_HZ, WHITE, N, axes, axis, correlated, seen, time_s, walk, white
 
@@ -127,11 +125,12 @@ def test_fast_series_is_white_whatever_the_spectrum_is():
 
 
 def test_noise_steps_of_a_model_are_in_its_course():
-    course = noise_deviation_over_time((WHITE, NoiseStep(time=12.0, ratio=3.0)), n, RATE_HZ)
+    steady = axis(drawn())
+    course = noise_deviation_over_time(steady.fit((WHITE, NoiseStep(time=12.0, ratio=3.0))))
     assert np.mean(course**2) == pytest.approx(1.0)
     assert course[1200] / course[1199] == pytest.approx(3.0)
     assert np.unique(course).size == 2
-    np.testing.assert_array_equal(noise_deviation_over_time((WHITE,), n, RATE_HZ), np.ones(n))
+    np.testing.assert_array_equal(noise_deviation_over_time(steady.fit((WHITE,))), np.ones(n))
     y = white(n, np.random.default_rng(9)) * np.where(time_s(n) < 12.0, 1.0, 3.0)
     effects = (AngleRandomWalk(N=N), NoiseStep(time=12.0, ratio=3.0))
     assert diagnostics.diagnose_variance(seen(axis(y), effects)).gain < 15.0
@@ -174,5 +173,5 @@ def test_courses_that_were_fitted_are_taken_out():
     line = 1e-3 * np.sin(2 * np.pi * 7.3 * time_s(n))
     one = axis(drawn(15) + line)
     model = (*MODEL, Sinusoidal(amplitude=1.0, frequency=7.3, phase=0.0))
-    view = whiten_axis(one, fit_with_given_sizes(one, model).likely)
+    view = seen(one, model)
     assert diagnostics.diagnose_lines(view).gain < 20.0 < diagnostics.diagnose_lines(seen(one, MODEL)).gain

@@ -16,7 +16,7 @@ from monitor.reconcile.likelihood.hidden_state import (
     prior_level_variance,
     state_space_noise,
 )
-from tests.monitor.reconcile.made import BLOCK_S, dense
+from tests.monitor.reconcile.event_noise import BLOCK_S, dense
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from scipy.special import logsumexp
 from monitor.reconcile.likelihood import poisson_steps
 from monitor.reconcile.likelihood.hidden_state import BackgroundNoise, kalman_log_likelihood, state_space_noise
 from monitor.reconcile.likelihood.poisson_steps import compare_steps_with_random_walk
-from tests.monitor.reconcile.made import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, walk, white
+from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, walk, white
 
 RATE, HEIGHT = 0.05, 2.0  # of the short series, beside white noise of density one
 BLOCKS = 11

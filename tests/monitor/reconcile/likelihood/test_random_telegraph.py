@@ -10,7 +10,7 @@ from scipy.stats import norm
 from monitor.reconcile.likelihood import random_telegraph
 from monitor.reconcile.likelihood.hidden_state import BackgroundNoise, block_means, state_space_noise
 from monitor.reconcile.likelihood.random_telegraph import compare_telegraph_with_correlated
-from tests.monitor.reconcile.made import BLOCK_S, HOUR, TAU0_S, N, dense, two_levels, walk, wandering, white
+from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, two_levels, walk, wandering, white
 
 A, DWELL = 3.0, 20.0  # of the short series, beside white noise of density one
 

@@ -7,7 +7,7 @@ from scipy.stats import multivariate_normal
 from monitor.reconcile.likelihood import single_steps
 from monitor.reconcile.likelihood.hidden_state import BackgroundNoise, state_space_noise
 from monitor.reconcile.likelihood.single_steps import compare_steps_with_single_steps
-from tests.monitor.reconcile.made import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, white
+from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, white
 
 REST = BackgroundNoise(1.0, walk=0.01, correlated=((1.0, 30.0),))
 M = 60

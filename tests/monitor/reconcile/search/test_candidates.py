@@ -20,8 +20,6 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.diagnostics.diagnostics import whiten_axis
-from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
 from monitor.reconcile.search import candidates
 from monitor.reconcile.search.candidates import PENALTY_NATS, find_spectral_peaks, line_frequency
 from tests.monitor.reconcile.axes import (
@@ -34,6 +32,7 @@ from tests.monitor.reconcile.axes import (
     axis,
     correlated,
     ringing,
+    seen,
     time_s,
     walk,
     warmth,
@@ -51,8 +50,7 @@ def noise(seed=0):
 
 def asked(family, one, model=MODEL):
     """What a family offers, by name."""
-    state = fit_with_given_sizes(one, model)
-    return {effect.name: effect for effect in family(one, state, whiten_axis(one, state.likely))}
+    return {effect.name: effect for effect in family(seen(one, model))}
 
 
 def test_every_effect_of_the_vocabulary_has_a_price():
@@ -90,7 +88,7 @@ def test_a_resonance():
     assert found.frequency == pytest.approx(17.3, abs=0.2)
     assert found.bandwidth == pytest.approx(1.0, rel=0.3)
     one = axis(y)
-    middle, width = find_spectral_peaks(whiten_axis(one, fit_with_given_sizes(one, MODEL).likely))[0]
+    middle, width = find_spectral_peaks(seen(one, MODEL))[0]
     assert middle == pytest.approx(17.3, abs=0.5)
     assert 0.2 < width < 5.0
     assert asked(candidates.propose_resonances, axis(noise())) == {}
@@ -103,7 +101,7 @@ def test_a_line():
     found = asked(candidates.propose_sinusoids, one)["sinusoidal"]
     assert isinstance(found, Sinusoidal)
     assert found.frequency == pytest.approx(17.3042, abs=5e-4)
-    view = whiten_axis(one, fit_with_given_sizes(one, MODEL).likely)
+    view = seen(one, MODEL)
     t = time_s(n)
     best = minimize_scalar(
         lambda f: -abs(np.exp(-2j * np.pi * f * t) @ view.white), bounds=(17.303, 17.306), method="bounded"
@@ -161,14 +159,12 @@ def test_other_axes_by_their_kind():
     every = axes(values, (WHITE,))
     found = {}
     for name, one in every.items():
-        state = fit_with_given_sizes(one, (WHITE,))
-        offered = candidates.propose_leaks(one, state, whiten_axis(one, state.likely))
+        offered = candidates.propose_leaks(seen(one, (WHITE,)))
         found[name] = {(type(effect), effect.source) for effect in offered}
     assert found["gz"] == {(CrossAxis, "gy"), (GSensitivity, "ax"), (GSensitivity, "az")}
     assert found["ax"] == {(CrossAxis, "az")}
     known = (WHITE, CrossAxis(source="gy", coefficient=0.1))
-    state = fit_with_given_sizes(every["gz"], known)
-    rest = candidates.propose_leaks(every["gz"], state, whiten_axis(every["gz"], state.likely))
+    rest = candidates.propose_leaks(seen(every["gz"], known))
     assert {effect.source for effect in rest} == {"ax", "az"}
 
 

@@ -16,12 +16,25 @@ from monitor.noise.effects import (
     Sinusoidal,
     TemperatureBias,
 )
-from monitor.reconcile.diagnostics.diagnostics import find_line_peaks, whiten_axis
-from monitor.reconcile.diagnostics.gap import NullDistribution
+from monitor.reconcile.diagnostics.diagnostics import find_line_peaks
+from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes, fit_with_given_sizes
-from monitor.reconcile.preparation.prepare import repair_again
+from monitor.reconcile.search.axis_preparation import repair_again
 from monitor.reconcile.search.cross_validation import cross_validate
-from tests.monitor.reconcile.axes import WALK, WHITE, N, axes, axis, correlated, ringing, time_s, walk, warmth, white
+from tests.monitor.reconcile.axes import (
+    WALK,
+    WHITE,
+    N,
+    axes,
+    axis,
+    correlated,
+    ringing,
+    seen,
+    time_s,
+    walk,
+    warmth,
+    white,
+)
 
 n = 24_000
 MODEL = (WHITE, WALK)
@@ -36,7 +49,7 @@ def noise(seed=0):
 
 def proven(one, effect, lens, model=MODEL):
     before, after = fit_with_given_sizes(one, model), fit_with_fewest_changes(one, (effect,), model)
-    return cross_validate(one, before, after, after.effects[-1], lens, NULL, np.random.default_rng(0))
+    return cross_validate(before, after, after.effects[-1], lens, NULL, np.random.default_rng(0))
 
 
 LINE = 3e-4 * np.sin(2 * np.pi * 17.3 * time_s(n))
@@ -83,15 +96,15 @@ def test_what_one_half_contradicts_is_not_kept(name):
     one = axes({"gx": OTHER, "gz": noise() + hidden}, {"gx": (), "gz": MODEL}, warmth(n))["gz"]
     before, after = fit_with_given_sizes(one, MODEL), fit_with_fewest_changes(one, (effect,), MODEL)
     # on the data that chose it, it is worth its name
-    assert after.likely.log_likelihood - before.likely.log_likelihood > 20.0
-    found = cross_validate(one, before, after, effect, lens, NULL, np.random.default_rng(0))
+    assert after.fit.log_likelihood - before.fit.log_likelihood > 20.0
+    found = cross_validate(before, after, effect, lens, NULL, np.random.default_rng(0))
     assert not found.kept
 
 
 def test_a_line_picked_on_the_data_has_nothing_to_show_elsewhere():
     """The strongest line of pure noise gains its dozen nats; halves of that decide nothing, and the reason says so."""
     one = axis(noise(4))
-    view = whiten_axis(one, fit_with_given_sizes(one, MODEL).likely)
+    view = seen(one, MODEL)
     gain, f_hz = find_line_peaks(view.white, one.rate_hz, 1)[0]
     assert gain > 7.0
     found = proven(one, Sinusoidal(amplitude=1.0, frequency=f_hz, phase=0.0), "lines")
@@ -104,7 +117,7 @@ def test_another_size_of_a_known_noise():
     before = fit_with_given_sizes(one, MODEL)
     after = fit_with_fewest_changes(one, (), MODEL)
     assert after.freed >= 1
-    found = cross_validate(one, before, after, None, "psd", NULL, np.random.default_rng(0))
+    found = cross_validate(before, after, None, "psd", NULL, np.random.default_rng(0))
     assert found.kept
     assert found.after < 0.2 * found.before
 
@@ -142,7 +155,7 @@ def test_single_samples_are_looked_at_in_each_half(kind):
     one = repair_again(plain, (*MODEL, effect), rng)
     before = fit_with_fewest_changes(plain, (), MODEL)
     after = fit_with_fewest_changes(one, (effect,), MODEL)
-    found = cross_validate(one, before, after, effect, lens, NULL, rng)
+    found = cross_validate(before, after, effect, lens, NULL, rng)
     assert found.kept
     assert found.reason == ""
     assert found.after < 0.5 * found.before

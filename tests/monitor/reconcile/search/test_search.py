@@ -56,7 +56,6 @@ def names(found):
 def test_a_true_model_is_left_alone(seed):
     found = looked(noise(seed))
     assert found.rounds == ()
-    assert found.state == found.start
     assert found.state.effects == MODEL
 
 
@@ -79,8 +78,8 @@ def test_what_was_hidden_is_named(name):
     found = looked(noise(2) + HIDDEN[name], temperature_c=warmth(n))
     assert names(found) == [name]
     first = found.rounds[0]
-    assert any(one.gain > STRICT[lens].threshold for lens, one in first.seen.items())
-    assert not any(one.gain > STRICT[lens].threshold for lens, one in found.seen.items())
+    assert any(one.gain > STRICT[lens].threshold for lens, one in first.findings.items())
+    assert not any(one.gain > STRICT[lens].threshold for lens, one in found.findings.items())
     assert first.trials[0].name == name
     assert first.trials[0].value > 0.0
     assert found.state.effects[:2] == MODEL  # what is right stays as it is
@@ -141,17 +140,17 @@ def test_what_nobody_knows_has_no_name():
     """A chirp through the whole band, and Student's t of six degrees of freedom: both stay to be seen."""
     chirp = 1.5 * SIGMA * np.sin(2 * np.pi * (2.0 * T + 0.5 * (40.0 / T[-1]) * T**2))
     found = looked(noise(9) + chirp)
-    assert any(one.gain > STRICT[lens].threshold for lens, one in found.seen.items())
+    assert any(one.gain > STRICT[lens].threshold for lens, one in found.findings.items())
     student = looked(SIGMA * np.random.default_rng(10).standard_t(6, n) / np.sqrt(1.5), (WHITE,))
     assert "outliers" not in names(student)
-    assert student.seen["tails"].gain > STRICT["tails"].threshold
+    assert student.findings["tails"].gain > STRICT["tails"].threshold
 
 
 def test_the_same_generator_gives_the_same_search():
     y = noise(11) + HIDDEN["outliers"]
     one, other = looked(y), looked(y)
     assert one.state.effects == other.state.effects
-    assert one.seen == other.seen
+    assert one.findings == other.findings
     assert [r.trials for r in one.rounds] == [r.trials for r in other.rounds]
 
 
@@ -161,7 +160,7 @@ def test_what_is_worth_nothing_is_dropped():
     idle = ExponentiallyCorrelated(sigma=1e-6, correlation_time=1.0)
     line = Sinusoidal(amplitude=1.0, frequency=17.3, phase=0.0)
     last = RateRandomWalk(K=1e-9)  # what was just found is not asked
-    state = drop_unneeded_effects(one, fit_with_fewest_changes(one, (idle, line, last), MODEL))
+    state = drop_unneeded_effects(fit_with_fewest_changes(one, (idle, line, last), MODEL))
     assert [type(effect) for effect in state.effects] == [AngleRandomWalk, RateRandomWalk, Sinusoidal, RateRandomWalk]
 
 
@@ -170,9 +169,7 @@ def test_candidates_on_a_true_model_are_not_worth_their_price():
     wrong = 0
     for seed in range(6):
         one = axis(noise(20 + seed), MODEL)
-        trials = [
-            each for kind in trial_groups(one, fit_with_given_sizes(one, MODEL), seen(one, MODEL)) for each in kind
-        ]
+        trials = [each for kind in trial_groups(fit_with_given_sizes(one, MODEL), seen(one, MODEL)) for each in kind]
         assert trials
         wrong += max(each.value for each in trials) > 0.0
     assert wrong <= 1

@@ -1,6 +1,5 @@
 """Names that do not stand once everything is found, and those that do."""
 
-import numpy as np
 import pytest
 
 from monitor.noise.effects import (
@@ -12,13 +11,10 @@ from monitor.noise.effects import (
     Sinusoidal,
 )
 from monitor.reconcile.diagnostics.diagnostics import Finding
-from monitor.reconcile.diagnostics.gap import NullDistribution
-from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes
+from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.result import Location
 from monitor.reconcile.search.withdrawal import supported_effects
-from tests.monitor.reconcile.axes import WALK, WHITE, axes, white
 
-MODEL = (WHITE, WALK)
 QUIET = {lens: Finding(1.0, Location(frequency=(1.0, 2.0))) for lens in ("psd", "lines", "spectrogram")}
 QUIET |= {lens: Finding(1.0, Location()) for lens in ("level", "other_axes", "tails", "variance")}
 NULL = dict.fromkeys(QUIET, NullDistribution(6.0, 12.0))
@@ -29,10 +25,7 @@ def lines(*f_hz):
 
 
 def kept(found, seen=QUIET, closing=None):
-    rng = np.random.default_rng(1)
-    one = axes({"gz": white(20_000, rng), "gx": white(20_000, rng)}, MODEL)["gz"]
-    state = fit_with_fewest_changes(one, found, MODEL)
-    return [type(effect) for effect in supported_effects(state, closing or {}, seen, NULL)]
+    return [type(effect) for effect in supported_effects(found, closing or {}, seen, NULL)]
 
 
 def test_lines_apart_from_each_other_stand():

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import expon
 
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding
-from monitor.reconcile.diagnostics.gap import (
+from monitor.reconcile.diagnostics.null_distribution import (
     FALSE_ALARM_PROBABILITY,
     NullDistribution,
     null_distributions,

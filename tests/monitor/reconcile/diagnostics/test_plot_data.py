@@ -6,7 +6,7 @@ import pytest
 from scipy.special import erfc
 
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.diagnostics.figures import plot_data
+from monitor.reconcile.diagnostics.plot_data import plot_data
 from tests.monitor.reconcile.axes import RATE_HZ, TERMS, WALK, WHITE, N, axis, seen, time_s, walk, warmth, white
 
 n = 24_000

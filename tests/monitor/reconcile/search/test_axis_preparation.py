@@ -5,7 +5,7 @@ import pytest
 
 from drivers.sample import AXES
 from monitor.noise.effects import AngleRandomWalk, Outliers, Resolution, SampleHold, Saturation
-from monitor.reconcile.preparation.prepare import (
+from monitor.reconcile.search.axis_preparation import (
     may_leak,
     measure_value_statistics,
     repair_again,

@@ -7,7 +7,7 @@ from monitor.noise.effect import Leak, SampleBlockContext, Source
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, Narrowband, SampleRateError, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS
-from monitor.reconcile.preparation.sample_rate_test import detect_sample_rate_error, in_stated_time
+from monitor.reconcile.search.sample_rate_error import detect_sample_rate_error, in_stated_time
 from tests.contracts.effect_examples import effect
 from tests.monitor.reconcile.axes import GYRO_AXES, RATE_HZ, WALK, WHITE, axes, recording, warmth
 

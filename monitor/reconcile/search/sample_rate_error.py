@@ -1,31 +1,33 @@
-"""Test of whether the true sample rate of a recording differs from the stated one.
+"""Detection of a true sample rate that differs from the stated sample rate of a recording.
 
-A wrong sample rate shifts all frequencies on all axes by one ratio. It is detectable if the model has a feature at a
-known frequency, such as a line or a resonance. The feature is then missing at its own frequency and appears at another
-one. Without such a feature, a wrong sample rate cannot be distinguished from a wrong N.
+A wrong sample rate shifts all frequencies on all axes by one ratio. The error is detectable if the model has a feature
+at a known frequency, such as a line or a resonance. The feature is then missing at the stated frequency and appears at
+another frequency. Without such a feature, a wrong sample rate cannot be distinguished from a wrong N.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from math import exp, log
 from typing import Any, Final
 
 import numpy as np
 
+from drivers.sample import Floats
 from monitor.common.distributions import HALF_CHI2_95
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
-from monitor.reconcile.diagnostics.diagnostics import periodogram, whiten_axis
-from monitor.reconcile.likelihood.hypothesis import GOLDEN, fit_with_given_sizes
-from monitor.reconcile.preparation.axis import Axis, Effects
+from monitor.reconcile.diagnostics.diagnostics import periodogram
+from monitor.reconcile.likelihood.axis import Axis, Effects
+from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes, golden_section
+from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidates import find_spectral_peaks
 
 MAX_LOG_RATIO: Final = 0.15
 """Largest absolute logarithm of the ratio. A larger error means that the recording is from another sensor."""
 MIN_OTHER_GAIN_NATS: Final = 6.0
-"""Log-likelihood gain in nats that everything except the strongest feature must reach: the other features and the noise
-of all axes. It is also the largest loss of a single feature. A feature that loses more has stayed at its stated
+"""Log-likelihood gain in nats that the other features and the noise of all axes must reach without the strongest
+feature. The same number is the largest loss of a single feature. A feature that loses more has stayed at the stated
 frequency.
 """
 SAME_FEATURE_RATIO: Final = 1.01
@@ -34,6 +36,8 @@ MAX_TRIAL_RATIOS: Final = 12
 """Number of ratios at which all axes are fitted."""
 SAMPLE_RATE_PENALTY_NATS: Final = 12.0
 """Penalty in nats for the ratio and for the choice of features."""
+SEARCH_ITERATIONS: Final = 18
+"""Number of iterations of the search for the best ratio."""
 RATIO_EXPONENTS: Final[Mapping[str, float]] = {
     "Q": 1.0,
     "N": 0.5,
@@ -48,9 +52,12 @@ RATIO_EXPONENTS: Final[Mapping[str, float]] = {
     "time": 1.0,
     "rate": -1.0,
 }
-"""For each parameter, the power of r = (true rate / stated rate) that converts it to stated time: S(f) becomes r S(rf),
-and τ becomes τ/r.
+"""For each parameter, the power of r = (true rate / stated rate) that converts the parameter to stated time.
+
+A spectral density S(f) becomes r S(rf), and a time τ becomes τ/r.
 """
+Feature = Sinusoidal | Narrowband
+"""Effect with a known frequency."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,25 +107,23 @@ def detect_sample_rate_error(
 
     Returns
     -------
-    Clock or None
-        The ratio at which all axes together fit best, or None if its gain does not exceed the penalty.
+    SampleRateErrorEstimate or None
+        The ratio at which all axes together fit best, or None if the gain does not exceed the penalty.
     """
     trials = _candidate_ratios(axes, effects)
     if not trials:
         return None
-    before = {name: fit_with_given_sizes(axes[name], effects[name]).likely.log_likelihood for name in axes}
+    before = {name: _log_likelihood(axes[name], effects[name]) for name in axes}
 
     def gains(x: float) -> dict[str, float]:
         changed = {name: tuple(in_stated_time(effect, exp(x)) for effect in effects[name]) for name in axes}
-        return {
-            name: fit_with_given_sizes(axes[name], changed[name]).likely.log_likelihood - before[name] for name in axes
-        }
+        return {name: _log_likelihood(axes[name], changed[name]) - before[name] for name in axes}
 
     def gain(x: float) -> float:
         return sum(gains(x).values())
 
     ratio, width = max(trials, key=lambda one: gain(log(one[0])))
-    x = _maximise_gain(gain, log(ratio), width)
+    x = golden_section(gain, log(ratio) - width, log(ratio) + width, SEARCH_ITERATIONS)
     top = gain(x)
     if top < SAMPLE_RATE_PENALTY_NATS:
         return None
@@ -128,20 +133,29 @@ def detect_sample_rate_error(
     ends = [_interval_end(gain, x, top, sign * width) for sign in (-1.0, 1.0)]
     of_axes = gains(x)
     strongest = max(of_axes, key=lambda one: of_axes[one])
-    features = [e for e in effects[strongest] if isinstance(e, (Sinusoidal, Narrowband))]
+    features = _features(effects[strongest])
     stated = features[0].frequency if features else 0.0
     return SampleRateErrorEstimate(
         ParameterInterval(exp(x), exp(ends[0]), exp(ends[1])), top, strongest, (stated, stated / exp(x))
     )
 
 
+def _log_likelihood(axis: Axis, effects: Effects) -> float:
+    """Return the log-likelihood of effects with the given noise sizes."""
+    return fit_with_given_sizes(axis, effects).fit.log_likelihood
+
+
+def _features(effects: Effects) -> list[Feature]:
+    """Return the lines and resonances of an axis."""
+    return [effect for effect in effects if isinstance(effect, Feature)]
+
+
 def _gain_per_feature(
     axes: Mapping[str, Axis], effects: Mapping[str, Effects], before: Mapping[str, float], ratio: float
 ) -> list[float]:
     """Return the gain in nats of each feature when only this feature is moved by the ratio."""
-    features = sorted({e.frequency for of in effects.values() for e in of if isinstance(e, (Sinusoidal, Narrowband))})
     groups: list[list[float]] = []
-    for f_hz in features:
+    for f_hz in sorted({feature.frequency for of in effects.values() for feature in _features(of)}):
         if groups and f_hz < groups[-1][-1] * SAME_FEATURE_RATIO:
             groups[-1].append(f_hz)
         else:
@@ -152,56 +166,55 @@ def _gain_per_feature(
         for name, of in effects.items():
             moved = tuple(in_stated_time(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
             if moved != of:
-                gain += fit_with_given_sizes(axes[name], moved).likely.log_likelihood - before[name]
+                gain += _log_likelihood(axes[name], moved) - before[name]
         gains.append(gain)
     return gains
 
 
 def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, float]]:
-    """Return the best ratios that move features of the model to observed peaks, each with the width of the search
-    around it.
-    """
-    found: list[tuple[float, float]] = []
-    features = {name: [e for e in of if isinstance(e, (Sinusoidal, Narrowband))] for name, of in effects.items()}
+    """Return the ratios that move features of the model to observed peaks, each with half the width to search."""
+    features = {name: _features(of) for name, of in effects.items()}
     if not any(features.values()):
         return []
-    highest = max(one.frequency for of in features.values() for one in of)
+    highest = max(feature.frequency for of in features.values() for feature in of)
     first = next(iter(axes.values()))
     step = 0.25 * first.rate_hz / first.n / highest
     grid = np.arange(-MAX_LOG_RATIO, MAX_LOG_RATIO, step)  # ln ratio
     power = np.zeros(grid.size)
+    found: list[tuple[float, float]] = []
     for name, axis in axes.items():
-        lines = [one for one in features[name] if isinstance(one, Sinusoidal)]
-        if not features[name]:
-            continue
-        view = whiten_axis(axis, fit_with_given_sizes(axis, effects[name]).likely)
-        turned = periodogram(view.white)
-        spacing = axis.rate_hz / (2 * (turned.size - 1))
-        for line in lines:
-            power += turned[
-                np.minimum(np.rint(line.frequency * np.exp(-grid) / spacing).astype(np.int64), turned.size - 1)
-            ]
-        for one in features[name]:
-            if isinstance(one, Narrowband):
-                places = [middle for middle, _ in find_spectral_peaks(view, 4)]
-                near = [place for place in places if abs(log(one.frequency / place)) < MAX_LOG_RATIO]
-                found += [(one.frequency / place, 2.0 * one.bandwidth / one.frequency) for place in near]
-    for at in np.argsort(power)[-MAX_TRIAL_RATIOS:]:
-        if power[at] > 0.0:
-            found.append((exp(float(grid[at])), 8.0 * step))
-    return found
+        if features[name]:
+            seen = whiten_axis(fit_with_given_sizes(axis, effects[name]).fit)
+            power += _line_power(seen, features[name], np.exp(-grid))
+            found += _resonance_ratios(seen, features[name])
+    strongest = [at for at in np.argsort(power)[-MAX_TRIAL_RATIOS:] if power[at] > 0.0]
+    return found + [(exp(float(grid[at])), 8.0 * step) for at in strongest]
 
 
-def _maximise_gain(gain: Any, x: float, width: float) -> float:
-    """Return the logarithm of the ratio with the largest gain, by golden-section search."""
-    lo, hi = x - width, x + width
-    for _ in range(18):
-        a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
-        lo, hi = (lo, b) if gain(a) > gain(b) else (a, hi)
-    return 0.5 * (lo + hi)
+def _line_power(seen: WhitenedAxis, features: list[Feature], factors: Floats) -> Floats:
+    """Return the summed power of all lines if their frequencies are multiplied by each of the given factors."""
+    power = np.zeros(factors.size)
+    spectrum = periodogram(seen.white)
+    spacing_hz = seen.axis.rate_hz / (2 * (spectrum.size - 1))
+    for line in features:
+        if isinstance(line, Sinusoidal):
+            at = np.rint(line.frequency * factors / spacing_hz).astype(np.int64)
+            power += spectrum[np.minimum(at, spectrum.size - 1)]
+    return power
 
 
-def _interval_end(gain: Any, x: float, top: float, step: float) -> float:
+def _resonance_ratios(seen: WhitenedAxis, features: list[Feature]) -> list[tuple[float, float]]:
+    """Return the ratios that move resonances to observed peaks, each with half the width to search."""
+    return [
+        (feature.frequency / peak_hz, 2.0 * feature.bandwidth / feature.frequency)
+        for feature in features
+        if isinstance(feature, Narrowband)
+        for peak_hz, _ in find_spectral_peaks(seen, 4)
+        if abs(log(feature.frequency / peak_hz)) < MAX_LOG_RATIO
+    ]
+
+
+def _interval_end(gain: Callable[[float], float], x: float, top: float, step: float) -> float:
     """Return the point on one side of the maximum at which the gain has fallen by ``HALF_CHI2_95``."""
     near, far = x, x + step
     for _ in range(12):

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding, WhitenedAxis
-from monitor.reconcile.diagnostics.gap import null_distributions, run_diagnostics
+from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding
+from monitor.reconcile.diagnostics.null_distribution import null_distributions, run_diagnostics
+from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, inverse_cosine_transform
 from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, N, axes, correlated, seen, time_s, walk, warmth, white
 

@@ -1,0 +1,204 @@
+"""Plot data of an axis and a model: the measurement, the expectation and the 95 % band.
+
+At each point, the band contains 95 of 100 simulated recordings. The band is calculated from the spectrum of the model,
+without simulation. A plot has a few hundred points.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+from scipy.special import chdtri, erfc
+
+from drivers.sample import Floats, Ints
+from monitor.common.distributions import Z95
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
+from monitor.noise.spectrum import allan_of_density
+from monitor.reconcile.diagnostics.diagnostics import MAX_LAG_SAMPLES, autocorrelation
+from monitor.reconcile.likelihood.whitening import WhitenedAxis, noise_deviation_over_time
+from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
+from monitor.reconcile.result import PlotData
+
+SPECTRUM_POINTS: Final = 240
+"""Approximate number of points of a spectrum."""
+TIME_BLOCKS: Final = 240
+"""Number of blocks of a plot over time."""
+TEMPERATURE_BINS: Final = 24
+"""Number of temperature intervals."""
+LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}
+"""Unit of the level by the first letter of the axis."""
+
+
+def plot_data(seen: WhitenedAxis) -> tuple[PlotData, ...]:
+    """Return the plot data of every diagnostic that has a plot."""
+    fitted = _deterministic_series(seen)
+    plots = [
+        _plot_psd(seen),
+        _plot_allan_deviation(seen, fitted),
+        _plot_level(seen, fitted),
+        _plot_variance(seen),
+        _plot_tails(seen),
+        _plot_autocorrelation(seen),
+    ]
+    if seen.axis.temperature_c is not None and np.ptp(seen.axis.temperature_c) > 0.0:
+        plots.append(_plot_level_over_temperature(seen, fitted, seen.axis.temperature_c))
+    return tuple(plots)
+
+
+def _deterministic_series(seen: WhitenedAxis) -> Floats:
+    """Return the sum of the fitted deterministic effects, shape (n,), without its mean."""
+    repaired = seen.axis.repaired
+    return np.asarray(repaired - repaired.mean() - inverse_cosine_transform(seen.fit.residual()))
+
+
+def _plot_psd(seen: WhitenedAxis) -> PlotData:
+    """Return the plot of the spectral density."""
+    bins, tau0_s = seen.axis.bins, 1.0 / seen.axis.rate_hz
+    used = np.flatnonzero(seen.axis.used_bins)
+    # average neighbouring bins to about SPECTRUM_POINTS points that are evenly spaced in the logarithm of frequency
+    f = np.log(bins.f_hz[used])
+    cell = np.floor((f - f[0]) / max(f[-1] - f[0], 1e-9) * SPECTRUM_POINTS)
+    first = np.flatnonzero(np.diff(cell, prepend=-1.0))
+    count = np.add.reduceat(bins.count[used], first)
+    expected = np.add.reduceat((bins.count * seen.fit.fitted.variance)[used], first) / count * tau0_s
+    measured = np.add.reduceat(seen.fit.fitted.residual[used], first) / count * tau0_s
+    middle = np.exp(np.add.reduceat((bins.count * np.log(bins.f_hz))[used], first) / count)
+    lo, hi = _chi2_band(count)
+    unit = f"({_level_unit(seen)})²/Hz"
+    names = ("psd", "frequency", "Hz", "spectral density", unit)
+    return PlotData(*names, True, middle, measured, expected, lo * expected, hi * expected)
+
+
+def _plot_allan_deviation(seen: WhitenedAxis, fitted: Floats) -> PlotData:
+    """Return the plot of the Allan deviation."""
+    axis, tau0_s = seen.axis, 1.0 / seen.axis.rate_hz
+    m = cluster_sizes(axis.n, axis.rate_hz)
+    measured, _ = overlapping_avar_axis(axis.repaired, m)
+    deterministic, _ = overlapping_avar_axis(fitted, m)
+    tau_s = np.asarray(m * tau0_s, np.float64)
+    noise = allan_of_density(_density_function(seen), tau_s, tau0_s, ())
+    lo, hi = _chi2_band(_allan_degrees_of_freedom(seen, m))
+    curves = (measured, noise + deterministic, lo * noise + deterministic, hi * noise + deterministic)
+    names = ("allan", "averaging time", "s", "Allan deviation", _level_unit(seen))
+    return PlotData(*names, True, tau_s, *(np.sqrt(avar) for avar in curves))
+
+
+def _density_function(seen: WhitenedAxis) -> Callable[[Floats], Floats]:
+    """Return the spectral density of the fitted noise as an interpolating function of the frequency in Hz."""
+    bins = seen.axis.bins
+    x, y = np.log(bins.f_hz), np.log(seen.fit.fitted.variance / seen.axis.rate_hz)
+    return lambda f: np.asarray(np.exp(np.interp(np.log(f), x, y)))
+
+
+def _allan_degrees_of_freedom(seen: WhitenedAxis, m: Ints) -> Floats:
+    """Return the degrees of freedom of overlapping Allan variances.
+
+    An Allan variance is a sum Σ a_k Y_k² of squared coefficients with variances v. The degrees of freedom are therefore
+    2 E²/Var = (Σ a v)²/Σ (a v)². The weights are a_k ∝ sin⁴(πfτ)/sin²(πfτ0). If a bin contains more than a period of
+    sin⁴, the mean 3/8 and the mean square 35/128 are used.
+    """
+    bins, variance = seen.axis.bins, seen.fit.fitted.variance
+    f, count = bins.f_hz, bins.count
+    width = count * 0.5 * seen.axis.rate_hz / seen.axis.n
+    found = np.empty(m.size)
+    for at, factor in enumerate(m.tolist()):
+        tau_s = factor / seen.axis.rate_hz
+        averaged = width * tau_s > 0.5
+        square = np.sin(np.pi * f * tau_s) ** 2
+        first, second = np.where(averaged, 0.375, square**2), np.where(averaged, 35.0 / 128.0, square**4)
+        rest = variance / np.sin(np.pi * f / seen.axis.rate_hz) ** 2
+        found[at] = (count * first * rest).sum() ** 2 / (count * second * rest**2).sum()
+    return np.maximum(found, 1.0)
+
+
+def _plot_level(seen: WhitenedAxis, fitted: Floats) -> PlotData:
+    """Return the plot of the level over time."""
+    axis = seen.axis
+    length = max(1, axis.n // TIME_BLOCKS)
+    measured, expected = _block_means(axis.repaired, length), _block_means(fitted, length) + axis.repaired.mean()
+    spread = _level_spread(seen, length / axis.rate_hz)
+    names = ("level", "time", "s", "level", _level_unit(seen))
+    times_s = _block_times_s(measured.size, length, axis.rate_hz)
+    return PlotData(*names, False, times_s, measured, expected, expected - spread, expected + spread)
+
+
+def _level_spread(seen: WhitenedAxis, length_s: float) -> float:
+    """Return half the width of the 95 % band of the mean over a time, in the unit of the axis."""
+    bins = seen.axis.bins
+    weight = np.sinc(bins.f_hz * length_s) ** 2
+    return Z95 * float(np.sqrt((bins.count * seen.fit.fitted.variance * weight).sum() / seen.axis.n))
+
+
+def _plot_variance(seen: WhitenedAxis) -> PlotData:
+    """Return the plot of the noise standard deviation over time."""
+    axis = seen.axis
+    length = max(1, axis.n // TIME_BLOCKS)
+    deviation = noise_deviation_over_time(seen.fit)
+    measured = np.sqrt(_block_means((seen.fast * deviation) ** 2, length))
+    expected = np.sqrt(_block_means(deviation**2, length))
+    lo, hi = np.sqrt(_chi2_band(np.array([float(length)])))
+    names = ("variance", "time", "s", "noise over its mean", "1")
+    times_s = _block_times_s(measured.size, length, axis.rate_hz)
+    return PlotData(*names, False, times_s, measured, expected, lo * expected, hi * expected)
+
+
+def _plot_tails(seen: WhitenedAxis) -> PlotData:
+    """Return the plot of the share of samples beyond a distance."""
+    magnitudes = np.sort(np.abs(seen.fast))
+    n = magnitudes.size
+    x = np.linspace(0.5, max(float(magnitudes[-1]), 4.0), 80)
+    measured = 1.0 - np.searchsorted(magnitudes, x) / n
+    expected = erfc(x / 2.0**0.5)
+    spread = Z95 * np.sqrt(np.maximum(expected * (1.0 - expected), 0.0) / n)
+    least = 0.3 / n
+    hi = np.maximum(expected + spread, 3.0 / n)
+    measured, expected, lo = (np.maximum(one, least) for one in (measured, expected, expected - spread))
+    names = ("tails", "distance", "σ", "share of samples beyond", "1")
+    return PlotData(*names, True, x, measured, expected, lo, hi)
+
+
+def _plot_autocorrelation(seen: WhitenedAxis) -> PlotData:
+    """Return the plot of the autocorrelation of the whitened series."""
+    lag_s = np.arange(1, MAX_LAG_SAMPLES + 1) / seen.axis.rate_hz
+    zero, band = np.zeros(MAX_LAG_SAMPLES), np.full(MAX_LAG_SAMPLES, Z95 / seen.white.size**0.5)
+    names = ("autocorrelation", "lag", "s", "autocorrelation", "1")
+    return PlotData(*names, False, lag_s, autocorrelation(seen.white), zero, -band, band)
+
+
+def _plot_level_over_temperature(seen: WhitenedAxis, fitted: Floats, temperature_c: Floats) -> PlotData:
+    """Return the plot of the level over temperature."""
+    axis = seen.axis
+    edges = np.linspace(float(temperature_c.min()), float(temperature_c.max()), TEMPERATURE_BINS + 1)
+    cell = np.clip(np.searchsorted(edges, temperature_c, "right") - 1, 0, TEMPERATURE_BINS - 1)
+    count = np.bincount(cell, minlength=TEMPERATURE_BINS)
+    filled = count > 0
+
+    def means(series: Floats) -> Floats:
+        return np.asarray(np.bincount(cell, weights=series, minlength=TEMPERATURE_BINS)[filled] / count[filled])
+
+    expected = means(fitted) + axis.repaired.mean()
+    spread = np.array([_level_spread(seen, length_s) for length_s in count[filled] / axis.rate_hz])
+    names = ("temperature", "temperature", "°C", "level", _level_unit(seen))
+    middle = 0.5 * (edges[1:] + edges[:-1])[filled]
+    return PlotData(*names, False, middle, means(axis.repaired), expected, expected - spread, expected + spread)
+
+
+def _level_unit(seen: WhitenedAxis) -> str:
+    """Return the unit of the level of an axis."""
+    return LEVEL_UNITS[seen.axis.name[0]]
+
+
+def _block_means(values: Floats, length: int) -> Floats:
+    """Return the means of consecutive blocks."""
+    count = values.size // length
+    return np.asarray(values[: count * length].reshape(count, length).mean(axis=1))
+
+
+def _block_times_s(count: int, length: int, rate_hz: float) -> Floats:
+    """Return the times of the middles of consecutive blocks in seconds."""
+    return np.asarray((np.arange(count) + 0.5) * length / rate_hz, np.float64)
+
+
+def _chi2_band(freedom: Floats) -> tuple[Floats, Floats]:
+    """Return the 95 % band of a mean square relative to its expectation."""
+    return np.asarray(chdtri(freedom, 0.975) / freedom), np.asarray(chdtri(freedom, 0.025) / freedom)

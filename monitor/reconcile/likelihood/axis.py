@@ -1,0 +1,362 @@
+"""Maximum-likelihood fit of effects to one axis of a recording.
+
+An ``Axis`` holds the repaired samples of one axis, the transforms of the axes that may leak into this axis, and the
+temperature. ``Axis.fit`` returns an ``AxisFit`` with the sizes that maximise the Whittle likelihood. Regressors and the
+sums of their products over bins are cached, because most trials of a search use the same ramp, line or delayed
+temperature.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from typing import Final, TypeGuard
+
+import numpy as np
+
+from drivers.sample import Floats
+from monitor.noise.effect import Effect, Leak, Transform
+from monitor.noise.effects import (
+    TRANSFORM_ORDER,
+    AngleRandomWalk,
+    BandwidthLimit,
+    Bias,
+    NoiseStep,
+    Resolution,
+    SampleHold,
+    Saturation,
+)
+from monitor.noise.spectrum import Spectrum, white_noise_spectrum
+from monitor.reconcile.likelihood.effect_terms import (
+    DETERMINISTIC_SIZE_PARAMETERS,
+    NOISE_SIZE_PARAMETERS,
+    regressors,
+    size,
+    unit_spectrum,
+    with_factors,
+    with_size,
+)
+from monitor.reconcile.likelihood.whittle import BinSums, WhittleFit, maximise_whittle
+from monitor.reconcile.preparation.cosine_bins import Bins, cosine_transform
+from monitor.reconcile.preparation.value_statistics import Clipping, QuantizationGrid, RepeatedSamples
+
+MIN_BIN_POWER_RATIO: Final = 1e-4
+"""Smallest power of a bin relative to the median bin. Weaker bins in the stop band of a filter contain only the effect
+of the ends of the recording.
+"""
+MIN_STOP_BAND_FRACTION: Final = 0.02
+"""Lowest frequency of a stop band, as a fraction of the sample rate. At lower frequencies, a bin of one coefficient may
+be weak by chance.
+"""
+MAX_CACHE_BYTES: Final = 1 << 28
+"""Largest memory of the cached regressors, in bytes."""
+MIN_CACHED_SERIES: Final = 16
+"""Number of cached series for recordings of any length. The diagnostics use this many series."""
+MAX_CACHED_PRODUCTS: Final = 4096
+"""Largest number of cached sums over bins for each axis."""
+INITIAL_FLOOR_RATIO: Final = 1e-3
+"""Starting value of the white noise floor after a low-pass filter, relative to the total power."""
+INITIAL_EXTRA_RATIO: Final = 1e-2
+"""Starting value of an additional variance basis, relative to the total power."""
+Effects = tuple[Effect, ...]
+"""Effects of one axis in a fixed order."""
+Regressor = tuple[Effect, int]
+"""Deterministic effect and the index of one of its one or two regressors."""
+CURVATURE: Final[Regressor] = (Bias(value=1.0), 0)
+"""Marker for the regressor t². As an effect, a constant bias would have no influence."""
+
+
+@dataclass(frozen=True, slots=True)
+class ValueStatistics:
+    """Statistics of the measured values of an axis: quantization levels, clipping and repeated samples."""
+
+    levels: QuantizationGrid | None
+    clipped: Clipping | None
+    repeats: RepeatedSamples | None
+
+
+class RegressorCache:
+    """Cached transforms of the regressors that depend on time and temperature.
+
+    Parameters
+    ----------
+    n : int
+        Number of samples.
+    rate_hz : float
+        Sample rate in Hz.
+    temperature_c : ndarray of float64, shape (n,), or None
+        Temperature in °C.
+    """
+
+    def __init__(self, n: int, rate_hz: float, temperature_c: Floats | None) -> None:
+        def make(effect: Effect) -> list[Floats]:
+            return [cosine_transform(series) for series in regressors(effect, n, rate_hz, temperature_c)]
+
+        self.curvature = cosine_transform(np.linspace(-1.0, 1.0, n) ** 2)
+        """[n − 1] transform of t², a drift that corresponds to no named effect."""
+        self.step_power = 0.25 / n / np.sin(0.5 * np.pi * np.arange(1, n) / n) ** 2
+        """[n − 1] mean squares of the coefficients of a unit step, averaged over all step times."""
+        self._make = lru_cache(max(MIN_CACHED_SERIES, MAX_CACHE_BYTES // (8 * n)))(make)
+
+    def columns(self, effect: Effect) -> list[Floats]:
+        """Return the transforms of the regressors of a deterministic effect with size one, each of shape (n − 1,)."""
+        return self._make(with_factors(effect, np.ones(2)))
+
+
+@dataclass(slots=True, eq=False)
+class Axis:
+    """Samples, transforms and bins of one axis of one recording."""
+
+    name: str
+    raw: Floats  # [n] rad/s or m/s² as measured; NaN = missing
+    repaired: Floats  # [n] rad/s or m/s², repaired
+    coefficients: Floats  # [n − 1] cosine transform of ``repaired``
+    bins: Bins
+    others: Mapping[str, Floats]  # [n − 1] transforms of the axes that may leak into this axis
+    temperature_c: Floats | None  # [n] °C
+    shown: ValueStatistics
+    regressors: RegressorCache  # shared by all axes of a recording and of its simulations
+    used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
+    _products: dict[tuple[object, ...], Floats] = field(init=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        power = self.bins.sums(self.coefficients**2) / self.bins.count
+        slow = self.bins.f_hz < MIN_STOP_BAND_FRACTION * self.bins.rate_hz
+        self.used_bins = ((power > MIN_BIN_POWER_RATIO * np.median(power)) | slow).astype(np.float64)
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return self.repaired.size
+
+    @property
+    def rate_hz(self) -> float:
+        """Stated sample rate in Hz."""
+        return self.bins.rate_hz
+
+    @property
+    def length_s(self) -> float:
+        """Length of the recording in seconds."""
+        return self.n / self.rate_hz
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the coefficients, in the unit of the axis."""
+        return float(np.sqrt(np.mean(self.coefficients**2)))
+
+    def with_samples(self, repaired: Floats) -> "Axis":
+        """Return a copy of the axis with other repaired samples, shape (n,)."""
+        return replace(self, repaired=repaired, coefficients=cosine_transform(repaired))
+
+    def columns(self, effect: Effect) -> list[Floats]:
+        """Return the transforms of the regressors of a deterministic effect with size one, each of shape (n − 1,)."""
+        return [self.others[effect.source]] if isinstance(effect, Leak) else self.regressors.columns(effect)
+
+    def fit(
+        self,
+        effects: Sequence[Effect],
+        held: frozenset[int] = frozenset(),
+        extra: Floats | None = None,
+        curved: bool = False,
+        floor: bool = True,
+    ) -> "AxisFit":
+        """Return the maximum of the likelihood over all sizes that are not fixed.
+
+        Parameters
+        ----------
+        effects : sequence of Effect
+            Effects of the axis. The shape parameters stay fixed, and the sizes are the starting values.
+        held : frozenset of int, optional
+            Indices of the noise effects whose size is fixed.
+        extra : ndarray of float64, shape (r, m), optional
+            Additional variance bases without an effect.
+        curved : bool, optional
+            If True, t² is an additional regressor without an effect.
+        floor : bool, optional
+            If True and the effects contain a low-pass filter, white noise is added after the filter. A real sensor
+            aliases and its converter is noisy. The null of a digital filter at half the sample rate is therefore never
+            observed.
+
+        Returns
+        -------
+        AxisFit
+            Effects with fitted sizes and the log-likelihood.
+        """
+        transforms = self._spectral_transforms(effects)
+        floor = floor and any(isinstance(one, BandwidthLimit) for one in transforms)
+        constant = _density_after(transforms, None, self.bins) / (1.0 / self.rate_hz)
+        free, bases, start = [], [], []
+        for at, effect in enumerate(effects):
+            if type(effect) not in NOISE_SIZE_PARAMETERS:
+                continue
+            basis = self._variance_basis(effect, effects, transforms)
+            if at in held:
+                constant = constant + size(effect) ** 2 * basis
+            else:
+                free.append(at)
+                bases.append(basis)
+                start.append(min(size(effect) ** 2, self._full_power_theta(basis)))
+        unnamed = [(np.ones_like(constant), INITIAL_FLOOR_RATIO)] if floor else []
+        unnamed += [(row, INITIAL_EXTRA_RATIO) for row in (extra if extra is not None else ())]
+        for basis, ratio in unnamed:
+            bases.append(basis)
+            start.append(ratio * self._full_power_theta(basis))
+        slices, columns = self._regressors_of(effects)
+        fitted = maximise_whittle(
+            self.bins.count * self.used_bins,
+            self.binned_sums([*columns, CURVATURE] if curved else columns),
+            np.asarray(bases).reshape(len(bases), self.bins.count.size),
+            constant,
+            np.asarray(start, np.float64),
+        )
+        return AxisFit(
+            self,
+            _with_fitted_sizes(effects, free, slices, fitted),
+            held,
+            fitted.log_likelihood,
+            fitted,
+            tuple(free),
+            slices,
+            float(fitted.theta[len(free)]) if floor else 0.0,
+        )
+
+    def binned_sums(self, columns: Sequence[Regressor]) -> BinSums:
+        """Return the sums over bins of the products of the axis and regressors."""
+        q, m = len(columns), self.bins.count.size
+        cross, gram = np.empty((q, m)), np.empty((q, q, m))
+        for i, column in enumerate(columns):
+            cross[i] = self._binned_product(column, None)
+            for j in range(i + 1):
+                gram[i, j] = gram[j, i] = self._binned_product(column, columns[j])
+        return BinSums(self._binned_product(None, None), cross, gram)
+
+    def _regressors_of(self, effects: Sequence[Effect]) -> tuple[tuple[tuple[int, slice], ...], list[Regressor]]:
+        """Return the regressors of the deterministic effects, and for each effect its index and the slice of β."""
+        slices: list[tuple[int, slice]] = []
+        columns: list[Regressor] = []
+        for at, effect in enumerate(effects):
+            if type(effect) in DETERMINISTIC_SIZE_PARAMETERS:
+                count = len(self.columns(effect))
+                slices.append((at, slice(len(columns), len(columns) + count)))
+                columns += [(effect, i) for i in range(count)]
+        return tuple(slices), columns
+
+    def _spectral_transforms(self, effects: Sequence[Effect]) -> list[Transform]:
+        """Return the transforms that change the spectrum, in the order in which they act."""
+        return sorted((e for e in effects if self._changes_spectrum(e)), key=lambda e: TRANSFORM_ORDER.index(type(e)))
+
+    def _changes_spectrum(self, effect: Effect) -> TypeGuard[Transform]:
+        """Return True for a transform that changes the spectrum. Repeats at known positions have been replaced."""
+        replaced = isinstance(effect, SampleHold) and self.shown.repeats is not None and self.shown.repeats.mask.any()
+        return isinstance(effect, Transform) and not replaced
+
+    def _variance_basis(self, effect: Effect, effects: Sequence[Effect], transforms: Sequence[Transform]) -> Floats:
+        """Return the variance, shape (m,), of the coefficients of each bin for a noise effect with size one."""
+        factor = 1.0
+        if isinstance(effect, AngleRandomWalk):
+            for other in effects:
+                if isinstance(other, NoiseStep):
+                    later = 1.0 - min(other.time * self.rate_hz / self.n, 1.0)
+                    factor *= 1.0 + later * (other.ratio**2 - 1.0)  # mean variance over the recording
+        tau0_s = 1.0 / self.rate_hz
+        source = Spectrum(lambda f: factor * unit_spectrum(effect, f, tau0_s), None, tau0_s)
+        density = _density_after(transforms, source, self.bins) - _density_after(transforms, None, self.bins)
+        return np.asarray(density / tau0_s)
+
+    def _full_power_theta(self, basis: Floats) -> float:
+        """Return the θ for which a basis would have the total power of the axis."""
+        power = self._binned_product(None, None).sum()
+        return float(power / max((self.bins.count * self.used_bins * basis).sum(), 1e-300))
+
+    def _binned_product(self, a: Regressor | None, b: Regressor | None) -> Floats:
+        """Return the sums over bins of the product of two columns. None means the axis itself."""
+        key = (_regressor_key(a), _regressor_key(b))
+        if key not in self._products:
+            if len(self._products) > MAX_CACHED_PRODUCTS:
+                self._products.clear()
+            self._products[key] = self.bins.sums(self._column(a) * self._column(b)) * self.used_bins
+        return self._products[key]
+
+    def _column(self, regressor: Regressor | None) -> Floats:
+        """Return the transform of a regressor, or of the axis itself for None."""
+        if regressor is None:
+            return self.coefficients
+        return self.regressors.curvature if regressor is CURVATURE else self.columns(regressor[0])[regressor[1]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AxisFit:
+    """Effects of an axis at the maximum of the likelihood."""
+
+    axis: Axis
+    effects: Effects  # with fitted sizes
+    held: frozenset[int]  # indices of effects whose size was not fitted
+    log_likelihood: float
+    fitted: WhittleFit
+    noises: tuple[int, ...]  # index in ``effects`` of each fitted θ
+    regressors: tuple[tuple[int, slice], ...]  # index in ``effects`` and slice of β of each deterministic effect
+    floor: float = 0.0  # variance of a coefficient due to the white noise floor after a low-pass filter
+
+    def error(self, at: int) -> float:
+        """Return the standard error of the size of the effect with index ``at``, or NaN if the size was fixed."""
+        if at in self.noises:
+            noise = self.noises.index(at)
+            covariance = np.linalg.pinv(self.fitted.theta_information)
+            theta = float(self.fitted.theta[noise])
+            return 0.5 * float(np.sqrt(covariance[noise, noise] / theta)) if theta > 0.0 else float("nan")
+        for index, place in self.regressors:
+            if index == at:  # the two columns of one effect, a sine and its cosine, have equal errors
+                return float(np.sqrt(np.diag(self.fitted.beta_covariance)[place].mean()))
+        return float("nan")
+
+    def with_beta(self, beta: Floats) -> "AxisFit":
+        """Return the fit with given sizes, shape (q,), of the deterministic effects and unchanged noise."""
+        axis, fitted = self.axis, self.fitted
+        sums = axis.binned_sums([(self.effects[at], i) for at, p in self.regressors for i in range(p.stop - p.start)])
+        residual = sums.power - 2.0 * beta @ sums.cross + np.einsum("i,j,ijb->b", beta, beta, sums.gram)
+        count = axis.bins.count * axis.used_bins
+        value = -0.5 * float((count * np.log(fitted.variance) + residual / fitted.variance).sum())
+        changed = replace(fitted, beta=beta, residual=np.maximum(residual, 0.0), log_likelihood=value)
+        return replace(self, fitted=changed, log_likelihood=value)
+
+    def residual(self) -> Floats:
+        """Return the coefficients, shape (n − 1,), with all fitted deterministic effects removed."""
+        left = self.axis.coefficients.copy()
+        for at, place in self.regressors:
+            for factor, column in zip(self.fitted.beta[place], self.axis.columns(self.effects[at]), strict=True):
+                left -= factor * column
+        return left
+
+
+def _with_fitted_sizes(
+    effects: Sequence[Effect], noises: Sequence[int], slices: Sequence[tuple[int, slice]], fitted: WhittleFit
+) -> Effects:
+    """Return the effects with their fitted sizes."""
+    found = list(effects)
+    for theta, at in zip(fitted.theta, noises, strict=False):  # bases without an effect come last
+        found[at] = with_size(found[at], float(theta) ** 0.5)
+    for at, place in slices:
+        found[at] = with_factors(found[at], fitted.beta[place])
+    return tuple(found)
+
+
+def _density_after(transforms: Sequence[Transform], source: Spectrum | None, bins: Bins) -> Floats:
+    """Return the spectral density, shape (m,), of a source, or of no source, after the transforms of an axis.
+
+    Rounding adds white noise, also if the quantization steps are coarse. Clipped samples have been restored before, so
+    saturation has no influence.
+    """
+    spectrum = source or Spectrum(np.zeros_like, np.zeros_like, 1.0 / bins.rate_hz)
+    for transform in transforms:
+        if isinstance(transform, Resolution):
+            spectrum = spectrum + white_noise_spectrum(transform.step**2 / 12.0, spectrum.tau0_s)
+        elif not isinstance(transform, Saturation):
+            spectrum = transform.transform_spectrum(spectrum)
+    return spectrum.density(bins.f_hz)
+
+
+def _regressor_key(regressor: Regressor | None) -> tuple[object, int] | None:
+    """Return the cache key of a regressor, which does not depend on the size of the effect."""
+    if regressor is None or regressor is CURVATURE:
+        return regressor
+    effect, at = regressor
+    return (with_size(effect, 1.0) if isinstance(effect, Leak) else with_factors(effect, np.ones(2)), at)
