@@ -4,17 +4,19 @@ The format is big-endian without a sync word: ``id | gyro 3 x i24, status | [acc
 [inclinometer ...] | [temperature 3 x i16, status of each included sensor] | [aux or PPS i24, status] | counter u8 |
 latency u16 | CRC u32``, then CR LF if that is enabled. The identifier states which parts follow. The CRC-32 has the
 polynomial 0x04C11DB7 and the initial value 0xFFFFFFFF, and is not reflected. It covers all bytes before it, padded with
-zeros to a multiple of four bytes. Sources: vortexntnu/stim300-driver, and the frame published in geirhovland/stim300;
+zeros to a multiple of four bytes. Sources: vortexntnu/stim300-driver, the frame published in geirhovland/stim300, and
 data sheet TS1524 tables 5-21 to 5-23 as restated by public drivers.
 
 The datagram contains neither the range of the accelerometer nor the output units, so both must be configured. An
-"increment" is the angle or velocity of one sample, and ``rate`` is needed to convert it to a rate. Integrated outputs
-are not supported. The counter runs with the internal 2000 Hz sampling (unconfirmed: it steps by 4 at 500 Hz).
+"increment" is the change of angle or velocity during one sample. ``rate`` is needed to convert an increment to a rate.
+Integrated outputs are not supported. The counter runs with the internal 2000 Hz sampling. This has not been confirmed
+on a device. The counter would then step by 4 at 500 Hz.
 
-In the status byte of gyro and accelerometer, system integrity error (bit 7), start-up (6), overload (4) and channel
-error (3) make the sample bad, since its values are wrong or unsettled. A sample outside the operating conditions (5) is
-accepted, because the sensor still measures, for example in a climate chamber beyond its stated range. The temperature
-is the mean of the three sensors of the gyro. It is not measured if their status shows an error.
+The status byte of gyro and accelerometer marks a sample as bad if it reports a system integrity error (bit 7), start-up
+(6), overload (4) or a channel error (3). The values of such a sample are wrong or unsettled. A sample outside the
+operating conditions (5) is accepted, because the sensor still measures, for example in a climate chamber beyond the
+stated range. The temperature is the mean of the three sensors of the gyro. If the status of these sensors shows an
+error, the temperature is not measured.
 """
 
 import zlib
@@ -64,8 +66,9 @@ SIZES: Final = {identifier: _datagram_size(parts) for identifier, parts in IDENT
 LONGEST: Final = max(SIZES.values())
 
 ACCEL_BITS: Final = {"2g": 21, "5g": 20, "10g": 19, "30g": 18, "80g": 16}
-"""Exponent of the resolution by accelerometer range. The least significant bit is 2**-bits g. For an increment, it is 8
-times finer, in m/s.
+"""Exponent of the resolution by accelerometer range. The least significant bit is 2**-bits g.
+
+The least significant bit of an increment is 2**-(bits + 3) m/s.
 """
 ERROR_BITS: Final = 0x80 | 0x40 | 0x10 | 0x08
 START_UP: Final = 0x40
@@ -73,7 +76,7 @@ CHANNEL_ERROR: Final = 0x08
 
 _BITS = np.arange(256, dtype=np.uint8)[:, None] >> np.arange(8, dtype=np.uint8) & 1
 BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
-"""Each byte with its bits in reverse order. It converts the CRC to the reflected CRC of zlib."""
+"""Each byte with its bits in reverse order, for conversions between the CRC and the reflected CRC of zlib."""
 
 
 class Settings(DecoderSettings, frozen=True):

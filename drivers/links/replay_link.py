@@ -1,15 +1,16 @@
-"""Replay of a file in place of a device: recordings, CAN logs and captured bytes, at their own pace or another.
+"""Replay of a file in place of a device, at the recorded speed or another speed.
 
 The link carries different data for each kind of file:
 
 - recordings (``drivers.recordings``: CSV, .npz, Parquet, Arrow, a folder) become messages for the decoder ``samples``;
-- CAN logs (.asc .blf .log .trc, CSV of python-can, CSV with ``t``, ``id_hex``, ``data_hex``) become frames;
+- CAN logs (``drivers.links.can_log``) become frames;
 - captured bytes (.bin .raw .txt, also with .gz) become bytes;
-- raw bytes recorded by the daemon (a folder of segments, or one of them) become bytes, frames or messages, according to
+- raw bytes recorded by the daemon (one segment, or a folder of segments) become bytes, frames or messages, according to
   their original link.
 
 Recordings, logs and raw bytes keep their own times (``epoch`` is unix). Captured bytes have no times. With
-``bytes_per_second``, each chunk gets the time at which that rate delivers it. Otherwise it gets the time of the read.
+``bytes_per_second``, each chunk gets the time at which a device with this rate would have sent the chunk. Otherwise
+each chunk gets the time of the read.
 
 ``read`` raises ``LinkEnded`` after all data have been returned. A truncated file is replayed up to the cut, and the
 message at the end mentions the cut. ``build`` reads the header of a CSV file, since the decoder must match. All other
@@ -42,8 +43,9 @@ CAN_LOGS: Final = (".asc", ".blf", ".log", ".trc")
 CAPTURES: Final = (".bin", ".raw", ".txt")
 BATCH_CHUNKS: Final = 1000
 BATCH_BYTES: Final = 1_000_000
-"""A read returns at most BATCH chunks and at most one chunk more than this size. Each read therefore ends, and none
-holds hours of a recording.
+"""Size of the chunks after which a read returns. A read returns at most BATCH_CHUNKS chunks.
+
+Without these limits, one read could return hours of a recording.
 """
 MAX_MESSAGE_ROWS: Final = 4096
 STEP_S: Final = 0.02
@@ -56,11 +58,11 @@ DAMAGE_ERRORS: Final = (
 """Exceptions, in addition to ValueError, that readers raise where a file is truncated or damaged."""
 
 PACES: Final = {"recorded": 1.0, "max": float("inf")}
-"""Values of ``speed`` that are words: seconds of the file per second."""
+"""Seconds of the file per second for the values of ``speed`` that are words."""
 
 Kind = Literal["recording", "log", "capture", "raw"]
 TimedChunk = tuple[float, Chunk]
-"""Seconds since the start of the file, and the chunk that is due then."""
+"""Time in s since the start of the file at which a chunk is due, and the chunk."""
 CARRIERS: Final[dict[Kind, Carrier]] = {"recording": "messages", "log": "frames", "capture": "bytes"}
 """Carrier of each kind of file. Raw bytes state their carrier themselves."""
 
@@ -230,7 +232,7 @@ def _raw_carrier(path: Path) -> Carrier:
     for one in known:
         if one == carrier:
             return one
-    raise ConfigError(f'path: "{path}" carries "{carrier}", where {", ".join(known)} are known')
+    raise ConfigError(f'path: "{path}" carries "{carrier}"; possible are {", ".join(known)}')
 
 
 # --- captured bytes ------------------------------------------------------------------------------
@@ -272,7 +274,7 @@ def _detect_kind(path: Path) -> Kind:
     if suffix in FORMATS:
         return "recording"
     known = (*FORMATS, *CAN_LOGS, *CAPTURES)
-    raise ConfigError(f'path: "{path}" is nothing to replay by its suffix{format_choices(suffix, known)}')
+    raise ConfigError(f'path: "{path}" has no suffix of a file to replay{format_choices(suffix, known)}')
 
 
 def _plain_suffix(path: Path) -> str:
@@ -284,7 +286,7 @@ def _plain_suffix(path: Path) -> str:
 
 
 def _read_header(path: Path) -> str:
-    """Return the first line of a text file; "" if it cannot be read."""
+    """Return the first line of a text file; "" if the file cannot be read."""
     try:
         with _open_text(path) as stream:
             return stream.readline(1000).strip()

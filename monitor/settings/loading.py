@@ -27,7 +27,7 @@ from drivers.errors import ConfigError, format_one_line
 from drivers.links.base import AddressFilteringLink, Link
 from drivers.quantities import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ
 from drivers.sample import AXES, EVENT_KINDS
-from drivers.zenoh.session import configuration, format_error, secret_files
+from drivers.zenoh.session import build_session_config, find_secret_files, format_error
 from monitor.common.config_files import model_path
 from monitor.common.topics import ENDPOINT
 from monitor.settings import file_permissions, toml_text
@@ -589,7 +589,7 @@ def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
     import zenoh
 
     try:
-        return secret_files(configuration({}, path))
+        return find_secret_files(build_session_config({}, path))
     except zenoh.ZError as error:
         text = format_error(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from error

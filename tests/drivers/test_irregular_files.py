@@ -13,8 +13,9 @@ import pytest
 from drivers import file_access
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.links import replay_link
-from drivers.recordings import load_samples, open_recording_writer, segment
-from drivers.zenoh.session import configuration
+from drivers.recordings import load_samples, segment
+from drivers.recordings.writing import atomic_write_path
+from drivers.zenoh.session import build_session_config
 from monitor.commands import thermal
 from monitor.common import config_files
 from monitor.history import sqlite_store
@@ -118,7 +119,7 @@ def test_a_segment(kind: str, read: Callable[[Path], object], tmp_path: Path) ->
 
 def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "a.csv.part")
-    with open_recording_writer.whole(tmp_path / "a.csv") as part:
+    with atomic_write_path(tmp_path / "a.csv") as part:
         part.write_text("x")
     assert (tmp_path / "a.csv").read_text() == "x"
     pytest.importorskip("pyarrow")
@@ -179,7 +180,7 @@ def test_a_file_that_a_zenoh_file_names(tmp_path: Path) -> None:
     file = tmp_path / "zenoh.json5"
     file.write_text(f'{{transport: {{link: {{tls: {{listen_private_key: "{tmp_path / "key.pem"}"}}}}}}}}')
     with pytest.raises(zenoh.ZError, match="is a FIFO"):
-        configuration({}, file)
+        build_session_config({}, file)
 
 
 @pytest.mark.parametrize("suffix", [".dbc", ".kcd"])

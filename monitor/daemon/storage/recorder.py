@@ -466,10 +466,10 @@ class Recorder:
         assert track.writer is not None
         if track.origin.kind == "samples":
             blocks = [one for one in track.held if isinstance(one, SampleBlock)]
-            track.writer.samples(blocks, self._states.get(track.origin.device, DaemonState()))
+            track.writer.write_samples(blocks, self._states.get(track.origin.device, DaemonState()))
             track.rows += sum(len(one) for one in blocks)
         else:
-            track.writer.chunks([one for one in track.held if isinstance(one, Chunk)])
+            track.writer.write_chunks([one for one in track.held if isinstance(one, Chunk)])
             track.rows += len(track.held)
         track.unsynced = True
 

@@ -42,7 +42,7 @@ def save(past: HistoryTable, path: Path) -> None:
         The suffix is unknown or the file cannot be written.
     """
     columns = table(past)
-    begin = format_for_path(path).writer
+    begin = format_for_path(path).open_writer
     with atomic_write_path(path) as part, begin(part, list(columns)) as append:
         append(columns)
 

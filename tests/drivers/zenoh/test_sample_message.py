@@ -21,7 +21,7 @@ from tests.support.ports import free_endpoint
 from tests.support.zenoh_sessions import router
 
 START_NS = 1_763_700_000_123_456_789
-PAGE = Path(__file__).parents[2] / "docs" / "samples-format.md"
+PAGE = Path(__file__).parents[3] / "docs" / "samples-format.md"
 
 
 def rows(n: int, jitter_ns: int = 0) -> SampleBlock:
