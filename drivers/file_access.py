@@ -135,7 +135,7 @@ def _is_fifo(path: Path) -> bool:
 
 
 def _check_mode(path: Path, mode: int) -> None:
-    """Raise OSError if the mode is not that of a regular file."""
+    """Raise OSError if the mode does not belong to a regular file."""
     if not stat.S_ISREG(mode):
         kind = FILE_KINDS.get(stat.S_IFMT(mode), "something else")
         number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL

@@ -18,9 +18,9 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint, SenderTiming, Timing
+from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint
 from drivers.errors import DecodeError
-from drivers.sample import NO_TICK, Chunk, Floats, SampleBlock
+from drivers.sample import NO_TICK, Chunk, Floats, SampleBlock, SenderTiming, Timing
 
 HEADER_BYTES: Final = 4
 DOUBLES: Final = 37

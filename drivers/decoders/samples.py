@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Final
 
-from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint, SenderTiming, Timing
+from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint
 from drivers.errors import DecodeError
-from drivers.sample import Chunk, SampleBlock
+from drivers.sample import Chunk, SampleBlock, SenderTiming, Timing
 from drivers.zenoh.sample_message import decode_samples, encode_samples
 
 MAX_GAP_SAMPLES: Final = 1_000_000_000

@@ -44,7 +44,7 @@ from drivers.sample import Chunk, CounterTiming, Floats, Ints, SampleBlock, Timi
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
-# in the order of the bits of the parts; F0..F7 carry PPS in place of aux; 97 is A7 of hardware up to revision C
+# The order is that of the part bits. F0 to F7 contain PPS instead of aux. 97 is A7 of hardware up to revision C.
 IDENTIFIERS: Final = {
     **dict(zip((0x90, 0x91, 0x92, 0x93, 0x94, 0xA5, 0xA6, 0xA7), range(8), strict=True)),
     **dict(zip((0x98, 0x99, 0x9A, 0x9B, 0x9C, 0xAD, 0xAE, 0xAF), range(8, 16), strict=True)),
@@ -212,14 +212,19 @@ def _write_int24(data: Bytes, at: int, values: Floats, step: float) -> None:
 
 def datagram_crc(body: bytes) -> bytes:
     """Return the four CRC bytes of a datagram."""
-    # reversed zeros are zeros, so the padding can be appended afterwards
-    mirrored = zlib.crc32(bytes(-len(body) % 4), zlib.crc32(body.translate(BIT_REVERSAL))) ^ 0xFFFFFFFF
-    return mirrored.to_bytes(4, "little").translate(BIT_REVERSAL)
+    return _reflected_crc(body.translate(BIT_REVERSAL)).to_bytes(4, "little").translate(BIT_REVERSAL)
 
 
 def has_valid_crc(frame: bytes) -> bool:
     """Return True if the CRC of a complete datagram is correct."""
-    return datagram_crc(frame[:-4]) == frame[-4:]
+    mirrored = frame.translate(BIT_REVERSAL)
+    return _reflected_crc(mirrored[:-4]) == int.from_bytes(mirrored[-4:], "little")
+
+
+def _reflected_crc(mirrored: bytes) -> int:
+    """Return the CRC with reversed bits of a datagram whose bytes have reversed bits."""
+    # reversed zeros are zeros, so the padding can be appended after the reversal
+    return zlib.crc32(bytes(-len(mirrored) % 4), zlib.crc32(mirrored)) ^ 0xFFFFFFFF
 
 
 def build(settings: Settings) -> Decoder:

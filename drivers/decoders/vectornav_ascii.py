@@ -61,7 +61,7 @@ class VectornavAsciiDecoder(FrameStreamDecoder):
         self.timing: Timing = ArrivalTiming()
         self._wanted = b"" if settings.sentence == "auto" else f"${settings.sentence},".encode()
         self._sentence = self._wanted
-        self._unwanted_sentences = 0  # number of sentences since the last wanted one
+        self._unwanted_sentences = 0  # number of sentences since the last wanted sentence
 
     @property
     def hint(self) -> str:

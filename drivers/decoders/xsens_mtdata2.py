@@ -183,7 +183,7 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
         return filled
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return one packet per sample with both clocks, the temperature if there is one, and the measured axes."""
+        """Return one packet per sample with both clocks, the temperature if measured, and the measured axes."""
         number_format = FORMATS.index(self._settings.format)
         frames = []
         rows = zip(samples.values, samples.temperature_c.tolist(), samples.ticks.tolist(), strict=True)
@@ -201,9 +201,7 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
 
 
 def _group_by_layout(frames: Frames) -> Iterator[tuple[Layout | None, list[int], Bytes]]:
-    """Yield each layout (None if invalid), the indices of its packets, and their bytes [k, length]. Most often there is
-    one layout.
-    """
+    """Yield each layout, the indices of its packets, and their bytes [k, length]. The layout is None if invalid."""
     for _, rows in group_indices([len(packet) for packet in frames.data]):
         packets = frames.stack_bytes(rows)
         at = np.array(rows)

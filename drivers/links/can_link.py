@@ -167,7 +167,7 @@ class CanLink(PolledLink):
         return chunks
 
     def _receive_frame(self, wait_s: float) -> "can.Message | None":
-        """Receive one frame; None if there is none. Raise LinkLost if the bus is gone."""
+        """Return one frame; None if no frame arrives in time. Raise LinkLost if the bus is gone."""
         import can
 
         bus = self._bus

@@ -67,7 +67,7 @@ CARRIERS: Final[dict[Kind, Carrier]] = {"recording": "messages", "log": "frames"
 """Carrier of each kind of file. Raw bytes state their carrier themselves."""
 
 DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log": "dbc", "capture": "", "raw": ""}
-"""Decoder of each kind of file if the settings name none; "" if the settings must name one."""
+"""Default decoder of each kind of file; "" if the settings must name the decoder."""
 
 
 class Settings(LinkSettings, frozen=True, kw_only=True):
@@ -210,12 +210,12 @@ def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
 
 
 def _raw_segments(path: Path) -> list[Path]:
-    """Return the segments of raw bytes in a folder, oldest first, or the one segment that is named."""
+    """Return the segments of a folder, oldest first. For a file, return the file."""
     return segment.list_segments(path) if path.is_dir() else [path]
 
 
 def _is_raw(path: Path) -> bool:
-    """Return True if the newest segment holds raw bytes. An unreadable segment is reported when it is opened."""
+    """Return True if the newest segment contains raw bytes. An unreadable segment is reported when it is opened."""
     found = _raw_segments(path)
     if not found or not segment.NAME.fullmatch(found[-1].name):
         return False

@@ -142,7 +142,7 @@ class ZenohLink:
         self._waiting_bytes = 0
 
     def _enqueue(self, chunk: Chunk) -> None:
-        """Queue the newest chunk and drop the oldest ones above the limits."""
+        """Queue the newest chunk, and drop the oldest chunks above the limits."""
         self._waiting.append(chunk)
         self._waiting_bytes += len(chunk.data)
         while len(self._waiting) > 1 and (self._waiting_bytes > MAX_QUEUED_BYTES or len(self._waiting) > MAX_MESSAGES):

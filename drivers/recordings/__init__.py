@@ -204,7 +204,7 @@ def _supported_fs(fs: float | None, notes: list[str]) -> float | None:
 
 
 def _choose_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> float | None:
-    """Return the rate to use. The rate of the caller takes precedence over that of the file."""
+    """Return the rate to use. The rate of the caller takes precedence over the rate in the file."""
     if rate_hz is not None and fs is not None and rate_hz != fs:
         notes.append(f"The file states {fs:g} Hz; the requested {rate_hz:g} Hz are used.")
     return fs if rate_hz is None else float(rate_hz)
@@ -213,7 +213,7 @@ def _choose_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> f
 def _usable_times(
     path: Path, t: Floats | None, rate_hz: float | None, notes: list[str]
 ) -> tuple[Floats | None, NDArray[np.bool_] | slice]:
-    """Return the usable times and a mask of their rows; None and all rows if ``t`` is not usable."""
+    """Return the usable times and a mask of their samples; None and all samples if ``t`` is not usable."""
     if t is None:
         return None, slice(None)
     usable = np.abs(t) < T_LIMIT_S  # False for NaN as well
@@ -230,7 +230,7 @@ def _usable_times(
 
 
 def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
-    """Replace values beyond MAX_VALUE by NaN, in place, and add a note that counts them."""
+    """Replace values beyond MAX_VALUE by NaN, in place, and add a note with their number."""
     count = 0
     for array in (values, temperature_c):
         large = np.abs(array) > MAX_VALUE

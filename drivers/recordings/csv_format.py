@@ -55,7 +55,7 @@ GZIP_LEVEL: Final = 1  # digits of noise hardly compress: level 6 saves a furthe
 
 @dataclass(slots=True)
 class _BadLines:
-    """Number of lines that are not samples, and a description of the first one."""
+    """Number of lines that are not samples, and a description of the first such line."""
 
     count: int = 0
     first: str = ""

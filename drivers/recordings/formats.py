@@ -34,7 +34,7 @@ FORMATS: Final[Mapping[str, Format]] = {
 
 
 def format_for_path(path: Path) -> Format:
-    """Return the format for the suffix of a path. Raise ConfigError if the suffix is not that of a recording."""
+    """Return the format for the suffix of a path. Raise ConfigError if no format of recordings has the suffix."""
     suffix = _suffix(path)
     if not suffix:
         raise ConfigError(
@@ -44,7 +44,7 @@ def format_for_path(path: Path) -> Format:
 
 
 def is_recording(path: Path) -> bool:
-    """Return True if the suffix of a path is that of a recording. The file itself is not opened."""
+    """Return True if a format of recordings has the suffix of a path. The file itself is not opened."""
     return _suffix(path) in FORMATS
 
 

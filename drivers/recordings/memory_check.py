@@ -33,7 +33,7 @@ ROW_BYTES: Final = 64
 """Size of one sample in memory: time, six axes and temperature as float64."""
 MIN_ROW_LIMIT: Final = 20_000_000
 MAX_ROWS_PER_BYTE: Final = 8
-"""Rows of measured values need more than one bit each, in every format."""
+"""Maximum number of rows per byte. A row of measured values needs more than one bit in every format."""
 MIN_UNPACKED_LIMIT_BYTES: Final = 2_000_000_000
 MAX_UNPACKING_RATIO: Final = 100
 MAX_COLUMNS: Final = 10_000
@@ -96,7 +96,7 @@ class ReadLimit:
 
 
 def read_limit(path: Path) -> ReadLimit:
-    """Return the limits on a file, with the memory that is available now. Raise OSError if there is no such file."""
+    """Return the limits on a file, with the memory that is available now. Raise OSError if the file does not exist."""
     return ReadLimit(path, path.stat().st_size, available_bytes())
 
 

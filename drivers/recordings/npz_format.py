@@ -62,7 +62,10 @@ NPY_HEADER: Final = re.compile(
     rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
     re.DOTALL,
 )
-"""Header of a numeric array with one dimension or none, as every version of NumPy writes it. It is not evaluated."""
+"""Header of a numeric array with at most one dimension, as every version of NumPy writes it.
+
+The header is matched and not evaluated as Python.
+"""
 
 
 class _BoundedFile(FileIO):

@@ -12,7 +12,6 @@ from typing import Any, Final
 
 import drivers
 from drivers import file_access, units
-from drivers.decoders.base import ArrivalTiming, CounterTiming, Timing
 from drivers.decoders.dbc.bits import SignalBits
 from drivers.decoders.dbc.join import COLUMNS, Column, Message
 from drivers.decoders.dbc.settings import Settings, SignalSettings
@@ -20,7 +19,7 @@ from drivers.discovery import format_choices, format_suggestion
 from drivers.errors import ConfigError
 from drivers.extras import check_extra
 from drivers.quantities import describe_range_errors
-from drivers.sample import AXES
+from drivers.sample import AXES, ArrivalTiming, CounterTiming, Timing
 
 TEMPERATURE: Final = "temperature"
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
@@ -208,7 +207,7 @@ def _problems(settings: Settings) -> Iterator[str]:
 
 
 def _signal_settings(axis: str, entry: str | SignalSettings) -> SignalSettings:
-    """Return the settings of a signal from its short or long form."""
+    """Return the settings of a signal, which may be given as a name."""
     if isinstance(entry, SignalSettings):
         return entry
     if entry.startswith("-"):
@@ -217,7 +216,7 @@ def _signal_settings(axis: str, entry: str | SignalSettings) -> SignalSettings:
 
 
 def _locate(file: str) -> Path:
-    """Return the path of a database, which may be a shipped one."""
+    """Return the path of a database file. A name without a folder may be that of a shipped database."""
     path = file_access.expand_user(file)
     name = file.removeprefix(SHIPPED_PREFIX)
     if name == file and (file_access.is_file(path) or len(path.parts) != 1):
