@@ -1,4 +1,4 @@
-"""Discovery of plug-in modules: list the modules of a package, import one by name, suggest names for unknown ones."""
+"""Discovery of plug-in modules by listing a package, and suggestions for misspelled names."""
 
 import importlib
 import pkgutil
@@ -43,7 +43,7 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
     Raises
     ------
     ConfigError
-        There is no such module. The text lists all names, the most similar one first.
+        If there is no such module. The text lists all names, beginning with the most similar name.
     """
     known = list_modules(package, suffix)
     if name not in known:
@@ -64,14 +64,14 @@ def format_suggestion(word: str, known: Sequence[str]) -> str:
     Returns
     -------
     str
-        A question that suggests the most similar known word, or a list of all known words if none is similar.
+        A question that suggests the most similar known word. If no known word is similar, a list of all known words.
     """
     close = get_close_matches(word, known, n=1, cutoff=0.5)
     return f'; did you mean "{close[0]}"?' if close else f"; known are {', '.join(known)}"
 
 
 def format_choices(word: str, known: Sequence[str]) -> str:
-    """Return the end of an error message about an unknown word: a list of all known words, the most similar one first.
+    """Return the end of an error message about an unknown word: all known words, beginning with the most similar word.
 
     Parameters
     ----------

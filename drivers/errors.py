@@ -1,4 +1,4 @@
-"""Exception classes of the project. Each class also inherits from the matching built-in exception if there is one.
+"""Exception classes of the project. Most classes also inherit from the matching built-in exception.
 
     ImuError
       ConfigError(ValueError)        only while starting; the service refuses to start
@@ -41,7 +41,7 @@ def format_one_line(text: str) -> str:
 
 
 def describe_error(error: Exception) -> str:
-    """Return the text of an exception in one line. For an error of the system, this is the reason without the path."""
+    """Return the text of an exception in one line. The text of an OSError is the reason without the path."""
     return " ".join(str(getattr(error, "strerror", None) or error).split())
 
 
@@ -75,7 +75,7 @@ class LinkUnavailable(LinkError):
 
 
 class LinkLost(LinkError):
-    """An open link has failed. It is opened again."""
+    """An open link has failed. The link is opened again."""
 
 
 class LinkEnded(LinkError):

@@ -1,4 +1,4 @@
-"""Optional packages: check whether the packages of an installation extra are installed, and how to install them."""
+"""Check of the optional packages of an installation extra."""
 
 import importlib.util
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ def check_extra(extra: str, user: str) -> None:
     Raises
     ------
     ConfigError
-        A package is missing. The text says how to install it.
+        If a package is missing. The text says how to install the package.
     """
     if missing := missing_packages(extra):
         raise ConfigError(f'{user} needs {" and ".join(missing)}: pip install "imu-monitor[{extra}]"')

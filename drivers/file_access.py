@@ -1,7 +1,8 @@
 """Safe opening and reading of files whose names come from a configuration, a folder or the command line.
 
-``open_regular`` opens regular files only. It refuses a FIFO, a socket, a device or a directory with a one-line error,
-and it never blocks. ``read_small_file`` reads a whole small file, such as a configuration, a model or a CAN database.
+``open_regular`` opens regular files only. For a FIFO, a socket, a device or a directory, the function raises a one-line
+error and never blocks. ``read_small_file`` reads a complete small file, such as a configuration, a model or a CAN
+database.
 """
 
 import errno
@@ -26,15 +27,12 @@ FILE_KINDS: Final = {
 
 
 def expand_user(name: str) -> Path:
-    """Return the path for a name as users write it.
-
-    A leading ``~`` is replaced by the home folder if the user exists.
-    """
+    """Return the path for a name that may begin with ``~`` for the home folder of an existing user."""
     return Path(os.path.expanduser(name))
 
 
 def real_path(path: Path) -> Path:
-    """Return the absolute path with symbolic links followed. A loop of links is kept, where pathlib raises."""
+    """Return the absolute path with symbolic links followed. pathlib would raise an error for a loop of links."""
     return Path(os.path.realpath(path))
 
 
@@ -59,7 +57,7 @@ def open_regular(path: Path) -> IO[bytes]:
     Raises
     ------
     OSError
-        The file cannot be opened, or it is not a regular file. ``strerror`` gives the reason without the path.
+        If the file cannot be opened, or is not a regular file. ``strerror`` gives the reason without the path.
     """
     check_regular(path)  # check before opening, since opening a device may have side effects
     # the file may have been replaced since: open without blocking, and check again
@@ -73,14 +71,14 @@ def open_regular(path: Path) -> IO[bytes]:
 
 
 def check_regular(path: Path) -> None:
-    """Check that a name belongs to a regular file, for libraries that open a file themselves.
+    """Check that a path is a regular file, before a library opens the file.
 
-    The file is not opened. Closing another descriptor of a file would drop the locks that SQLite holds on it.
+    The check does not open the file, since closing a second descriptor would drop the locks that SQLite holds on it.
 
     Raises
     ------
     OSError
-        There is no such file, or it is not a regular file. ``strerror`` gives the reason without the path.
+        If the file does not exist, or is not a regular file. ``strerror`` gives the reason without the path.
     """
     try:
         mode = os.stat(path).st_mode
@@ -90,13 +88,7 @@ def check_regular(path: Path) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Check that a path is a folder or does not exist.
-
-    Raises
-    ------
-    OSError
-        The path is not a folder. ``strerror`` names the kind of file, without the path.
-    """
+    """Raise OSError if a path is neither a folder nor absent. ``strerror`` names the kind of file."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -114,8 +106,8 @@ def read_small_file(path: Path, *, pipe: bool = False) -> bytes:
     path
         Name of the file.
     pipe
-        True if a pipe may be read as well, for a name given on the command line: ``/dev/stdin`` or ``<(command)``.
-        Opening and reading a pipe wait for its writer.
+        True if a pipe may be read as well, such as ``/dev/stdin`` or ``<(command)`` on the command line. Opening and
+        reading a pipe wait for the writer of the pipe.
 
     Returns
     -------
@@ -125,7 +117,7 @@ def read_small_file(path: Path, *, pipe: bool = False) -> bytes:
     Raises
     ------
     OSError
-        The file cannot be read, is not a regular file, or is larger than MOST_BYTES.
+        If the file cannot be read, is not a regular file, or is larger than MAX_BYTES.
     """
     with path.open("rb") if pipe and _is_fifo(path) else open_regular(path) as file:
         data = file.read(MAX_BYTES + 1)
@@ -143,7 +135,7 @@ def _is_fifo(path: Path) -> bool:
 
 
 def _check_mode(path: Path, mode: int) -> None:
-    """Raise OSError if the mode is not that of a regular file."""
+    """Raise OSError if the mode does not belong to a regular file."""
     if not stat.S_ISREG(mode):
         kind = FILE_KINDS.get(stat.S_IFMT(mode), "something else")
         number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL

@@ -43,7 +43,7 @@ class Chunk:
 
 @dataclass(frozen=True, slots=True)
 class SampleBlock:
-    """Consecutive samples of one device, n ≥ 1. ``lost`` samples are missing just before the first one."""
+    """Consecutive samples of one device, n ≥ 1. ``lost`` samples are missing just before the first sample."""
 
     t_ns: Ints  # [n]
     values: Floats  # [n, 6] in AXES order, rad/s and m/s²; NaN = not measured
@@ -55,7 +55,7 @@ class SampleBlock:
         return int(self.t_ns.size)
 
     def __getitem__(self, rows: slice) -> "SampleBlock":
-        """Return some rows of the block. ``lost`` is kept only if the first row is among them."""
+        """Return some samples of the block. ``lost`` is kept only if the first sample is included."""
         first = rows.indices(len(self))[0]
         return SampleBlock(
             self.t_ns[rows],
@@ -86,7 +86,7 @@ def make_block(
     ticks
         [n] int64, counter of the device. None if there is no counter.
     lost
-        Number of samples that are missing just before the first one.
+        Number of samples that are missing just before the first sample.
     """
     n = int(t_ns.size)
     temperature_c = np.full(n, np.nan) if temperature_c is None else temperature_c
@@ -145,9 +145,9 @@ EVENT_KINDS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something that happened to a device, with its kind, time, size and significance."""
+    """Event of a device, such as a lost link or a noise change, with time, size and significance."""
 
-    kind: str  # one of KINDS
+    kind: str  # one of EVENT_KINDS
     t_ns: int
     text: str
     axis: str | None = None
@@ -176,8 +176,8 @@ def merge_contiguous_blocks(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
 def seconds_to_ns(seconds: Floats) -> Ints:
     """Convert seconds [n] to whole nanoseconds [n].
 
-    Integer part and fraction are converted separately. The only error is the resolution of a float64 of Unix seconds,
-    0.24 µs.
+    Integer part and fraction are converted separately. The error is only the resolution of Unix seconds as float64,
+    which is 0.24 µs.
     """
     whole = np.floor(seconds)
     fraction = np.rint((seconds - whole) * 1e9)
@@ -186,7 +186,7 @@ def seconds_to_ns(seconds: Floats) -> Ints:
 
 
 def ns_to_seconds(t_ns: Ints) -> Floats:
-    """Convert nanoseconds [n] to seconds [n]. A float64 of Unix seconds has a resolution of 0.24 µs."""
+    """Convert nanoseconds [n] to seconds [n]. The resolution of Unix seconds as float64 is 0.24 µs."""
     whole, rest = np.divmod(t_ns, 1_000_000_000)
     result: Floats = whole + rest * 1e-9
     return result

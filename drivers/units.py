@@ -1,9 +1,9 @@
 """Conversion factors from unit names to SI, for units in settings and CAN databases.
 
 Each table maps the spelling of a unit to the factor that converts a number in that unit to rad/s, m/s² or s. A
-temperature unit also has an offset. The spellings are those of data sheets, DBC files and plots. Case matters, since
-``mg`` is not ``Mg``. Blanks around a name are ignored. An unknown name raises a ``ConfigError`` that lists all known
-names, the most similar one first.
+temperature unit also has an offset. The spellings are those of data sheets, DBC files and plots. Upper and lower case
+are distinguished. Blanks around a name are ignored. An unknown name raises a ``ConfigError`` that lists all known
+names, beginning with the most similar name.
 """
 
 import math
@@ -82,15 +82,8 @@ T = TypeVar("T")
 
 
 def rate_factor(unit: str) -> float:
-    """Return the factor from a unit of angular rate to rad/s.
+    """Return the factor from a unit of angular rate to rad/s. Raise ConfigError if the unit is unknown.
 
-    Raises
-    ------
-    ConfigError
-        The unit is unknown.
-
-    Examples
-    --------
     >>> round(rate_factor("deg/s"), 6)
     0.017453
     """
@@ -98,15 +91,8 @@ def rate_factor(unit: str) -> float:
 
 
 def acceleration_factor(unit: str) -> float:
-    """Return the factor from a unit of acceleration to m/s².
+    """Return the factor from a unit of acceleration to m/s². Raise ConfigError if the unit is unknown.
 
-    Raises
-    ------
-    ConfigError
-        The unit is unknown.
-
-    Examples
-    --------
     >>> acceleration_factor("g")
     9.80665
     """
@@ -116,13 +102,8 @@ def acceleration_factor(unit: str) -> float:
 def temperature_scale(unit: str) -> tuple[float, float]:
     """Return factor and offset of a unit of temperature: °C = factor · number + offset.
 
-    Raises
-    ------
-    ConfigError
-        The unit is unknown.
+    The function raises ConfigError if the unit is unknown.
 
-    Examples
-    --------
     >>> temperature_scale("K")
     (1.0, -273.15)
     """
@@ -130,25 +111,14 @@ def temperature_scale(unit: str) -> tuple[float, float]:
 
 
 def time_factor(unit: str) -> float:
-    """Return the factor from a unit of time to s.
-
-    Raises
-    ------
-    ConfigError
-        The unit is unknown.
-
-    Examples
-    --------
-    >>> time_factor("ms")
-    0.001
-    """
+    """Return the factor from a unit of time to s. Raise ConfigError if the unit is unknown."""
     return _look_up(TIME, unit, "time")
 
 
 def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
     """Return the entry of a unit. Raise ConfigError if the table does not contain the unit."""
-    # Unicode has two characters for the prefix micro, and keyboards and fonts produce either of them
+    # Unicode has two characters for the prefix micro, and keyboards produce both of them
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     if name not in table:
-        raise ConfigError(f'"{unit}" is no unit of {quantity}{format_choices(name, tuple(table))}')
+        raise ConfigError(f'"{unit}" is not a unit of {quantity}{format_choices(name, tuple(table))}')
     return table[name]

@@ -18,17 +18,13 @@ from typing import ClassVar, Final, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import NO_TICK, Chunk, Floats, Ints, SampleBlock, make_block
-from drivers.sample import ArrivalTiming as ArrivalTiming  # noqa: PLC0414 - re-exported for decoders
-from drivers.sample import CounterTiming as CounterTiming  # noqa: PLC0414 - re-exported for decoders
-from drivers.sample import SenderTiming as SenderTiming  # noqa: PLC0414 - re-exported for decoders
-from drivers.sample import Timing as Timing  # noqa: PLC0414 - re-exported for decoders
+from drivers.sample import NO_TICK, Chunk, Floats, Ints, SampleBlock, Timing, make_block
 from drivers.settings_model import SettingsModel
 
 MAX_GYRO_RAD_S: Final = 1000.0
 """Largest plausible angular rate in rad/s. The widest range of MEMS gyroscopes is 4000 °/s, which is 70 rad/s."""
 MAX_ACCEL_M_S2: Final = 10_000.0
-"""Largest plausible acceleration in m/s², about 1000 g. It is above the range of every inertial-grade MEMS sensor."""
+"""Largest plausible acceleration in m/s², about 1000 g. No inertial-grade MEMS sensor has a wider range."""
 VALUE_LIMITS: Final = np.repeat([MAX_GYRO_RAD_S, MAX_ACCEL_M_S2], 3)
 """Largest plausible values [6] in the order of ``AXES``."""
 TEMPERATURE_LIMITS_C: Final = (-100.0, 300.0)
@@ -48,7 +44,7 @@ class Decoder(Protocol):
 
     @property
     def timing(self) -> Timing:
-        """Timing information that the frames carry. It does not change during the life of the decoder."""
+        """Timing information that the frames carry. The kind of timing does not change."""
 
     @property
     def bad(self) -> int:
@@ -56,7 +52,7 @@ class Decoder(Protocol):
 
     @property
     def hint(self) -> str:
-        """Reason for rejected frames, for the status line; "" if there is none."""
+        """Reason for rejected frames, for the status line; "" if no frame was rejected recently."""
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples that these chunks complete.
@@ -82,7 +78,7 @@ class AddressFilter(Protocol):
 
 @runtime_checkable
 class LateFrameCounter(Protocol):
-    """Interface of a decoder that joins several frames to one sample, and tells late frames from missing ones."""
+    """Interface of a decoder that joins frames to samples, and distinguishes late frames from lost frames."""
 
     @property
     def late(self) -> int:
@@ -101,7 +97,7 @@ HINT_FRAMES: Final = 1000
 
 
 class RejectionHint:
-    """Reason for the last rejected frame. It is shown until HINT_FRAMES good frames have followed."""
+    """Reason for the last rejected frame, which is shown until HINT_FRAMES good frames have followed."""
 
     def __init__(self) -> None:
         self._text = ""
@@ -109,7 +105,7 @@ class RejectionHint:
 
     @property
     def text(self) -> str:
-        """Reason for the last rejected frame; "" if there is none."""
+        """Reason for the last rejected frame; "" if no frame was rejected recently."""
         return self._text if self._good_frames < HINT_FRAMES else ""
 
     def note_rejected(self, text: str) -> None:
@@ -236,7 +232,7 @@ class Frames:
 NEED_MORE: Final = 0
 """Result of a ``FrameMatcher`` if the buffer ends before the frame does."""
 REJECT: Final = -1
-"""Result of a ``FrameMatcher`` if there is no valid frame."""
+"""Result of a ``FrameMatcher`` if the bytes at the offset are not a valid frame."""
 
 FrameMatcher = Callable[[bytes, int], int]
 """Function of the buffer and the offset of a sync pattern that returns the length of the frame, NEED_MORE or REJECT."""
@@ -291,7 +287,7 @@ class FrameBuffer:
 
     @property
     def hint(self) -> str:
-        """Reason for rejected or missing frames; "" if there is none."""
+        """Reason for rejected or missing frames; "" if the stream is free of errors."""
         if self._skipped_bytes >= MAX_BYTES_WITHOUT_FRAME:
             return f"{self._skipped_bytes} bytes without a valid frame: is the baud rate right, and the decoder?"
         return self._hint.text
@@ -358,7 +354,7 @@ class FrameBuffer:
         return b"".join((self._buffer, *[chunk.data for chunk in chunks]))
 
     def _count_rejected(self, at: int) -> None:
-        """Count a rejected candidate unless it lies within a frame length of the previous one."""
+        """Count a rejected candidate unless the previous rejected candidate is less than a frame length away."""
         offset = self._buffer_offset + at
         if offset - self._last_rejected >= max(self._frame_length, 1):
             self._rejected += 1
@@ -407,7 +403,7 @@ class FrameStreamDecoder(ABC):
 
     @property
     def hint(self) -> str:
-        """Reason for rejected frames; "" if there is none."""
+        """Reason for rejected frames; "" if no frame was rejected recently."""
         return self._buffer.hint
 
     def reset(self) -> None:
@@ -433,7 +429,7 @@ class FrameStreamDecoder(ABC):
 
     @abstractmethod
     def _decode(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples of these frames, of which there is at least one."""
+        """Return the samples of one or more frames."""
 
 
 Key = TypeVar("Key", bound=Hashable)

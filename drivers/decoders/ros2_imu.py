@@ -2,13 +2,13 @@
 
 The payload is XCDR1 (OMG DDSI-RTPS 10.5). It begins with 4 bytes of encapsulation (``00 01`` little-endian, ``00 00``
 big-endian, two bytes of options). The following fields are aligned from byte 4: stamp.sec i32, stamp.nanosec u32,
-frame_id (u32 length with its NUL, bytes), padding to 8 bytes, then 37 float64. These are orientation x y z w and its
-covariance (9), angular velocity x y z in rad/s and its covariance (9), linear acceleration x y z in m/s² and its
-covariance (9). covariance[0] = -1 means that the quantity is not provided (sensor_msgs/Imu.msg). The stamp is the time
-of the sample. There is no temperature.
+frame_id (u32 length with its NUL, bytes), padding to 8 bytes, then 37 float64. The 37 numbers are orientation x y z w,
+angular velocity x y z in rad/s and linear acceleration x y z in m/s², each followed by 9 covariances. covariance[0] =
+-1 means that the quantity is not provided (sensor_msgs/Imu.msg). The stamp is the time of the sample. The message
+contains no temperature.
 
-The attachment of rmw_zenoh exists in two layouts: labelled (77 bytes) and bare (33 bytes). Both contain a sequence
-number i64, by which lost messages are counted, and the identifier of the publisher. The attachment is optional.
+The attachment of rmw_zenoh exists in two layouts: labelled (77 bytes) and bare (33 bytes). Both layouts contain the
+identifier of the publisher and a sequence number i64, by which lost messages are counted. The attachment is optional.
 """
 
 import struct
@@ -18,9 +18,9 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint, SenderTiming, Timing
+from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint
 from drivers.errors import DecodeError
-from drivers.sample import NO_TICK, Chunk, Floats, SampleBlock
+from drivers.sample import NO_TICK, Chunk, Floats, SampleBlock, SenderTiming, Timing
 
 HEADER_BYTES: Final = 4
 DOUBLES: Final = 37
@@ -38,7 +38,7 @@ SEQUENCE_OFFSETS: Final = {77: 16, 33: 0}
 with its length byte precedes the number.
 """
 MAX_GAP_MESSAGES: Final = 1_000_000_000
-"""Largest gap in messages. A larger jump, eleven days at 1 kHz, indicates another count and not a loss."""
+"""Largest gap in messages, eleven days at 1 kHz. A larger jump indicates that the counter was restarted."""
 GID_BYTES: Final = 16  # the last bytes of both layouts
 BYTE_ORDERS: Final = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
@@ -144,15 +144,15 @@ def _parse_message(data: bytes) -> _Message:
     """Find the numbers in a payload. Raise ``DecodeError`` if it is not an Imu message."""
     end = BYTE_ORDERS.get(data[:2])
     if end is None:
-        raise DecodeError("no XCDR1 message: its encapsulation is not 00 00 or 00 01")
+        raise DecodeError("no XCDR1 message: the encapsulation is not 00 00 or 00 01")
     if len(data) < HEADER_BYTES + 12 + BODY_BYTES:
         raise DecodeError(f"{len(data)} bytes are too few for sensor_msgs/Imu")
     sec, nanosec, length = struct.unpack_from(f"{end}iII", data, HEADER_BYTES)
     if nanosec >= 1_000_000_000 or length > MAX_FRAME_ID_BYTES:
-        raise DecodeError("its header is none of sensor_msgs/Imu; is the type of this topic another?")
+        raise DecodeError("the header is not that of sensor_msgs/Imu; check the type of the topic")
     start = HEADER_BYTES + (12 + length + 7) // 8 * 8
     if len(data) - start - BODY_BYTES not in range(4):  # up to 3 bytes of padding may follow
-        raise DecodeError(f"{len(data)} bytes are not the length of a sensor_msgs/Imu")
+        raise DecodeError(f"{len(data)} bytes are not the length of sensor_msgs/Imu")
     return _Message(sec * 1_000_000_000 + nanosec, data[start : start + BODY_BYTES], end == "<")
 
 

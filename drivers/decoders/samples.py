@@ -1,22 +1,22 @@
 """Decoder of sample messages from another imu-monitor, or from any program that publishes the same map.
 
 The layout is defined in ``drivers.zenoh.sample_message``. A message contains Unix times and the number of samples that
-its publisher has received since its start. If this number increases by more than the rows of the message, messages have
-been lost. Their rows are counted as ``lost`` before the batch. If the number decreases, the publisher has been
-restarted and nothing is lost.
+the publisher has received since its start. If the number increases by more than the samples of the message, messages
+have been lost. Their samples are counted as ``lost`` before the message. If the number decreases, the publisher has
+been restarted, and no samples are counted as lost.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Final
 
-from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint, SenderTiming, Timing
+from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint
 from drivers.errors import DecodeError
-from drivers.sample import Chunk, SampleBlock
+from drivers.sample import Chunk, SampleBlock, SenderTiming, Timing
 from drivers.zenoh.sample_message import decode_samples, encode_samples
 
 MAX_GAP_SAMPLES: Final = 1_000_000_000
-"""Largest gap in samples. A larger jump of the count, eleven days at 1 kHz, indicates another count and not a loss."""
+"""Largest gap in samples, eleven days at 1 kHz. A larger jump indicates that the counter was restarted."""
 
 
 class Settings(DecoderSettings):
@@ -24,7 +24,7 @@ class Settings(DecoderSettings):
 
 
 class SamplesDecoder:
-    """Decoder of msgpack maps to samples."""
+    """Decoder and encoder of msgpack maps of samples."""
 
     carrier: ClassVar[str] = "messages"
 
@@ -71,10 +71,10 @@ class SamplesDecoder:
         return [Chunk(encode_samples("encoded", self._encoded, samples), int(samples.t_ns[-1]))]
 
     def _decode_message(self, data: bytes) -> list[SampleBlock]:
-        """Return the samples of one message, with the losses before it."""
-        batch = decode_samples(data)
-        rows = batch.block
-        self._lost = min(self._lost + rows.lost + self._count_skipped(batch.samples, len(rows)), MAX_GAP_SAMPLES)
+        """Return the samples of one message. The first block states the number of samples lost before the message."""
+        message = decode_samples(data)
+        rows = message.block
+        self._lost = min(self._lost + rows.lost + self._count_skipped(message.samples, len(rows)), MAX_GAP_SAMPLES)
         blocks = self._builder.build_blocks(rows.t_ns, rows.values, rows.temperature_c, rows.ticks)
         if blocks and self._lost:
             blocks[0] = replace(blocks[0], lost=blocks[0].lost + self._lost)

@@ -4,17 +4,19 @@ The format is big-endian without a sync word: ``id | gyro 3 x i24, status | [acc
 [inclinometer ...] | [temperature 3 x i16, status of each included sensor] | [aux or PPS i24, status] | counter u8 |
 latency u16 | CRC u32``, then CR LF if that is enabled. The identifier states which parts follow. The CRC-32 has the
 polynomial 0x04C11DB7 and the initial value 0xFFFFFFFF, and is not reflected. It covers all bytes before it, padded with
-zeros to a multiple of four bytes. Sources: vortexntnu/stim300-driver, and the frame published in geirhovland/stim300;
+zeros to a multiple of four bytes. Sources: vortexntnu/stim300-driver, the frame published in geirhovland/stim300, and
 data sheet TS1524 tables 5-21 to 5-23 as restated by public drivers.
 
 The datagram contains neither the range of the accelerometer nor the output units, so both must be configured. An
-"increment" is the angle or velocity of one sample, and ``rate`` is needed to convert it to a rate. Integrated outputs
-are not supported. The counter runs with the internal 2000 Hz sampling (unconfirmed: it steps by 4 at 500 Hz).
+"increment" is the change of angle or velocity during one sample. ``rate`` is needed to convert an increment to a rate.
+Integrated outputs are not supported. The counter runs with the internal 2000 Hz sampling. This has not been confirmed
+on a device. The counter would then step by 4 at 500 Hz.
 
-In the status byte of gyro and accelerometer, system integrity error (bit 7), start-up (6), overload (4) and channel
-error (3) make the sample bad, since its values are wrong or unsettled. A sample outside the operating conditions (5) is
-accepted, because the sensor still measures, for example in a climate chamber beyond its stated range. The temperature
-is the mean of the three sensors of the gyro. It is not measured if their status shows an error.
+The status byte of gyro and accelerometer marks a sample as bad if it reports a system integrity error (bit 7), start-up
+(6), overload (4) or a channel error (3). The values of such a sample are wrong or unsettled. A sample outside the
+operating conditions (5) is accepted, because the sensor still measures, for example in a climate chamber beyond the
+stated range. The temperature is the mean of the three sensors of the gyro. If the status of these sensors shows an
+error, the temperature is not measured.
 """
 
 import zlib
@@ -44,7 +46,7 @@ from drivers.settings_model import Conflict, WordOr, checked_by
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
-# in the order of the bits of the parts; F0..F7 carry PPS in place of aux; 97 is A7 of hardware up to revision C
+# The order is that of the part bits. F0 to F7 contain PPS instead of aux. 97 is A7 of hardware up to revision C.
 IDENTIFIERS: Final = {
     **dict(zip((0x90, 0x91, 0x92, 0x93, 0x94, 0xA5, 0xA6, 0xA7), range(8), strict=True)),
     **dict(zip((0x98, 0x99, 0x9A, 0x9B, 0x9C, 0xAD, 0xAE, 0xAF), range(8, 16), strict=True)),
@@ -66,8 +68,9 @@ SIZES: Final = {identifier: _datagram_size(parts) for identifier, parts in IDENT
 LONGEST: Final = max(SIZES.values())
 
 ACCEL_BITS: Final = {"2g": 21, "5g": 20, "10g": 19, "30g": 18, "80g": 16}
-"""Exponent of the resolution by accelerometer range. The least significant bit is 2**-bits g. For an increment, it is 8
-times finer, in m/s.
+"""Exponent of the resolution by accelerometer range. The least significant bit is 2**-bits g.
+
+The least significant bit of an increment is 2**-(bits + 3) m/s.
 """
 ERROR_BITS: Final = 0x80 | 0x40 | 0x10 | 0x08
 START_UP: Final = 0x40
@@ -75,7 +78,7 @@ CHANNEL_ERROR: Final = 0x08
 
 _BITS = np.arange(256, dtype=np.uint8)[:, None] >> np.arange(8, dtype=np.uint8) & 1
 BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
-"""Each byte with its bits in reverse order. It converts the CRC to the reflected CRC of zlib."""
+"""Each byte with its bits in reverse order, for conversions between the CRC and the reflected CRC of zlib."""
 
 
 def _check_identifier(identifier: int) -> None:
@@ -225,14 +228,19 @@ def _write_int24(data: Bytes, at: int, values: Floats, step: float) -> None:
 
 def datagram_crc(body: bytes) -> bytes:
     """Return the four CRC bytes of a datagram."""
-    # reversed zeros are zeros, so the padding can be appended afterwards
-    mirrored = zlib.crc32(bytes(-len(body) % 4), zlib.crc32(body.translate(BIT_REVERSAL))) ^ 0xFFFFFFFF
-    return mirrored.to_bytes(4, "little").translate(BIT_REVERSAL)
+    return _reflected_crc(body.translate(BIT_REVERSAL)).to_bytes(4, "little").translate(BIT_REVERSAL)
 
 
 def has_valid_crc(frame: bytes) -> bool:
     """Return True if the CRC of a complete datagram is correct."""
-    return datagram_crc(frame[:-4]) == frame[-4:]
+    mirrored = frame.translate(BIT_REVERSAL)
+    return _reflected_crc(mirrored[:-4]) == int.from_bytes(mirrored[-4:], "little")
+
+
+def _reflected_crc(mirrored: bytes) -> int:
+    """Return the CRC with reversed bits of a datagram whose bytes have reversed bits."""
+    # reversed zeros are zeros, so the padding can be appended after the reversal
+    return zlib.crc32(bytes(-len(mirrored) % 4), zlib.crc32(mirrored)) ^ 0xFFFFFFFF
 
 
 def build(settings: Settings) -> Decoder:

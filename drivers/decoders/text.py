@@ -1,14 +1,14 @@
 """Text lines of numbers, as printed by boards of the Arduino class.
 
-There is no standard. ``columns`` names the content of each column, and the units convert it to SI. A line ends in LF,
-CR or both. With ``delimiter = "auto"``, fields are separated by commas, semicolons or tabs, or by blanks in a line
-without any of these. An empty field or ``nan`` is not measured. Empty lines and lines that begin with the comment
-prefix are skipped. A line with another number of columns, or with a field that is not a number, is bad. With ``nmea`` a
-line has the form ``$fields*CC``, where CC is the exclusive or of the characters between ``$`` and ``*``. A wrong CC
-makes the line bad.
+The format has no standard. ``columns`` names the content of each column, and the numbers are converted from the
+configured units to SI. A line ends in LF, CR or both. With ``delimiter = "auto"``, fields are separated by commas,
+semicolons or tabs. In a line without these characters, fields are separated by blanks. An empty field or ``nan`` is not
+measured. Empty lines and lines that begin with the comment prefix are skipped. A line with another number of columns,
+or with a field that is not a number, is bad. With ``nmea`` a line is ``$fields*CC``, where CC is the exclusive or of
+the characters between ``$`` and ``*``. A line with a wrong CC is bad.
 
-The first line after the link was opened has usually lost its beginning, and a cut number is still a number: ``-0.012``
-becomes ``12``. The first line is therefore left out without being counted as bad, unless its checksum is correct or
+The first line after the link was opened has usually lost its beginning. Without its beginning, ``-0.012`` reads as
+``12``. The first line is therefore left out without being counted as bad, unless its checksum is correct or
 ``first_line = "keep"``. For this reason ``encode`` puts a line end before the first line of a block.
 """
 
@@ -34,18 +34,18 @@ from drivers.sample import AXES, ArrivalTiming, Chunk, CounterTiming, Floats, In
 from drivers.settings_model import ListOf, checked_by, one_of
 
 MAX_LINE_BYTES: Final = 4096
-"""Maximum length of a line in bytes. A longer text without a line end is noise and is dropped."""
+"""Maximum length of a line in bytes. Longer text without a line end is dropped as noise."""
 OVERLONG_LINE: Final = b"\0"
-"""Replacement for an overlong line. It is bad, since it is not a number."""
+"""Replacement for an overlong line. The replacement is a bad line, since it is not a number."""
 OVERLONG_HINT: Final = f"more than {MAX_LINE_BYTES} bytes without a line end: is the baud rate right?"
 SKIP: Final = "-"
 COLUMNS: Final = (*AXES, "temperature", "t", "counter", SKIP)
 TICK_S: Final = 1e-9
-"""Length of a tick. The ``t`` column is converted to ticks of 1 ns."""
+"""Length of a tick in s. The ``t`` column is converted to ticks of 1 ns."""
 DEVICE_WRAP: Final = 1 << 32
 """Counts after which ``millis()`` and ``micros()`` of small boards start again at 0."""
 UNWRAPPED_TICKS: Final = 1 << 62
-"""Modulus of a clock that does not wrap, in ticks: 146 years of nanoseconds."""
+"""Modulus in ticks for a clock that does not wrap. It corresponds to 146 years."""
 
 
 def _check_columns(columns: tuple[str, ...]) -> None:
@@ -119,7 +119,7 @@ class Settings(DecoderSettings):
 
 
 class TextDecoder:
-    """Decoder of lines of numbers to samples, and encoder."""
+    """Decoder and encoder of lines of numbers."""
 
     carrier: ClassVar[str] = "bytes"
 
@@ -183,15 +183,18 @@ class TextDecoder:
         return [line for line in lines if line]
 
     def _first_is_whole(self, line: bytes) -> bool:
-        """Return True if the first line is used. If it is not used, it does not count as bad."""
+        """Return True if the first line is used. An unused first line does not count as bad."""
         if self._settings.header:
-            return True  # it is skipped with the rest of the header
+            return True  # the line is skipped with the rest of the header
         if self._settings.nmea:
             return _nmea_body(line) is not None
         return self._settings.first_line == "keep" and self._parse_line(line)[0] is not None
 
     def _parse_data_lines(self, lines: list[bytes]) -> tuple[Floats, list[int]]:
-        """Return an array [n, columns] of all lines that are not skipped, and their indices. A bad line is infinite."""
+        """Return the numbers [n, columns] of all lines that are not skipped, and the indices of the lines.
+
+        The numbers of a bad line are infinite.
+        """
         bodies: list[bytes | None] = []  # None: the checksum is wrong
         counted: list[int] = []
         comment, header = self._comment, self._settings.header

@@ -9,8 +9,8 @@ pages 27-43).
 ``$VNIMU`` contains the magnetic field [Gauss], acceleration [m/s²], rate [rad/s], temperature [°C] and pressure [kPa]
 as measured. ``$VNYMR`` contains yaw, pitch, roll [°], magnetic field, acceleration and rate, all compensated. Its bias
 instability and random walk are the residuals of the on-board filter and do not describe the sensor. Data that may be
-appended to a sentence (a count or time of synchronization) are not read. The printed resolution is 0.001 m/s² and 1e-6
-rad/s, so quantization is visible in the Allan deviation. The binary messages do not have this limit.
+appended to a sentence (a count or time of synchronization) are ignored. The printed resolution is 0.001 m/s² and 1e-6
+rad/s, so quantization is visible in the Allan deviation. Binary messages have a finer resolution.
 """
 
 import binascii
@@ -63,7 +63,7 @@ class VectornavAsciiDecoder(FrameStreamDecoder):
         self.timing: Timing = ArrivalTiming()
         self._wanted = b"" if settings.sentence == "auto" else f"${settings.sentence},".encode()
         self._sentence = self._wanted
-        self._unwanted_sentences = 0  # number of sentences since the last wanted one
+        self._unwanted_sentences = 0  # number of sentences since the last wanted sentence
 
     @property
     def hint(self) -> str:

@@ -1,16 +1,16 @@
 """VectorNav VN-100/200/300 binary messages.
 
 The format is ``FA | groups u8 | a field mask u16le for each group | payload little-endian | CRC u16be``. The masks
-state which fields follow, in the order of groups and bits. Messages of groups 1, 2, 3 and 5 are decoded. Others are
-rejected, since the sizes of their fields are unknown here. The CRC-16 has the polynomial 0x1021 and the initial value 0
-and covers all bytes after 0xFA. The CRC over these bytes and the CRC itself is 0 (VN-100 user manual UM001 v2.1, pages
-27-43).
+state which fields follow, in the order of groups and bits. Messages of groups 1, 2, 3 and 5 are decoded. Messages of
+other groups are rejected, since the sizes of their fields are not known to the decoder. The CRC-16 has the polynomial
+0x1021 and the initial value 0, and covers all bytes after 0xFA. The CRC of these bytes followed by the CRC field is 0
+(VN-100 user manual UM001 v2.1, pages 27-43).
 
 For noise analysis, TimeStartup and Imu of group 1 are recommended (``FA 01 01 02``, 38 bytes). Imu and the Uncomp
 fields are the values of the sensor. From AngularRate and Accel, the on-board filter has removed its bias estimate,
-which hides bias instability and random walk. If a message contains both, ``compensated`` selects one. A message with
-only accelerations or only rates leaves the other axes unmeasured. A message with neither is ignored. VectorNav's z axis
-points down and reads -9.8 at rest.
+which hides bias instability and random walk. If a message contains both kinds of fields, ``compensated`` selects one
+kind. A message with only accelerations or only rates leaves the other axes unmeasured. A message without accelerations
+and rates is ignored. VectorNav's z axis points down and measures -9.8 m/s² at rest.
 """
 
 import binascii

@@ -151,7 +151,7 @@ class WitmotionDecoder(FrameStreamDecoder):
 
 
 class PairFinder:
-    """Finder of pairs of 0x51 and 0x52 packets, which also counts the samples lost in each gap."""
+    """Finder of pairs of 0x51 and 0x52 packets. The finder also counts the samples lost in each gap."""
 
     def __init__(self) -> None:
         self.unpaired = 0  # number of packets since the last pair
@@ -170,7 +170,7 @@ class PairFinder:
         kinds = joined[:, 1]
         in_order = (kinds[:-1] == ACCEL) & (kinds[1:] == RATE)
         at = np.flatnonzero(in_order & frames.adjacent)
-        # a few stray bytes may remain of many packets, so both packets need not belong to one sample
+        # the bytes between both packets may be the remains of many lost packets, so the pair may not be one sample
         separated = in_order & ~frames.adjacent & (frames.bad_before == 0)
         elapsed = self._elapsed + np.cumsum(1 + frames.bad_before)
         rejected = self._rejected + np.cumsum(frames.bad_before + separated)

@@ -8,10 +8,10 @@ part, each big-endian (three independent public parsers agree; the manual was no
 level communication protocol (MT0101P).
 
 The decoder reads acceleration 0x4020 (or HR 0x4040), rate of turn 0x8020 (or HR 0x8040), the clock 0x1060 or 0x1020,
-and temperature 0x0810. It never uses free acceleration 0x4030, from which the orientation filter has removed gravity. A
-packet with acceleration alone, or rates alone, leaves the other axes unmeasured (NaN). A packet with neither is not a
-sample and is not bad. Temperature often arrives in separate packets at a lower rate. The last value is used until the
-next one, or until the link is opened again.
+and temperature 0x0810. Free acceleration 0x4030 is never used, since the orientation filter has removed gravity from
+it. A packet with accelerations alone, or rates alone, leaves the other axes unmeasured (NaN). A packet without
+accelerations and rates is neither a sample nor bad. Temperature often arrives in separate packets at a lower rate. The
+last temperature is used until the next temperature arrives, or until the link is opened again.
 """
 
 import struct
@@ -40,7 +40,10 @@ from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, Floats,
 
 SYNC: Final = b"\xfa\xff\x36"
 MAX_PAYLOAD: Final = 2048
-"""Maximum payload in bytes. Every MTi configuration is far below it, and a damaged length must not block the stream."""
+"""Maximum payload in bytes, so that a damaged length does not block the stream.
+
+The payload of every MTi configuration is far smaller.
+"""
 LONGEST: Final = 7 + MAX_PAYLOAD
 
 TEMPERATURE: Final = 0x0810
@@ -184,7 +187,7 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
         return filled
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return one packet per sample with both clocks, the temperature if there is one, and the measured axes."""
+        """Return one packet per sample with both clocks, the temperature if measured, and the measured axes."""
         number_format = FORMATS.index(self._settings.format)
         frames = []
         rows = zip(samples.values, samples.temperature_c.tolist(), samples.ticks.tolist(), strict=True)
@@ -202,9 +205,7 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
 
 
 def _group_by_layout(frames: Frames) -> Iterator[tuple[Layout | None, list[int], Bytes]]:
-    """Yield each layout (None if invalid), the indices of its packets, and their bytes [k, length]. Most often there is
-    one layout.
-    """
+    """Yield each layout, the indices of its packets, and their bytes [k, length]. The layout is None if invalid."""
     for _, rows in group_indices([len(packet) for packet in frames.data]):
         packets = frames.stack_bytes(rows)
         at = np.array(rows)

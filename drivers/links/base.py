@@ -42,7 +42,7 @@ class Link(Protocol):
     name: str  # for messages, such as "/dev/ttyUSB0 at 460800 baud"
 
     def open(self) -> None:
-        """Open the link. If it is already open, do nothing.
+        """Open the link. Do nothing if the link is already open.
 
         Raises
         ------
@@ -64,7 +64,7 @@ class Link(Protocol):
         """
 
     def close(self) -> None:
-        """Close the link and end a waiting ``read``. If it is already closed, do nothing."""
+        """Close the link and end a waiting ``read``. Do nothing if the link is already closed."""
 
 
 class PolledLink(ABC):

@@ -1,14 +1,14 @@
 """CAN buses through python-can, one frame per chunk.
 
-The identifiers that the decoder names are filtered in the hardware or the kernel if the interface supports it,
-otherwise in python-can. A read waits for the first frame, then takes all frames that are queued after it.
+The identifiers that the decoder names are filtered in the hardware or the kernel if the interface supports filters,
+otherwise in python-can. A read waits for the first frame, and then takes all frames that are queued.
 
 ``Chunk.t_ns`` is the monotonic time of the host at arrival. A delayed reader finds many waiting frames, which must not
 all get the time of the read. Some interfaces stamp each frame on arrival with the system clock of the host
-(``HOST_STAMPED_INTERFACES``). For these, the age of each frame is subtracted from the present time. The age is a
-difference over milliseconds, so a step of the system clock affects at most the frames that wait at that moment. An age
-outside 0 to 1 s is ignored. Other interfaces stamp with clocks of their own, which drift against the host. For these,
-the time of the read is used, and the regression of the sample clock removes its jitter.
+(``HOST_STAMPED_INTERFACES``). For these interfaces, the age of each frame is subtracted from the present time. The age
+is a difference over milliseconds, so a step of the system clock affects only the frames that wait during the step. An
+age outside 0 to 1 s is ignored. Other interfaces stamp with clocks of their own, which drift against the host. For
+these interfaces, the time of the read is used, and the regression of the sample clock removes the jitter.
 
 A bus-off state, an interface that is down and an unplugged adapter raise ``LinkLost``. Other error frames and remote
 frames are counted and ignored. Nothing is sent, apart from the set-up of an adapter.
@@ -43,18 +43,18 @@ MAX_FRAMES: Final = 1000
 NEXT_FRAME_WAIT_S: Final = 0.0005
 """Wait for the next frame after a frame.
 
-The wait must not be 0. If python-can filters the frames itself, it would then stop at the first unwanted frame,
-although wanted frames may follow.
+The wait must not be 0. With a wait of 0, python-can stops at the first frame that it filters out, although wanted
+frames may follow.
 """
 MAX_READ_S: Final = 0.01
-"""A read returns its frames at the latest this long after the first one, even if more frames arrive."""
+"""Longest time from the first frame of a read to the return of its frames."""
 MAX_WAIT_S: Final = 0.1
-"""Longest single wait on the bus, and therefore the longest time until a closed link is noticed."""
+"""Longest single wait on the bus. A waiting read ends at most this time after the link has been closed."""
 HOST_STAMPED_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose time stamps are the system clock of the host at arrival of the frame."""
 MAX_FRAME_AGE_S: Final = 1.0
 CLOCK_PAIRS: Final = 3
-"""Number of readings of both clocks, of which the closest pair is used."""
+"""Number of pairs of clock readings. The pair with the shortest time between its readings is used."""
 PROBE_TIMEOUT_S: Final = 2.0
 BUS_OFF_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
 """Interfaces whose error frames contain the error classes of SocketCAN in their identifier."""
@@ -66,10 +66,10 @@ PACKAGES: Final[Mapping[str, tuple[str, str, str]]] = {
     "neovi": ("ics", "python-ics", "python-can[neovi]"),
     "nixnet": ("nixnet", "nixnet", "python-can[nixnet]"),
 }
-"""Interfaces that need a package which neither this project nor python-can requires: module, package, what to install.
+"""Module, package and requirement of the interfaces that need an optional package.
 
-pyserial, for slcan, robotell, seeedstudio and serial, is required by this project. socketcan, socketcand and virtual
-need no package. The other interfaces need a library of the adapter's manufacturer.
+pyserial, which slcan, robotell, seeedstudio and serial need, is required by this project. socketcan, socketcand and
+virtual need no package. The other interfaces need a library of the adapter's manufacturer.
 """
 BUS_OFF: Final = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a socketcan error frame."""
@@ -182,7 +182,7 @@ class CanLink(PolledLink):
         return chunks
 
     def _receive_frame(self, wait_s: float) -> "can.Message | None":
-        """Receive one frame; None if there is none. Raise LinkLost if the bus is gone."""
+        """Return one frame; None if no frame arrives in time. Raise LinkLost if the bus is gone."""
         import can
 
         bus = self._bus
@@ -213,9 +213,7 @@ class CanLink(PolledLink):
         return Chunk(bytes(message.data), self._arrival_ns(message), address)
 
     def _arrival_ns(self, message: "can.Message") -> int:
-        """Return the monotonic time of the host at which the frame arrived, or the present time if its stamp is
-        implausible.
-        """
+        """Return the monotonic arrival time of a frame, or the present time if the time stamp is implausible."""
         now_ns = time.monotonic_ns()
         if self._settings.interface not in HOST_STAMPED_INTERFACES:
             return now_ns
@@ -241,7 +239,7 @@ class CanLink(PolledLink):
 
 
 def missing_package(interface: str) -> str:
-    """Return the package that an interface of python-can lacks and how to install it; "" if none is missing."""
+    """Return the missing package of a python-can interface and how to install it; "" if no package is missing."""
     module, package, requirement = PACKAGES.get(interface, ("", "", ""))
     if not module or importlib.util.find_spec(module) is not None:
         return ""
@@ -251,8 +249,8 @@ def missing_package(interface: str) -> str:
 def _unix_minus_monotonic_ns() -> int:
     """Return the difference of the two clocks of the host in nanoseconds.
 
-    On a loaded machine the thread may be interrupted between the two readings. The closest of a few pairs is therefore
-    used.
+    On a loaded machine the thread may be interrupted between the two readings. The closest of several pairs is
+    therefore used.
     """
     pairs = []
     for _ in range(CLOCK_PAIRS):
@@ -262,7 +260,7 @@ def _unix_minus_monotonic_ns() -> int:
 
 
 def _probe_server(s: Settings) -> None:
-    """Check that a socketcand server answers. python-can would try to reach a missing one for 10 s."""
+    """Check that a socketcand server answers. python-can would try to reach a missing server for 10 s."""
     if s.interface == "socketcand":
         host, port = str(s.options.get("host", "127.0.0.1")), int(s.options.get("port", 29536))
         socket.create_connection((host, port), timeout=PROBE_TIMEOUT_S).close()

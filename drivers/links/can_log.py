@@ -129,7 +129,7 @@ class _BoundedLineReader(io.RawIOBase):
         self._bytes_without_frame = 0
 
     def as_text(self, newline: str | None) -> io.TextIOWrapper:
-        """Return the decoded text of the file. ``newline`` is that of the built-in function ``open``."""
+        """Return the decoded text of the file. ``newline`` has the same meaning as for the function ``open``."""
         return io.TextIOWrapper(io.BufferedReader(self), "utf-8", newline=newline)
 
     def note_frame(self) -> None:

@@ -1,15 +1,16 @@
-"""Replay of a file in place of a device: recordings, CAN logs and captured bytes, at their own pace or another.
+"""Replay of a file in place of a device, at the recorded speed or another speed.
 
 The link carries different data for each kind of file:
 
 - recordings (``drivers.recordings``: CSV, .npz, Parquet, Arrow, a folder) become messages for the decoder ``samples``;
-- CAN logs (.asc .blf .log .trc, CSV of python-can, CSV with ``t``, ``id_hex``, ``data_hex``) become frames;
+- CAN logs (``drivers.links.can_log``) become frames;
 - captured bytes (.bin .raw .txt, also with .gz) become bytes;
-- raw bytes recorded by the daemon (a folder of segments, or one of them) become bytes, frames or messages, according to
+- raw bytes recorded by the daemon (one segment, or a folder of segments) become bytes, frames or messages, according to
   their original link.
 
 Recordings, logs and raw bytes keep their own times (``epoch`` is unix). Captured bytes have no times. With
-``bytes_per_second``, each chunk gets the time at which that rate delivers it. Otherwise it gets the time of the read.
+``bytes_per_second``, each chunk gets the time at which a device with this rate would have sent the chunk. Otherwise
+each chunk gets the time of the read.
 
 ``read`` raises ``LinkEnded`` after all data have been returned. A truncated file is replayed up to the cut, and the
 message at the end mentions the cut. ``build`` reads the header of a CSV file, since the decoder must match. All other
@@ -45,8 +46,9 @@ CAN_LOGS: Final = (".asc", ".blf", ".log", ".trc")
 CAPTURES: Final = (".bin", ".raw", ".txt")
 BATCH_CHUNKS: Final = 1000
 BATCH_BYTES: Final = 1_000_000
-"""A read returns at most BATCH chunks and at most one chunk more than this size. Each read therefore ends, and none
-holds hours of a recording.
+"""Size of the chunks after which a read returns. A read returns at most BATCH_CHUNKS chunks.
+
+Without these limits, one read could return hours of a recording.
 """
 MAX_MESSAGE_ROWS: Final = 4096
 STEP_S: Final = 0.02
@@ -63,12 +65,12 @@ PACES: Final = {"recorded": 1.0, "max": float("inf")}
 
 Kind = Literal["recording", "log", "capture", "raw"]
 TimedChunk = tuple[float, Chunk]
-"""Seconds since the start of the file, and the chunk that is due then."""
+"""Time in s since the start of the file at which a chunk is due, and the chunk."""
 CARRIERS: Final[dict[Kind, Carrier]] = {"recording": "messages", "log": "frames", "capture": "bytes"}
 """Carrier of each kind of file. Raw bytes state their carrier themselves."""
 
 DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log": "dbc", "capture": "", "raw": ""}
-"""Decoder of each kind of file if the settings name none; "" if the settings must name one."""
+"""Default decoder of each kind of file; "" if the settings must name the decoder."""
 
 
 class Settings(LinkSettings):
@@ -216,12 +218,12 @@ def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
 
 
 def _raw_segments(path: Path) -> list[Path]:
-    """Return the segments of raw bytes in a folder, oldest first, or the one segment that is named."""
+    """Return the segments of a folder, oldest first. For a file, return the file."""
     return segment.list_segments(path) if path.is_dir() else [path]
 
 
 def _is_raw(path: Path) -> bool:
-    """Return True if the newest segment holds raw bytes. An unreadable segment is reported when it is opened."""
+    """Return True if the newest segment contains raw bytes. An unreadable segment is reported when it is opened."""
     found = _raw_segments(path)
     if not found or not segment.NAME.fullmatch(found[-1].name):
         return False
@@ -238,7 +240,7 @@ def _raw_carrier(path: Path) -> Carrier:
     for one in known:
         if one == carrier:
             return one
-    raise ConfigError(f'path: "{path}" carries "{carrier}", where {", ".join(known)} are known')
+    raise ConfigError(f'path: "{path}" carries "{carrier}"; possible are {", ".join(known)}')
 
 
 # --- captured bytes ------------------------------------------------------------------------------
@@ -280,7 +282,7 @@ def _detect_kind(path: Path) -> Kind:
     if suffix in FORMATS:
         return "recording"
     known = (*FORMATS, *CAN_LOGS, *CAPTURES)
-    raise ConfigError(f'path: "{path}" is nothing to replay by its suffix{format_choices(suffix, known)}')
+    raise ConfigError(f'path: "{path}" has no suffix of a file to replay{format_choices(suffix, known)}')
 
 
 def _plain_suffix(path: Path) -> str:
@@ -292,7 +294,7 @@ def _plain_suffix(path: Path) -> str:
 
 
 def _read_header(path: Path) -> str:
-    """Return the first line of a text file; "" if it cannot be read."""
+    """Return the first line of a text file; "" if the file cannot be read."""
     try:
         with _open_text(path) as stream:
             return stream.readline(1000).strip()

@@ -1,14 +1,14 @@
 """Serial ports, local or networked, by any URL that pyserial supports.
 
 Bytes are returned as they arrive, without regard to frames. The reader waits for the first byte, then for a short time
-(``read_timeout``, 10 ms) for more bytes, and takes all that have arrived. This needs a tenth of the processor time of a
-wake-up per frame, and no byte waits longer than this time. URL handlers without a file descriptor wake up at every
-arrival instead, within the same time.
+(``read_timeout``, 10 ms) for more bytes, and takes all bytes that have arrived. The short wait needs a tenth of the
+processor time of a wake-up per frame, and no byte waits longer than ``read_timeout``. URL handlers without a file
+descriptor wake up at every arrival instead.
 
-``close`` sets a flag and ends a waiting read. The port itself is closed after the reader has left it. A descriptor that
-is closed while a reader waits on it could by then belong to another file.
+``close`` sets a flag and ends a waiting read. The port itself is closed after the read has ended. If the descriptor
+were closed while a reader waits, its number could already belong to another file.
 
-``open`` succeeds or raises ``LinkUnavailable``. Its text names the cause and the remedy, such as a list of the existing
+``open`` succeeds or raises ``LinkUnavailable``. The text names the cause and the remedy, such as a list of the existing
 ports, a missing permission, or another program that uses the port. ``read`` returns bytes or None, or raises
 ``LinkLost`` if the device was unplugged or the other end closed the connection. Nothing is ever written to the device.
 """

@@ -1,16 +1,16 @@
 """Messages of another system over zenoh, one message per chunk with its attachment.
 
-The link has its own session, which is closed to others: it does not scout or listen, and it connects only to the
-endpoints of the settings. With one endpoint the session is a client, which needs that endpoint to open. A router does
-not forward data between two peers, and most publishers are peers. With several endpoints the session is a peer, since a
-client would stay with the first endpoint that answers. A peer opens at once, and zenoh keeps trying to connect in the
-background. A missing publisher therefore shows as silence and not as ``LinkLost``.
+The link has its own session. The session does not scout or listen, and connects only to the endpoints of the settings.
+With one endpoint the session is a client, which needs the endpoint to open, because a router does not forward data
+between two peers, and most publishers are peers. With several endpoints the session is a peer, since a client would
+stay with the first endpoint that answers. A peer opens at once, and zenoh keeps trying to connect in the background. A
+missing publisher therefore causes silence and not ``LinkLost``.
 
-zenoh writes to a ring channel, which overwrites its oldest message when it is full. A decoder detects this by the
-sequence numbers. A thread of the link takes the messages from the channel and time-stamps them, because zenoh's
+zenoh writes to a ring channel, which overwrites its oldest message when the channel is full. A decoder detects the loss
+by the sequence numbers. A thread of the link takes the messages from the channel and time-stamps them, because zenoh's
 channels have no timeout. No Python callback is registered, since a callback that exists at exit blocks the process.
-Closing the session ends the thread and with it a waiting ``read``. If a program ends without closing the session,
-``atexit`` closes it. Otherwise a thread that still waits in zenoh would abort the process.
+Closing the session ends the thread and a waiting ``read``. If a program ends without closing the session, ``atexit``
+closes the session. Otherwise a thread that still waits in zenoh would abort the process.
 """
 
 import atexit
@@ -27,7 +27,7 @@ from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.sample import Chunk
 from drivers.settings_model import FilePath, ListOf
 from drivers.zenoh.connection_errors import explain_refusals
-from drivers.zenoh.session import DEFAULT_CONFIGURATION, configuration, endpoints, format_error
+from drivers.zenoh.session import DEFAULT_CONFIGURATION, build_session_config, find_connect_endpoints, format_error
 
 if TYPE_CHECKING:
     import zenoh
@@ -80,7 +80,7 @@ class ZenohLink:
         self._running = False
 
     def open(self) -> None:
-        """Open the session and subscribe. A client needs its router, a peer needs no other party."""
+        """Open the session and subscribe. A client needs its router. A peer also opens without another program."""
         import zenoh
 
         with self._opening:
@@ -102,7 +102,7 @@ class ZenohLink:
             self._clear_waiting()
             self._running = True
             self._receiver = threading.Thread(
-                target=self._receive, args=(subscriber,), name=f"{self.name} taker", daemon=True
+                target=self._receive, args=(subscriber,), name=f"{self.name} receiver", daemon=True
             )
             self._receiver.start()
             atexit.register(self.close)
@@ -132,12 +132,12 @@ class ZenohLink:
         try:
             while True:
                 sample = handler.recv()
-                chunk = _chunk(sample, time.monotonic_ns())
+                chunk = _to_chunk(sample, time.monotonic_ns())
                 with self._changed:
                     self._enqueue(chunk)
                     self._changed.notify_all()
         except zenoh.ZError:
-            pass  # the channel was closed by close(), or by a session that failed
+            pass  # close() or a failure of the session has closed the channel
         finally:
             with self._changed:
                 self._running = False
@@ -149,7 +149,7 @@ class ZenohLink:
         self._waiting_bytes = 0
 
     def _enqueue(self, chunk: Chunk) -> None:
-        """Queue the newest chunk and drop the oldest ones above the limits."""
+        """Queue the newest chunk, and drop the oldest chunks above the limits."""
         self._waiting.append(chunk)
         self._waiting_bytes += len(chunk.data)
         while len(self._waiting) > 1 and (self._waiting_bytes > MAX_QUEUED_BYTES or len(self._waiting) > MAX_MESSAGES):
@@ -159,28 +159,28 @@ class ZenohLink:
         """Close the session and wait for the receiving thread."""
         atexit.unregister(self.close)
         session, self._session = self._session, None
-        taker, self._receiver = self._receiver, None
+        receiver, self._receiver = self._receiver, None
         with self._changed:
             self._running = False
             self._clear_waiting()
             self._changed.notify_all()
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
-        if taker is not None:
-            taker.join()
+        if receiver is not None:
+            receiver.join()
 
     def _why_not_open(self, error: Exception) -> str:
         """Return one line with the reason why the session cannot be opened."""
         config = _configuration(self._settings)
-        places = endpoints(config)
-        shown = mask_secrets(", ".join(places)) or "(connect is empty)"
+        endpoints = find_connect_endpoints(config)
+        shown = mask_secrets(", ".join(endpoints)) or "(connect is empty)"
         nobody = f"nobody at {shown}; start the router or the publisher there"
         if config.get_json("mode") == '"client"':
-            return f"{self.name}: {explain_refusals(places, config) or nobody}"
+            return f"{self.name}: {explain_refusals(endpoints, config) or nobody}"
         return f"{self.name}: check the endpoints of listen and connect: {format_error(error)}"
 
 
-def _chunk(sample: Any, t_ns: int) -> Chunk:
+def _to_chunk(sample: Any, t_ns: int) -> Chunk:
     """Return a zenoh sample as a chunk."""
     attachment = sample.attachment
     return Chunk(bytes(sample.payload), t_ns, attachment=b"" if attachment is None else bytes(attachment))
@@ -193,9 +193,9 @@ def _configuration(settings: Settings) -> "zenoh.Config":
         "connect/endpoints": settings.connect or None,
         "listen/endpoints": settings.listen or None,
     }
-    config = configuration(own, settings.config)
-    if settings.mode is None and not settings.listen and len(endpoints(config)) == 1:
-        return configuration(own, settings.config, {**DEFAULT_CONFIGURATION, "mode": "client"})
+    config = build_session_config(own, settings.config)
+    if settings.mode is None and not settings.listen and len(find_connect_endpoints(config)) == 1:
+        return build_session_config(own, settings.config, {**DEFAULT_CONFIGURATION, "mode": "client"})
     return config
 
 

@@ -1,14 +1,13 @@
 """Reading and writing of recordings: CSV (plain or gzip), .npz, Parquet, Arrow IPC, or a folder of segments.
 
-``load_samples`` reads a path and returns a ``Recording``. It contains times, six axes, temperature, a stated rate, and
-notes. The notes describe in sentences what was found and how it was handled. Each format has a module that only finds
-columns (``Table``). ``_assemble`` gives the columns their meaning.
+``load_samples`` reads a path and returns a ``Recording`` with times, six axes, temperature, a stated rate, and notes.
+Each note is a sentence about an irregularity of the file and how it was handled. The module of a format only finds the
+columns (``Table``). ``_assemble`` turns columns into a recording.
 
 There are three outcomes. A ``Recording`` has at least one sample. ``RecordingError`` means that the file is not a
 recording. Its text is one line that names the file, the error and the expected content. ``ConfigError`` means that a
-setting (``--rate``) or a package (pyarrow) is missing. A truncated file is read up to the cut. Doubtful data never
-become numbers: an incomplete line, an unreadable field, or a value that is infinite or beyond
-1e100 is read as missing, and a note counts it.
+setting (``--rate``) or a package (pyarrow) is missing. A truncated file is read up to the cut. An incomplete line, an
+unreadable field, and a value that is infinite or beyond 1e100 are read as missing. A note counts them.
 
 Times are returned as stored, with their jitter, gaps and steps back. The module does not resample, sort or interpolate
 data, it does not guess units, and it never unpickles objects.
@@ -23,7 +22,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.errors import ConfigError, RecordingError, format_one_line
+from drivers.errors import ConfigError, RecordingError, describe_error, format_one_line
 from drivers.file_access import check_regular
 from drivers.quantities import DURATION_S, RATE_HZ
 from drivers.recordings import memory_check
@@ -43,7 +42,7 @@ __all__ = [
 ]
 
 MAX_VALUE: Final = 1e100
-"""Maximum size of a value. Sums of squares of larger values can exceed the range of float64."""
+"""Largest absolute value. Sums of squares of larger values can exceed the range of float64."""
 TIME_RESOLUTION_S: Final = 1e-6
 """Slightly more than the resolution of Unix times in a float64."""
 
@@ -57,7 +56,7 @@ class Recording:
     temperature_c: Floats  # [n] °C; NaN = missing or absent
     rate_hz: float | None  # stated (fs of the file, or the caller's), not measured
     axes: tuple[str, ...]  # axes present as columns, in AXES order
-    notes: tuple[str, ...]  # what was found and how it was handled
+    notes: tuple[str, ...]  # irregularities of the file and how they were handled
 
     def __len__(self) -> int:
         return int(self.values.shape[0])
@@ -73,15 +72,15 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
     rate_hz
         Sample rate in Hz for a file without ``t``. It takes precedence over ``fs`` of the file.
     last_s
-        Duration in s to take from the end of the recording. Of a folder, only the segments that cover it are read. None
-        for the whole recording.
+        Duration in s to take from the end of the recording. In a folder, only the segments of this duration are read.
+        None for the whole recording.
 
     Raises
     ------
     RecordingError
-        The path holds no recording.
+        If the path contains no recording.
     ConfigError
-        A rate or a library is missing, the suffix is unknown, or the samples do not fit into the memory.
+        If a rate or a library is missing, the suffix is unknown, or the samples do not fit into the memory.
     """
     for option, quantity, value in (("--rate", RATE_HZ, rate_hz), ("--last", DURATION_S, last_s)):
         try:
@@ -94,7 +93,9 @@ def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None 
     except OSError as error:
         raise RecordingError(_error_text(path, error)) from error
     except MemoryError as error:
-        raise ConfigError(f"{path}: does not fit into the memory that is free; read a part of it") from error
+        raise ConfigError(
+            f"{path}: does not fit into the memory that is free; read a part of the recording with --last"
+        ) from error
     return found if last_s is None else _take_last(found, last_s)
 
 
@@ -123,26 +124,21 @@ def _error_text(path: Path, error: RecordingError | OSError) -> str:
     """Return why a file cannot be read, in one line that names the file."""
     if isinstance(error, RecordingError):
         return str(error)
-    return f"{error.filename or path}: cannot be read: {error.strerror or error}"
+    return f"{error.filename or path}: cannot be read: {describe_error(error)}"
 
 
 # --- from columns to a recording -----------------------------------------------------------------
 
 
 def _load_file(path: Path, rate_hz: float | None) -> Recording:
-    """Read one file."""
-    _check_content(path)
-    return _assemble(path, format_for_path(path).read(path), rate_hz)
-
-
-def _check_content(path: Path) -> None:
-    """Raise an error for an empty file, and for a path that is not a regular file. A pipe or a device has no end."""
+    """Read one file. A pipe or a device is refused, since it has no end."""
     check_regular(path)
     if path.stat().st_size:
-        return
+        return _assemble(path, format_for_path(path).read(path), rate_hz)
     if not is_recording(path):
         raise ConfigError(
-            f"{path}: the file is empty, and its name does not end like a recording's; known are {' '.join(FORMATS)}"
+            f"{path}: the file is empty, and its name does not end like that of a recording; known are "
+            f"{' '.join(FORMATS)}"
         )
     raise RecordingError(
         f"{path}: the file is empty, expected columns such as {EXAMPLE_HEADER}; record it again, or name another file"
@@ -166,10 +162,10 @@ def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
     temperature_c = table.columns.get("temperature", np.full(n, np.nan))
     values, temperature_c = values[rows], temperature_c[rows].copy()
     _drop_large(values, temperature_c, notes)
-    return _recording(t_s, values, temperature_c, rate, axes, notes)
+    return _read_only_recording(t_s, values, temperature_c, rate, axes, notes)
 
 
-def _recording(
+def _read_only_recording(
     t_s: Floats | None,
     values: Floats,
     temperature_c: Floats,
@@ -177,7 +173,7 @@ def _recording(
     axes: tuple[str, ...],
     notes: Sequence[str],
 ) -> Recording:
-    """Return a recording with read-only arrays and one-line notes."""
+    """Return a recording after making its arrays read-only. Each note becomes one line."""
     for array in (t_s, values, temperature_c):
         if array is not None:
             array.flags.writeable = False
@@ -185,7 +181,7 @@ def _recording(
 
 
 def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
-    """Return the length of all columns. Raise RecordingError if it differs between them or is zero."""
+    """Return the common length of all columns. Raise RecordingError if the lengths differ or are zero."""
     first = next(iter(columns))
     n = columns[first].size
     for name, column in columns.items():
@@ -203,30 +199,30 @@ def _supported_fs(fs: float | None, notes: list[str]) -> float | None:
     try:
         return fs if fs is None else RATE_HZ.check(fs)
     except ConfigError as error:
-        notes.append(f"fs was left aside: {error}.")
+        notes.append(f"fs is not used: {error}.")
         return None
 
 
 def _choose_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> float | None:
-    """Return the rate to use. The rate of the caller takes precedence over that of the file."""
+    """Return the rate to use. The rate of the caller takes precedence over the rate in the file."""
     if rate_hz is not None and fs is not None and rate_hz != fs:
-        notes.append(f"The file states {fs:g} Hz; {rate_hz:g} Hz was asked for and is used.")
+        notes.append(f"The file states {fs:g} Hz; the requested {rate_hz:g} Hz are used.")
     return fs if rate_hz is None else float(rate_hz)
 
 
 def _usable_times(
     path: Path, t: Floats | None, rate_hz: float | None, notes: list[str]
 ) -> tuple[Floats | None, NDArray[np.bool_] | slice]:
-    """Return the usable times and a mask of their rows; None and all rows if ``t`` is not usable."""
+    """Return the usable times and a mask of their samples; None and all samples if ``t`` is not usable."""
     if t is None:
         return None, slice(None)
     usable = np.abs(t) < T_LIMIT_S  # False for NaN as well
     lost = int(t.size - np.count_nonzero(usable))
     if 2 * lost > t.size:
-        what = f"{lost} of {t.size} values of t are no time in seconds (first: {t[~usable][0]:g})"
+        what = f"{lost} of {t.size} values of t are not times in seconds (first: {t[~usable][0]:g})"
         if rate_hz is None:
-            raise RecordingError(f"{path}: {what}; t must be in seconds, or absent and --rate HZ given")
-        notes.append(f"{what}; t was left aside and the stated rate of {rate_hz:g} Hz used.")
+            raise RecordingError(f"{path}: {what}; give t in seconds, or leave t out and give --rate HZ")
+        notes.append(f"{what}; the stated rate of {rate_hz:g} Hz is used instead of t.")
         return None, slice(None)
     if lost:
         notes.append(f"{lost} of {t.size} rows have no usable time and were left out.")
@@ -234,7 +230,7 @@ def _usable_times(
 
 
 def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
-    """Replace values beyond MAX_VALUE by NaN, in place, and add a note that counts them."""
+    """Replace values beyond MAX_VALUE by NaN, in place, and add a note with their number."""
     count = 0
     for array in (values, temperature_c):
         large = np.abs(array) > MAX_VALUE
@@ -245,7 +241,7 @@ def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None
 
 
 def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
-    """Return the times of some rows in ns."""
+    """Return the times of some samples in ns."""
     if recording.t_s is not None:
         seconds = recording.t_s[part]
     elif recording.rate_hz is not None:
@@ -265,9 +261,8 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
         raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
     parts: list[Recording] = []  # newest first
     notes: list[str] = []
-    free, taken = memory_check.available_bytes(), 0
-    if last_s is None:
-        _check_folder(path, segments, free)
+    free = memory_check.available_bytes()
+    rows = size_bytes = 0
     for segment in reversed(segments):
         try:
             part = _load_file(segment, rate_hz)
@@ -275,27 +270,14 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
             notes.append(f"A segment was left out: {_error_text(segment, error)}.")
             continue
         parts.append(part)
-        taken += part.values.nbytes + 2 * part.temperature_c.nbytes
-        memory_check.check_memory(path, taken, free)
+        rows, size_bytes = rows + len(part), size_bytes + segment.stat().st_size
+        memory_check.ReadLimit(path, size_bytes, free).check_rows(rows)
         notes += [f"{segment.name}: {note}" for note in reversed(part.notes)]
         if last_s is not None and _duration_s(parts) > last_s:
             break
     if not parts:
         raise RecordingError(f"{path}: none of {len(segments)} segments can be read; {notes[-1]}")
     return _concatenate(path, parts[::-1], notes[::-1])
-
-
-def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> None:
-    """Raise an error if the rows of all segments exceed the limits. Unreadable segments do not count."""
-    rows = size_bytes = 0
-    for segment in segments:
-        try:
-            _check_content(segment)
-            rows += format_for_path(segment).count_rows(segment)
-        except (RecordingError, OSError):
-            continue  # left out, with a note, when it is read
-        size_bytes += segment.stat().st_size
-        memory_check.ReadLimit(path, size_bytes, free).check_rows(rows)
 
 
 def _duration_s(parts: Sequence[Recording]) -> float:
@@ -315,9 +297,9 @@ def _take_last(found: Recording, last_s: float) -> Recording:
     else:
         first = max(len(found) - max(round(last_s * (found.rate_hz or 0.0)), 1), 0)
     t_s = None if found.t_s is None else found.t_s[first:]
-    note = f"Its last {last_s:g} s were taken, {len(found) - first} samples."
+    note = f"Only the last {last_s:g} s are used, {len(found) - first} samples."
     values, temperature_c = found.values[first:].copy(), found.temperature_c[first:].copy()
-    return _recording(t_s, values, temperature_c, found.rate_hz, found.axes, (*found.notes, note))
+    return _read_only_recording(t_s, values, temperature_c, found.rate_hz, found.axes, (*found.notes, note))
 
 
 def _concatenate(path: Path, parts: Sequence[Recording], notes: list[str]) -> Recording:
@@ -325,15 +307,15 @@ def _concatenate(path: Path, parts: Sequence[Recording], notes: list[str]) -> Re
     times = [part.t_s for part in parts if part.t_s is not None]
     rates = {part.rate_hz for part in parts}
     if 0 < len(times) < len(parts):
-        raise RecordingError(f"{path}: some segments have t and some have not; all must, or none")
+        raise RecordingError(f"{path}: some segments have t and some have not; give t in all of them, or in none")
     if not times and len(rates) > 1:
         raise RecordingError(f"{path}: its segments state different rates and have no t; give --rate HZ")
     back = sum(a[-1] >= b[0] for a, b in pairwise(times))
     if back:
-        notes.append(f"t does not go on from one segment to the next at {back} of {len(times) - 1} joints.")
+        notes.append(f"t does not increase from one segment to the next at {back} of {len(times) - 1} joints.")
     if not times and len(parts) > 1:
-        notes.append("The segments have no t; each is taken to follow the one before without a gap.")
-    return _recording(
+        notes.append("The segments have no t; they are joined without gaps.")
+    return _read_only_recording(
         np.concatenate(times) if times else None,
         np.concatenate([part.values for part in parts]),
         np.concatenate([part.temperature_c for part in parts]),

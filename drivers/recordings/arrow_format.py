@@ -7,7 +7,7 @@ of ``drivers.recordings.memory_check``.
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
@@ -16,17 +16,16 @@ import numpy as np
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import open_regular
 from drivers.recordings import memory_check
-from drivers.recordings.arrow_messages import batch_sizes, buffer_count, check_buffers
+from drivers.recordings.arrow_messages import check_buffer_sizes, count_buffers, iter_batch_sizes
 from drivers.recordings.table import (
     BATCH_ROWS,
     PARTIAL_SUFFIX,
-    Append,
+    AppendColumns,
     Table,
     check_width,
     choose_columns,
     describe_content,
 )
-from drivers.sample import Floats
 
 METADATA_KEY: Final = b"imu-monitor"
 """Key of the schema metadata that identifies a segment recorded by the daemon."""
@@ -48,7 +47,7 @@ def import_pyarrow(path: Path) -> Any:
     Raises
     ------
     ConfigError
-        pyarrow is not installed. The text names ``path`` as the file that cannot be read or written.
+        If pyarrow is not installed. The text names ``path`` as the file that cannot be read or written.
     """
     try:
         import pyarrow as pa
@@ -58,36 +57,29 @@ def import_pyarrow(path: Path) -> Any:
     return pa
 
 
-def count_rows_parquet(path: Path) -> int:
-    """Return the number of rows that the index states.
-
-    Raises
-    ------
-    RecordingError, ConfigError
-        As for ``read_parquet``.
-    """
-    with _parquet(path) as file:
-        return _checked_parquet(path, file, [])[1]
-
-
 def read_parquet(path: Path) -> Table:
     """Read the known columns of a Parquet file.
 
     Raises
     ------
     RecordingError
-        The file is not complete, is not Parquet, or exceeds a limit.
+        If the file is not complete, is not Parquet, or exceeds a limit.
     ConfigError
-        pyarrow is not installed, or the samples do not fit into the memory.
+        If pyarrow is not installed, or the samples do not fit into the memory.
     """
     notes: list[str] = []
-    with _parquet(path) as file:
-        chosen, _ = _checked_parquet(path, file, notes)
-        return _table(path, file.read(columns=list(chosen.values())), chosen, notes)
+    with _open_parquet(path) as file:
+        metadata = file.metadata
+        check_width(path, metadata.num_columns)
+        chosen = choose_columns(path, file.schema_arrow.names, notes)
+        _check_types(path, file.schema_arrow, chosen)
+        stated = sum(metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
+        memory_check.read_limit(path).check_rows(max(int(metadata.num_rows), stated))
+        return _float_table(path, file.read(columns=list(chosen.values())), chosen, notes)
 
 
 @contextmanager
-def _parquet(path: Path) -> Iterator[Any]:
+def _open_parquet(path: Path) -> Iterator[Any]:
     """Open a Parquet file. Within the context, pyarrow's errors are raised as RecordingError."""
     pa = import_pyarrow(path)
     from pyarrow import parquet
@@ -98,8 +90,8 @@ def _parquet(path: Path) -> Iterator[Any]:
         index_bytes = int.from_bytes(file.read()[:4], "little")
         if MAX_INDEX_BYTES < index_bytes < size_bytes:
             raise RecordingError(
-                f"{path}: its index of row groups and columns has {index_bytes} bytes, expected at most "
-                f"{MAX_INDEX_BYTES}; write it again with fewer columns or larger row groups"
+                f"{path}: the index of row groups and columns has {index_bytes} bytes, expected at most "
+                f"{MAX_INDEX_BYTES}; write the file again with fewer columns or larger row groups"
             )
         file.seek(0)
         try:
@@ -107,33 +99,9 @@ def _parquet(path: Path) -> Iterator[Any]:
                 yield opened
         except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
             raise RecordingError(
-                f"{path}: is no whole Parquet file ({_first_line(error)}); its index stands at the end, "
-                f"so one that is cut off cannot be read{describe_content(path)}"
+                f"{path}: is no complete Parquet file ({first_line(error)}); its index is at the end, "
+                f"so a file that is cut off cannot be read{describe_content(path)}"
             ) from error
-
-
-def _checked_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, str], int]:
-    """Return the columns to read and the number of rows, after checking both against the limits."""
-    check_width(path, file.metadata.num_columns)
-    schema = file.schema_arrow
-    chosen = choose_columns(path, schema.names, notes)
-    _check_types(path, schema, chosen)
-    rows = int(file.metadata.num_rows)
-    stated = sum(file.metadata.row_group(i).num_rows for i in range(file.metadata.num_row_groups))
-    memory_check.read_limit(path).check_rows(max(rows, stated))
-    return chosen, rows
-
-
-def count_rows_ipc(path: Path) -> int:
-    """Return the number of rows of all batches up to a truncation.
-
-    Raises
-    ------
-    RecordingError, ConfigError
-        As for ``read_ipc``.
-    """
-    with open_regular(path) as file:
-        return _checked_ipc(path, _ipc_start(path), _ipc_schema(path, file), {})[1]
 
 
 def read_ipc(path: Path) -> Table:
@@ -142,9 +110,9 @@ def read_ipc(path: Path) -> Table:
     Raises
     ------
     RecordingError
-        The file is not Arrow IPC, or it exceeds a limit.
+        If the file is not Arrow IPC, or exceeds a limit.
     ConfigError
-        pyarrow is not installed, or the samples do not fit into the memory.
+        If pyarrow is not installed, or the samples do not fit into the memory.
     """
     pa = import_pyarrow(path)
     notes: list[str] = []
@@ -153,9 +121,9 @@ def read_ipc(path: Path) -> Table:
         schema = _ipc_schema(path, file)
         own = METADATA_KEY in (schema.metadata or {})
         chosen = choose_columns(path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes)
-        count, _ = _checked_ipc(path, start, schema, chosen)
+        count = _check_ipc(path, start, schema, chosen)
         if not _has_end_mark(path, start > 0):
-            notes.append("The end mark is missing: the file is cut off and was read up to the cut.")
+            notes.append("The file has no end mark; it is cut off and was read up to the cut.")
         file.seek(start)
         batches: list[Any] = []
         try:
@@ -166,11 +134,11 @@ def read_ipc(path: Path) -> Table:
                 batch.validate()
                 batches.append(batch)
         except StopIteration:
-            pass  # the regular end
+            pass  # the regular end of the stream
         except (pa.ArrowException, OSError) as error:
-            notes.append(f"Only {len(batches)} whole batches could be read: {_first_line(error)}.")
+            notes.append(f"Only {len(batches)} complete batches could be read: {first_line(error)}.")
     schema = batches[0].schema if batches else schema
-    return _table(path, pa.Table.from_batches(batches, schema), chosen, notes)
+    return _float_table(path, pa.Table.from_batches(batches, schema), chosen, notes)
 
 
 def _ipc_start(path: Path) -> int:
@@ -197,37 +165,37 @@ def _ipc_schema(path: Path, file: Any) -> Any:
         schema.names, schema.metadata  # noqa: B018 - raises for names that are not UTF-8
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
-            f"{path}: is no Arrow IPC file or stream ({_first_line(error)}){describe_content(path)}"
+            f"{path}: is no Arrow IPC file or stream ({first_line(error)}){describe_content(path)}"
         ) from error
     return schema
 
 
-def _checked_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -> tuple[int, int]:
-    """Return the number of record batches and of rows, after checking them and the column types against the limits."""
+def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -> int:
+    """Return the number of record batches, after checking their sizes and the column types against the limits."""
     pa = import_pyarrow(path)
     _check_types(path, schema, chosen)
     counts = [
         count if count is None or field.name in chosen.values() else -count
         for field in schema
-        for count in (buffer_count(pa, field.type),)
+        for count in (count_buffers(pa, field.type),)
     ]
     limit = memory_check.read_limit(path)
     batches = rows = dictionaries = 0
     with open_regular(path) as file:
-        for size in batch_sizes(file, start):
+        for size in iter_batch_sizes(file, start):
             if size.dictionary:
                 dictionaries += sum(size.buffers)
                 if dictionaries > MAX_DICTIONARY_BYTES:
                     raise RecordingError(
                         f"{path}: its dictionaries unpack to {dictionaries} bytes, expected at most "
-                        f"{MAX_DICTIONARY_BYTES}; leave out the columns that are no numbers"
+                        f"{MAX_DICTIONARY_BYTES}; leave out the columns that are not numeric"
                     )
                 continue
             batches, rows = batches + 1, rows + size.rows
             limit.check_rows(rows)
-            if wrong := check_buffers(size, counts, SLACK_BYTES):
-                raise RecordingError(f"{path}: batch {batches} is no regular one: {wrong}")
-    return batches, rows
+            if wrong := check_buffer_sizes(size, counts, SLACK_BYTES):
+                raise RecordingError(f"{path}: batch {batches} is damaged: {wrong}")
+    return batches
 
 
 def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
@@ -238,28 +206,23 @@ def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
         type_ = schema.field(key).type
         if not any(is_type(type_) for is_type in numeric):
             unit = "; t is in seconds" if key == "t" else ""
-            raise RecordingError(f"{path}: {key} holds {type_}, not numbers{unit}")
+            raise RecordingError(f"{path}: {key} contains {type_}, expected numbers{unit}")
 
 
-def _table(path: Path, table: Any, chosen: Mapping[str, str], notes: list[str]) -> Table:
-    """Return the chosen columns as a ``Table``."""
-    columns = {name: _column(path, table.column(key)) for name, key in chosen.items()}
-    return Table(columns, None, notes)
+def _float_table(path: Path, table: Any, chosen: Mapping[str, str], notes: list[str]) -> Table:
+    """Return the chosen columns of a pyarrow table as float64, with null as NaN."""
+    float64 = import_pyarrow(path).float64()
+    columns = {name: table.column(key).cast(float64, safe=False).to_numpy() for name, key in chosen.items()}
+    return Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes)
 
 
-def _column(path: Path, column: Any) -> Floats:
-    """Return one column as float64, with null as NaN."""
-    pa = import_pyarrow(path)
-    return np.asarray(column.cast(pa.float64(), safe=False).to_numpy(), dtype=np.float64)
-
-
-def _first_line(error: Exception) -> str:
-    """Return the first line of the text of an error."""
+def first_line(error: Exception) -> str:
+    """Return the first line of an exception's text without a full stop at the end."""
     return str(error).strip().partition("\n")[0].rstrip(".")
 
 
 @contextmanager
-def parquet_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
+def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[AppendColumns]:
     """Write Parquet with its default compression.
 
     Parameters
@@ -271,52 +234,36 @@ def parquet_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
 
     Yields
     ------
-    Append
+    AppendColumns
         Function that appends rows. Each call writes one row group.
     """
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
-    schema = _schema(pa, names)
+    schema = _float_schema(pa, names)
     with parquet.ParquetWriter(path, schema) as file:
         yield lambda columns: file.write_table(pa.table(dict(columns), schema))
 
 
-def ipc_file_writer(path: Path, names: Sequence[str]) -> AbstractContextManager[Append]:
-    """Write an Arrow file (Feather version 2).
-
-    Parameters
-    ----------
-    path
-        File to write.
-    names
-        Names of the columns.
-    """
-    return _ipc_writer(import_pyarrow(path).ipc.new_file, path, names)
-
-
-def ipc_stream_writer(path: Path, names: Sequence[str]) -> AbstractContextManager[Append]:
-    """Write an Arrow stream.
-
-    Parameters
-    ----------
-    path
-        File to write.
-    names
-        Names of the columns.
-    """
-    return _ipc_writer(import_pyarrow(path).ipc.new_stream, path, names)
-
-
 @contextmanager
-def _ipc_writer(new: Any, path: Path, names: Sequence[str]) -> Iterator[Append]:
-    """Write Arrow IPC with the pyarrow writer that ``new`` opens."""
+def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> Iterator[AppendColumns]:
+    """Write an Arrow file (Feather version 2) or an Arrow stream.
+
+    Parameters
+    ----------
+    path
+        File to write.
+    names
+        Names of the columns.
+    stream
+        True for a stream.
+    """
     pa = import_pyarrow(path)
-    schema = _schema(pa, names)
-    with new(str(path), schema) as file:
+    schema = _float_schema(pa, names)
+    with (pa.ipc.new_stream if stream else pa.ipc.new_file)(str(path), schema) as file:
         yield lambda columns: file.write_table(pa.table(dict(columns), schema), max_chunksize=BATCH_ROWS)
 
 
-def _schema(pa: Any, names: Sequence[str]) -> Any:
+def _float_schema(pa: Any, names: Sequence[str]) -> Any:
     """Return a schema of float64 columns."""
     return pa.schema([(name, pa.float64()) for name in names])

@@ -1,8 +1,8 @@
-"""Sizes of the messages of an Arrow IPC stream, read before any data are unpacked.
+"""Sizes of the messages of an Arrow IPC stream, read before data are unpacked.
 
 A record batch states its number of rows, and a compressed buffer its unpacked size. pyarrow allocates the stated sizes
-and does not accept a limit. ``batch_sizes`` therefore reads the metadata of each message itself: the framing, the few
-fields of the flatbuffer that give sizes, and the first eight bytes of each compressed buffer. It reads no data.
+and does not accept a limit. ``iter_batch_sizes`` therefore parses the metadata of each message. It reads the framing,
+the fields of the flatbuffer that state sizes, and the first eight bytes of each compressed buffer.
 
 Sources: the Arrow columnar format, "Encapsulated message format" and "Compression",
 https://arrow.apache.org/docs/format; format/Message.fbs and Schema.fbs for the numbers of the fields; the FlatBuffers
@@ -41,8 +41,8 @@ class BatchSize:
     dictionary: bool  # True for a dictionary
 
 
-def batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
-    """Yield the stated sizes of the batches of a stream, up to its end, a truncation or damaged metadata.
+def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
+    """Yield the stated sizes of the batches of a stream up to the end, a truncation or damaged metadata.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
         file.seek(at)
         mark, size = struct.unpack("<II", file.read(8))
         at += 8
-        if mark != CONTINUATION:  # streams written before Arrow 0.15 lack this mark
+        if mark != CONTINUATION:  # streams written before Arrow 0.15 lack the mark
             size, at = mark, at - 4
         if not 0 < size <= MAX_METADATA_BYTES or at + size > end:
             return
@@ -71,14 +71,14 @@ def batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
         body = at + size
         try:
             message = _Table.root(metadata)
-            kind = message.number(MESSAGE_HEADER_TYPE, "B")
-            body_bytes = message.number(MESSAGE_BODY_LENGTH, "q")
+            kind = message.read_number(MESSAGE_HEADER_TYPE, "B")
+            body_bytes = message.read_number(MESSAGE_BODY_LENGTH, "q")
             if body_bytes < 0:
                 return
             if kind in (RECORD_BATCH, DICTIONARY_BATCH):
-                batch = message.table(MESSAGE_HEADER)
-                batch = batch.table(DICTIONARY_DATA) if kind == DICTIONARY_BATCH else batch
-                yield _batch_size(file, batch, body, body_bytes, kind == DICTIONARY_BATCH)
+                batch = message.read_table(MESSAGE_HEADER)
+                batch = batch.read_table(DICTIONARY_DATA) if kind == DICTIONARY_BATCH else batch
+                yield _read_batch_size(file, batch, body, body_bytes, kind == DICTIONARY_BATCH)
             elif kind != SCHEMA:
                 return
         except (struct.error, LookupError):
@@ -86,16 +86,16 @@ def batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
         at = body + body_bytes
 
 
-def check_buffers(size: BatchSize, counts: Sequence[int | None], slack_bytes: int) -> str:
-    """Check that the buffers of numeric columns unpack to no more than their rows need.
+def check_buffer_sizes(size: BatchSize, counts: Sequence[int | None], slack_bytes: int) -> str:
+    """Check that no buffer of a numeric column is larger after unpacking than the rows of the batch need.
 
     Parameters
     ----------
     size
         Stated size of the batch.
     counts
-        Number of buffers of each column in the order of the schema. It is negative if the column is not read, and None
-        if the number is unknown. All buffers after an unknown number are checked.
+        Number of buffers of each column in the order of the schema. The number is negative if the column is not read,
+        and None if it is unknown. All buffers after an unknown number are checked.
     slack_bytes
         Size allowed in addition to eight bytes per row.
 
@@ -118,7 +118,7 @@ def check_buffers(size: BatchSize, counts: Sequence[int | None], slack_bytes: in
     return ""
 
 
-def buffer_count(pa: Any, type_: Any) -> int | None:
+def count_buffers(pa: Any, type_: Any) -> int | None:
     """Return the number of buffers of a column.
 
     Parameters
@@ -131,7 +131,7 @@ def buffer_count(pa: Any, type_: Any) -> int | None:
     Returns
     -------
     int or None
-        None if the type is nested or has views.
+        None if the type is nested or has views, and the number therefore varies.
     """
     types = pa.types
     if types.is_null(type_):
@@ -144,12 +144,12 @@ def buffer_count(pa: Any, type_: Any) -> int | None:
     return 3 if any(is_type(type_) for is_type in variable) else 2
 
 
-def _batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> BatchSize:
+def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> BatchSize:
     """Return the stated size of a batch whose body begins at the offset ``body`` of the file."""
-    rows = batch.number(BATCH_LENGTH, "q")
-    packed = batch.has(BATCH_COMPRESSION)
+    rows = batch.read_number(BATCH_LENGTH, "q")
+    packed = batch.has_field(BATCH_COMPRESSION)
     sizes = []
-    for offset, length in batch.structs(BATCH_BUFFERS, BUFFER):
+    for offset, length in batch.read_structs(BATCH_BUFFERS, BUFFER):
         unpacked = length
         if packed and length >= 8 and 0 <= offset <= body_bytes - 8:
             file.seek(body + offset)
@@ -161,7 +161,7 @@ def _batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, di
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """Table of a flatbuffer. It raises struct.error or LookupError for offsets outside of the buffer."""
+    """Table of a flatbuffer. The methods raise struct.error or LookupError for offsets outside of the buffer."""
 
     data: bytes
     at: int
@@ -171,45 +171,45 @@ class _Table:
         """Return the root table of a flatbuffer."""
         return cls(data, struct.unpack_from("<I", data)[0])
 
-    def has(self, field: int) -> bool:
+    def has_field(self, field: int) -> bool:
         """Return True if the table contains a field."""
         return self._field(field) != 0
 
-    def number(self, field: int, form: str) -> int:
-        """Return a number; 0 if the field is absent. ``form`` is its struct format."""
+    def read_number(self, field: int, number_format: str) -> int:
+        """Return a number; 0 if the field is absent. ``number_format`` is a format of the module struct."""
         at = self._field(field)
-        return int(_unpack(f"<{form}", self.data, at)) if at else 0
+        return int(_unpack_number(f"<{number_format}", self.data, at)) if at else 0
 
-    def table(self, field: int) -> "_Table":
+    def read_table(self, field: int) -> "_Table":
         """Return a table that this table refers to."""
         at = self._field(field)
         if not at:
             raise LookupError(field)
-        return _Table(self.data, at + _unpack("<I", self.data, at))
+        return _Table(self.data, at + _unpack_number("<I", self.data, at))
 
-    def structs(self, field: int, form: struct.Struct) -> Iterator[tuple[Any, ...]]:
+    def read_structs(self, field: int, layout: struct.Struct) -> Iterator[tuple[Any, ...]]:
         """Yield the unpacked structs of a vector; nothing if the field is absent."""
         at = self._field(field)
         if not at:
             return iter(())
-        at += _unpack("<I", self.data, at)
-        count = _unpack("<I", self.data, at)
-        if count * form.size > len(self.data):
+        at += _unpack_number("<I", self.data, at)
+        count = _unpack_number("<I", self.data, at)
+        if count * layout.size > len(self.data):
             raise LookupError(field)
-        return form.iter_unpack(self.data[at + 4 : at + 4 + count * form.size])
+        return layout.iter_unpack(self.data[at + 4 : at + 4 + count * layout.size])
 
     def _field(self, field: int) -> int:
         """Return the offset of a field; 0 if the field is absent."""
-        entries = self.at - _unpack("<i", self.data, self.at)
-        place = 4 + 2 * field
-        if entries < 0 or place >= _unpack("<H", self.data, entries):
+        entries = self.at - _unpack_number("<i", self.data, self.at)
+        entry = 4 + 2 * field
+        if entries < 0 or entry >= _unpack_number("<H", self.data, entries):
             return 0
-        offset = _unpack("<H", self.data, entries + place)
+        offset = _unpack_number("<H", self.data, entries + entry)
         return self.at + offset if offset else 0
 
 
-def _unpack(form: str, data: bytes, at: int) -> int:
+def _unpack_number(number_format: str, data: bytes, at: int) -> int:
     """Unpack one number at an offset."""
     if at < 0:
         raise LookupError(at)
-    return int(struct.unpack_from(form, data, at)[0])
+    return int(struct.unpack_from(number_format, data, at)[0])

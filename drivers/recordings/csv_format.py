@@ -4,9 +4,9 @@ Blank lines and comment lines (``#`` or ``%``) before the header are skipped. Th
 
 Text is parsed in pieces of complete lines. A piece of regular lines is parsed at once. Any other piece is parsed line
 by line, so that a damaged line affects no other line and is reported by its number. A last line without a line end may
-be cut inside a number and is left out. A file with more bad lines than good ones is not a recording.
+be cut inside a number and is left out. A file with more bad lines than good lines is not a recording.
 
-The lines are counted before any is parsed, and the number is checked against the limits of
+The lines are counted before they are parsed, and their number is checked against the limits of
 ``drivers.recordings.memory_check``. Reading ends at a line that is longer than ``MAX_LINE_BYTES``.
 """
 
@@ -15,11 +15,11 @@ import gzip
 import io
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
-from typing import IO, Final, TextIO
+from typing import IO, Final, cast
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from drivers.recordings import memory_check
 from drivers.recordings.table import (
     BATCH_ROWS,
     EXAMPLE_HEADER,
-    Append,
+    AppendColumns,
     Columns,
     Table,
     check_width,
@@ -45,7 +45,7 @@ MAX_PREAMBLE_BYTES: Final = 1 << 20
 MAX_EMPTY_MEMBERS: Final = 1000
 """Maximum number of consecutive gzip members without content."""
 MAX_BAD_LINES: Final = 100_000
-"""Number of bad lines after which reading stops, if there are more bad lines than good ones."""
+"""Number of bad lines after which reading stops if there are more bad lines than good lines."""
 COMMENT_MARKS: Final = (b"#", b"%")
 BOM: Final = b"\xef\xbb\xbf"
 GZIP_BYTES: Final = 1 << 16  # a damaged gzip file loses at most this many bytes before the damage
@@ -55,25 +55,53 @@ GZIP_LEVEL: Final = 1  # digits of noise hardly compress: level 6 saves a furthe
 
 @dataclass(slots=True)
 class _BadLines:
-    """Number of lines that are not samples, and a description of the first one."""
+    """Number of lines that are not samples, and a description of the first such line."""
 
     count: int = 0
     first: str = ""
 
-    def add(self, number: int, why: str) -> None:
-        """Count a bad line."""
-        self.first = self.first or f"line {number}: {why}"
+    def count_line(self, number: int, reason: str) -> None:
+        """Count the bad line with this number."""
+        self.first = self.first or f"line {number}: {reason}"
         self.count += 1
 
 
-def count_rows(path: Path) -> int:
-    """Count the lines of a plain or gzip text up to a truncation, without parsing them.
+def read_csv(path: Path) -> Table:
+    """Read a plain or gzip CSV file up to a truncation.
 
     Raises
     ------
-    RecordingError, ConfigError
-        The file exceeds a limit of ``drivers.recordings.memory_check``. Reading stops at the limit.
+    RecordingError
+        If the file has no header or no samples, or most of its lines are not samples.
+    ConfigError
+        If the samples do not fit into the memory.
     """
+    notes: list[str] = []
+    bad = _BadLines()
+    _check_size(path)
+    with open_regular(path) as file:
+        texts = _whole_lines(_decompressed(file, notes), notes)
+        head = _find_header(path, texts)
+        if head is None:
+            what = notes[-1] if notes else "It has no line at all."
+            raise RecordingError(f"{path}: has not one complete line, expected {EXAMPLE_HEADER}. {what}")
+        names = _column_names(path, head)
+        chosen = choose_columns(path, names, notes, f" in line {head.number}")
+        use = [names.index(name) for name in chosen.values()]
+        parts = list(_parse_pieces(path, head, texts, names, use, bad))
+    rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
+    if 2 * bad.count > len(rows):
+        raise _too_many_bad_lines(path, bad, len(rows))
+    if bad.count:
+        notes.append(f"{bad.count} of {len(rows)} lines are not samples and are read as missing ({bad.first}).")
+    if not len(rows):
+        what = f". {notes[-1]}" if notes else ""
+        raise RecordingError(f"{path}: has a header line but no complete line of samples after it{what}")
+    return Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
+
+
+def _check_size(path: Path) -> None:
+    """Count the lines of a text up to a truncation, and check their number and size against the limits."""
     limit = memory_check.read_limit(path)
     lines = unpacked = 0
     with open_regular(path) as file:
@@ -83,47 +111,12 @@ def count_rows(path: Path) -> int:
             limit.check_rows(lines)
             if unpacked > limit.size_bytes:
                 limit.check_unpacked(unpacked)
-    return lines
-
-
-def read_csv(path: Path) -> Table:
-    """Read a plain or gzip CSV file up to a truncation.
-
-    Raises
-    ------
-    RecordingError
-        The file has no header or no samples, or most of its lines are not samples.
-    ConfigError
-        The samples do not fit into the memory.
-    """
-    notes: list[str] = []
-    bad = _BadLines()
-    count_rows(path)
-    with open_regular(path) as file:
-        texts = _whole_lines(_decompressed(file, notes), notes)
-        head = _find_header(path, texts)
-        if head is None:
-            what = notes[-1] if notes else "It has no line at all."
-            raise RecordingError(f"{path}: has not one whole line, expected {EXAMPLE_HEADER}. {what}")
-        names = _column_names(path, head)
-        chosen = choose_columns(path, names, notes, f" in line {head.number}")
-        use = [names.index(name) for name in chosen.values()]
-        parts = list(_parse_pieces(path, head, texts, names, use, bad))
-    rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
-    if 2 * bad.count > len(rows):
-        raise _too_many_bad_lines(path, bad, len(rows))
-    if bad.count:
-        notes.append(f"{bad.count} of {len(rows)} lines are no samples: read as missing ({bad.first}).")
-    if not len(rows):
-        what = f". {notes[-1]}" if notes else ""
-        raise RecordingError(f"{path}: has a header line but no whole line of samples after it{what}")
-    return Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
 
 
 def _too_many_bad_lines(path: Path, bad: _BadLines, rows: int) -> RecordingError:
     """Return the error for a file with mostly bad lines."""
     return RecordingError(
-        f"{path}: {bad.count} of {rows} lines are no samples ({bad.first}); every field must be a number, empty or nan"
+        f"{path}: {bad.count} of {rows} lines are not samples ({bad.first}); every field must be a number, empty or nan"
     )
 
 
@@ -139,23 +132,23 @@ def _decompressed(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
         return
     unzip = zlib.decompressobj(zlib.MAX_WBITS | 16)
     data = file.read(GZIP_BYTES)
-    empty, held = 0, False  # number of consecutive empty members; True if the current member holds text
+    empty, has_text = 0, False  # number of consecutive empty members; True if the current member contains text
     while data:
         try:
             text = unzip.decompress(data, READ_BYTES)
         except zlib.error as error:
-            notes.append(f"The gzip data are damaged ({error}); read up to the damage.")
+            notes.append(f"The gzip data are damaged ({error}); the file was read up to the damage.")
             return
         if text:
-            held = True
+            has_text = True
             yield text
         if unzip.eof:  # another member may follow, since gzip files can be concatenated
-            empty = 0 if held else empty + 1
+            empty = 0 if has_text else empty + 1
             if empty > MAX_EMPTY_MEMBERS:
-                notes.append(f"{empty} gzip members in a row are empty; read up to there.")
+                notes.append(f"{empty} consecutive gzip members are empty; the file was read up to these members.")
                 return
-            data = (unzip.unused_data or file.read(GZIP_BYTES)).lstrip(b"\0")  # and padded with zeros
-            unzip, held = zlib.decompressobj(zlib.MAX_WBITS | 16), False
+            data = (unzip.unused_data or file.read(GZIP_BYTES)).lstrip(b"\0")  # zeros may separate members
+            unzip, has_text = zlib.decompressobj(zlib.MAX_WBITS | 16), False
             if not data:
                 return
         else:
@@ -180,10 +173,10 @@ def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
         rest.append(tail)
         size += len(tail)
         if size > MAX_LINE_BYTES:
-            notes.append(f"Line {lines + 1} is longer than {MAX_LINE_BYTES} bytes; the file was read up to there.")
+            notes.append(f"Line {lines + 1} is longer than {MAX_LINE_BYTES} bytes; the file was read up to this line.")
             return
     if any(part.strip() for part in rest):
-        notes.append("The last line has no end: the file may be cut off there, and the line was left out.")
+        notes.append("The last line has no end and was left out; the file may be cut off.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,20 +229,20 @@ def _column_names(path: Path, head: _Header) -> list[str]:
     """Return the column names of the header line. Raise RecordingError if it is not a header."""
     if b"\0" in head.line or not head.line:
         raise RecordingError(
-            f"{path}: is no CSV text; the first line would be {EXAMPLE_HEADER}{describe_content(path)}"
+            f"{path}: is no CSV text, expected a first line such as {EXAMPLE_HEADER}{describe_content(path)}"
         )
     text = head.line.decode("utf-8", errors="replace")
     for separator, word in ((";", "semicolons"), ("\t", "tabs")):
         if separator in text and "," not in text:
             raise RecordingError(
-                f"{path}: the columns of line {head.number} are separated by {word}; a recording has commas"
+                f"{path}: the columns of line {head.number} are separated by {word}; separate them by commas"
             )
     check_width(path, text.count(",") + 1)
-    names = [name.strip(' \t"') for name in _fields(text)]
-    if all(_number(name) is not None for name in names):
+    names = [name.strip(' \t"') for name in _split_fields(text)]
+    if all(_parse_number(name) is not None for name in names):
         raise RecordingError(
-            f"{path}: the header line is missing, line {head.number} is all numbers; "
-            f"it would read like {EXAMPLE_HEADER}"
+            f"{path}: the header line is missing: line {head.number} consists of numbers; "
+            f"expected a header line such as {EXAMPLE_HEADER}"
         )
     return names
 
@@ -263,8 +256,8 @@ def _parse_pieces(
         text = text.replace(b"\r\n", b"\n")
         lines = text.decode("utf-8", errors="replace").split("\n")[:-1]
         if text.strip():
-            quick = _parse_quickly(text, lines, len(names), use)
-            part = _parse_slowly(lines, number, names, use, bad) if quick is None else quick
+            part = _parse_regular_lines(text, lines, len(names), use)
+            part = _parse_line_by_line(lines, number, names, use, bad) if part is None else part
             rows += len(part)
             if bad.count > MAX_BAD_LINES and 2 * bad.count > rows:
                 raise _too_many_bad_lines(path, bad, rows)
@@ -272,7 +265,7 @@ def _parse_pieces(
         number += len(lines)
 
 
-def _parse_quickly(text: bytes, lines: list[str], width: int, use: Sequence[int]) -> Floats | None:
+def _parse_regular_lines(text: bytes, lines: list[str], width: int, use: Sequence[int]) -> Floats | None:
     """Return an array [lines, used columns] if every line has all its fields and all are numbers, otherwise None."""
     codes = np.frombuffer(text, np.uint8)
     commas_before = np.searchsorted(np.flatnonzero(codes == ord(",")), np.flatnonzero(codes == ord("\n")))
@@ -284,13 +277,10 @@ def _parse_quickly(text: bytes, lines: list[str], width: int, use: Sequence[int]
         return None
 
 
-def _parse_slowly(
+def _parse_line_by_line(
     lines: Sequence[str], number: int, names: Sequence[str], use: Sequence[int], bad: _BadLines
 ) -> Floats:
-    """Parse line by line.
-
-    An empty field is a missing value. A line that is not a sample becomes a row of missing values.
-    """
+    """Return an array [lines, used columns]. A line that is not a sample becomes a row of missing values."""
     missing = [np.nan] * len(use)
     rows: list[list[float]] = []
     for offset, line in enumerate(lines):
@@ -299,26 +289,26 @@ def _parse_slowly(
         try:
             rows.append(_parse_sample(line, names, use))
         except ValueError as error:
-            bad.add(number + offset, str(error))
+            bad.count_line(number + offset, str(error))
             rows.append(missing)
     return np.array(rows).reshape(len(rows), len(use))
 
 
 def _parse_sample(line: str, names: Sequence[str], use: Sequence[int]) -> list[float]:
     """Return the used fields of one line. Raise ValueError with the reason if the line is not a sample."""
-    fields = _fields(line)
+    fields = _split_fields(line)
     if len(fields) != len(names):
         raise ValueError(f"{len(fields)} fields where the header has {len(names)}")
     row = []
     for i in use:
-        number = _number(fields[i])
+        number = _parse_number(fields[i])
         if number is None:
-            raise ValueError(f"{names[i]} reads {fields[i].strip()[:20]!a}")
+            raise ValueError(f"{names[i]} is {fields[i].strip()[:20]!a}")
         row.append(number)
     return row
 
 
-def _fields(line: str) -> list[str]:
+def _split_fields(line: str) -> list[str]:
     """Return the fields of one line."""
     if '"' not in line:
         return line.split(",")
@@ -328,7 +318,7 @@ def _fields(line: str) -> list[str]:
         return []
 
 
-def _number(field: str) -> float | None:
+def _parse_number(field: str) -> float | None:
     """Return a number, NaN for an empty field, or None for text. ``float`` alone would accept 1_000."""
     if not field or field.isspace():
         return float("nan")
@@ -339,7 +329,7 @@ def _number(field: str) -> float | None:
 
 
 @contextmanager
-def csv_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
+def open_csv_writer(path: Path, names: Sequence[str], packed: bool = False) -> Iterator[AppendColumns]:
     """Write one header line and one line per sample. A missing value is written as ``nan``.
 
     Parameters
@@ -348,41 +338,21 @@ def csv_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
         File to write.
     names
         Names of the columns.
+    packed
+        True if the file is compressed with gzip. The gzip header has no time stamp, so that equal columns give equal
+        bytes.
     """
-    with path.open("w", encoding="ascii", newline="") as file:
-        yield _line_appender(file, names)
+    with ExitStack() as stack:
+        raw: IO[bytes] = stack.enter_context(path.open("wb"))
+        if packed:
+            raw = cast("IO[bytes]", stack.enter_context(gzip.GzipFile("", "wb", GZIP_LEVEL, raw, mtime=0)))
+        file = stack.enter_context(io.TextIOWrapper(raw, "ascii", newline=""))
+        file.write(",".join(names) + "\n")
 
+        def append(columns: Columns) -> None:
+            """Append rows. ``repr`` gives the shortest text that reads back as the same float64."""
+            for start in range(0, columns[names[0]].size, BATCH_ROWS):
+                fields = [map(repr, columns[name][start : start + BATCH_ROWS].tolist()) for name in names]
+                file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))
 
-@contextmanager
-def csv_gz_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
-    """Write CSV compressed with gzip. The gzip header has no time stamp, so that equal columns give equal bytes.
-
-    Parameters
-    ----------
-    path
-        File to write.
-    names
-        Names of the columns.
-    """
-    with (
-        path.open("wb") as raw,
-        gzip.GzipFile("", "wb", GZIP_LEVEL, raw, mtime=0) as packed,
-        io.TextIOWrapper(packed, "ascii", newline="") as file,
-    ):
-        yield _line_appender(file, names)
-
-
-def _line_appender(file: TextIO, names: Sequence[str]) -> Append:
-    """Write the header line, and return a function that appends rows.
-
-    Numbers are written by ``repr``, the shortest text that reads back as the same float64.
-    """
-    file.write(",".join(names) + "\n")
-
-    def append(columns: Columns) -> None:
-        """Append rows to the file."""
-        for start in range(0, columns[names[0]].size, BATCH_ROWS):
-            fields = [map(repr, columns[name][start : start + BATCH_ROWS].tolist()) for name in names]
-            file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))
-
-    return append
+        yield append

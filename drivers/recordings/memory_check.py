@@ -1,11 +1,11 @@
 """Limits on the memory that a reader allocates, and the available memory.
 
-A reader checks the size of a recording before it allocates memory for the samples. If a process takes more memory than
-there is, the kernel ends the process and possibly the daemon on the same machine. A compressed file of a few megabytes
-can hold gigabytes, so the size of the file alone is not sufficient.
+A reader checks the size of a recording before it allocates memory for the samples. If a process allocates more memory
+than the machine has, the kernel ends the process and possibly the daemon on the same machine. A compressed file of a
+few megabytes can hold gigabytes, so a check of the file size is not sufficient.
 
-Four limits apply. The memory limit depends on the machine. The other three are constants, documented in
-docs/recording.md:
+Four limits apply. The memory limit depends on the machine. The other three limits are constants, which
+docs/recording.md lists:
 
 - the samples and their copies fit into the available memory;
 - a file holds at most ``MIN_ROW_LIMIT`` rows, or ``MAX_ROWS_PER_BYTE`` rows per byte on disk if that is more;
@@ -33,7 +33,7 @@ ROW_BYTES: Final = 64
 """Size of one sample in memory: time, six axes and temperature as float64."""
 MIN_ROW_LIMIT: Final = 20_000_000
 MAX_ROWS_PER_BYTE: Final = 8
-"""Rows of measured values need more than one bit each, in every format."""
+"""Maximum number of rows per byte. A row of measured values needs more than one bit in every format."""
 MIN_UNPACKED_LIMIT_BYTES: Final = 2_000_000_000
 MAX_UNPACKING_RATIO: Final = 100
 MAX_COLUMNS: Final = 10_000
@@ -63,16 +63,21 @@ class ReadLimit:
         Raises
         ------
         RecordingError
-            The file is too small to hold this number of measured samples.
+            If the file is too small to contain this number of measured samples.
         ConfigError
-            The samples do not fit into the available memory.
+            If the samples and the copies that an analysis makes of them do not fit into the available memory.
         """
         if rows > max(MIN_ROW_LIMIT, MAX_ROWS_PER_BYTE * self.size_bytes):
             raise RecordingError(
-                f"{self.path}: at least {rows} rows in a file of {self.size_bytes} bytes are no measured samples; "
+                f"{self.path}: at least {rows} rows in a file of {self.size_bytes} bytes are not measured samples; "
                 f"the limit is {MIN_ROW_LIMIT} rows, or {MAX_ROWS_PER_BYTE} rows per byte in a larger file"
             )
-        check_memory(self.path, rows * ROW_BYTES, self.free)
+        needed_bytes = COPIES * rows * ROW_BYTES
+        if self.free is not None and needed_bytes > self.free:
+            raise ConfigError(
+                f"{self.path}: more than {needed_bytes / 1e9:.1f} GB of memory would be needed, "
+                f"{self.free / 1e9:.1f} GB are free; read the end of a folder with --last 1d, or split the file"
+            )
 
     def check_unpacked(self, unpacked_bytes: int) -> None:
         """Check the number of bytes that have been unpacked so far.
@@ -80,44 +85,39 @@ class ReadLimit:
         Raises
         ------
         RecordingError
-            The file unpacks to more than the limit.
+            If the file unpacks to more than the limit.
         """
         if unpacked_bytes > max(MIN_UNPACKED_LIMIT_BYTES, MAX_UNPACKING_RATIO * self.size_bytes):
             raise RecordingError(
                 f"{self.path}: unpacks to more than {unpacked_bytes / 1e9:.1f} GB from {self.size_bytes / 1e6:.1f} MB; "
                 f"the limit is {MIN_UNPACKED_LIMIT_BYTES / 1e9:g} GB, or {MAX_UNPACKING_RATIO} times the size of the "
-                "file; unpack it and check what it holds"
+                "file; unpack the file and check its content"
             )
 
 
 def read_limit(path: Path) -> ReadLimit:
-    """Return the limits on a file, with the memory that is available now.
-
-    Raises
-    ------
-    OSError
-        There is no such file.
-    """
+    """Return the limits on a file, with the memory that is available now. Raise OSError if the file does not exist."""
     return ReadLimit(path, path.stat().st_size, available_bytes())
 
 
 def available_bytes() -> int | None:
-    """Return the memory that is available to this process in bytes.
+    """Return the memory that is available to this process in bytes; None if the system states no limit.
 
-    This is the minimum of the available memory of the system, of its control groups (container or service limits) and
-    of the limits of the process (``ulimit -v``, ``ulimit -d``). None if the system states none of them.
+    The available memory is the minimum of the available memory of the system, of the control groups of the process
+    (container or service limits) and of the limits of the process (``ulimit -v``, ``ulimit -d``).
     """
-    known = [n for n in (system_bytes(), cgroup_bytes(), process_bytes()) if n is not None]
+    stated = (available_system_bytes(), available_cgroup_bytes(), available_process_bytes())
+    known = [n for n in stated if n is not None]
     return max(min(known), 0) if known else None
 
 
-def system_bytes(meminfo: Path = MEMINFO) -> int | None:
+def available_system_bytes(meminfo: Path = MEMINFO) -> int | None:
     """Return the available memory of the system in bytes; None if the system does not state it."""
-    found = _fields(meminfo, ":").get("MemAvailable")
+    found = _parse_fields(meminfo, ":").get("MemAvailable")
     return None if found is None else 1024 * found
 
 
-def cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int | None:
+def available_cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int | None:
     """Return the memory that the control groups of this process leave available, in bytes; None without a limit.
 
     Page cache counts as available, since the kernel drops it when the group reaches its limit.
@@ -133,7 +133,7 @@ def cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int | None:
     return min(left) if left else None
 
 
-def process_bytes(statm: Path = STATM) -> int | None:
+def available_process_bytes(statm: Path = STATM) -> int | None:
     """Return the bytes of address space and data that the limits of the process leave; None without a limit."""
     try:
         pages = [int(n) for n in statm.read_text().split()]
@@ -144,30 +144,6 @@ def process_bytes(statm: Path = STATM) -> int | None:
     limits = [(resource.getrlimit(kind)[0], page * used) for kind, used in taken]
     left = [limit - used for limit, used in limits if limit != resource.RLIM_INFINITY]
     return min(left) if left else None
-
-
-def check_memory(path: Path, needed_bytes: int, free: int | None) -> None:
-    """Check the size of samples against the available memory.
-
-    Parameters
-    ----------
-    path
-        File or folder that the message names.
-    needed_bytes
-        Size of the samples in bytes.
-    free
-        Available memory in bytes; None if it is unknown.
-
-    Raises
-    ------
-    ConfigError
-        The samples and the copies that an analysis makes of them do not fit.
-    """
-    if free is not None and COPIES * needed_bytes > free:
-        raise ConfigError(
-            f"{path}: more than {COPIES * needed_bytes / 1e9:.1f} GB of memory would be needed, {free / 1e9:.1f} GB "
-            f"are free; take the end of a folder with --last 1d, or split the file"
-        )
 
 
 def _cgroup_folders(own: Path, root: Path) -> Iterator[Path]:
@@ -196,14 +172,14 @@ def _left_in_cgroup(folder: Path) -> int | None:
     ):
         try:
             most, used = int((folder / limit).read_text()), int((folder / usage).read_text())
-        except (OSError, ValueError):  # no such file, or "max"
+        except (OSError, ValueError):  # the file does not exist, or its content is "max"
             continue
-        cached = _fields(folder / "memory.stat", " ")
+        cached = _parse_fields(folder / "memory.stat", " ")
         return most - used + sum(cached.get(f"{prefix}{kind}_file", 0) for kind in ("active", "inactive"))
     return None
 
 
-def _fields(path: Path, separator: str) -> dict[str, int]:
+def _parse_fields(path: Path, separator: str) -> dict[str, int]:
     """Return the whole numbers of a file of ``name value`` lines. Unreadable numbers are left out."""
     found: dict[str, int] = {}
     try:

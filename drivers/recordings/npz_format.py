@@ -1,8 +1,8 @@
 """Reading and writing of .npz recordings, with one array per column. ``fs`` (Hz) can replace ``t``.
 
 Arrays of Python objects are refused and never unpickled. The headers of all columns are checked against the limits of
-``drivers.recordings.memory_check`` before the data of any column are read. The index of a zip archive is at its end. In
-a truncated file, the arrays are therefore found by the header before each array.
+``drivers.recordings.memory_check`` before the data of a column are read. The index of a zip archive is at the end of
+the file. In a truncated file, the arrays are therefore found by the header before each array.
 """
 
 import io
@@ -32,14 +32,13 @@ from drivers.recordings import memory_check
 from drivers.recordings.table import (
     ALIASES,
     COLUMNS,
-    Append,
+    AppendColumns,
     Columns,
     Table,
     check_width,
     choose_columns,
     describe_content,
 )
-from drivers.sample import Floats
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
@@ -63,20 +62,23 @@ NPY_HEADER: Final = re.compile(
     rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
     re.DOTALL,
 )
-"""Header of a numeric array with one dimension or none, as every version of NumPy writes it. It is not evaluated."""
+"""Header of a numeric array with at most one dimension, as every version of NumPy writes it.
+
+The header is matched and not evaluated as Python.
+"""
 
 
-class _Archive(FileIO):
-    """File that refuses to be read in parts larger than MAX_INDEX_BYTES.
+class _BoundedFile(FileIO):
+    """File that refuses reads of more than MAX_INDEX_BYTES.
 
-    ``zipfile`` reads the whole index of an archive at once. It needs about 500 bytes of memory for an entry of 50
+    ``zipfile`` reads the whole index of an archive at once, and needs about 500 bytes of memory for an entry of 50
     bytes.
     """
 
     def read(self, size: int | None = -1, /) -> bytes:
         """Read up to ``size`` bytes."""
         if size is not None and size > MAX_INDEX_BYTES:
-            raise zipfile.BadZipFile(f"it has {size} bytes, expected at most {MAX_INDEX_BYTES}")
+            raise zipfile.BadZipFile(f"the index has {size} bytes, expected at most {MAX_INDEX_BYTES}")
         return super().read(size) or b""
 
 
@@ -94,55 +96,43 @@ class _Header:
         return math.prod(self.shape)
 
 
-def count_rows(path: Path) -> int:
-    """Return the number of rows that the headers of the columns state, without reading the columns.
-
-    Raises
-    ------
-    RecordingError, ConfigError
-        The file is not a .npz file, or exceeds a limit of ``drivers.recordings.memory_check``.
-    """
-    with _Archive(path) as file:
-        if not _has_index(path, file):
-            return 0  # a truncated archive is measured while it is read
-        with _open_archive(path, file) as archive:
-            return _checked_rows(path, archive, choose_columns(path, _keys(archive), []))
-
-
 def read_npz(path: Path) -> Table:
     """Read the known arrays of a .npz file. A truncated file is read up to the cut.
 
     Raises
     ------
     RecordingError
-        The file is not a .npz file, is damaged before its first number, or exceeds a limit.
+        If the file is not a .npz file, is damaged before its first number, or exceeds a limit.
     ConfigError
-        The samples do not fit into the memory.
+        If the samples do not fit into the memory.
     """
     notes: list[str] = []
-    with _Archive(path) as file:
+    with _BoundedFile(path) as file:
         if _has_index(path, file):
             with _open_archive(path, file) as archive:
-                chosen = choose_columns(path, _keys(archive), notes)
-                _checked_rows(path, archive, chosen)
-                columns = {name: _npz_column(path, archive, key) for name, key in chosen.items()}
-                return Table(columns, _npz_rate(path, archive, notes), notes)
+                chosen = choose_columns(path, _array_names(archive), notes)
+                _check_columns(path, archive, chosen)
+                with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite
+                    columns = {n: _read_array(path, archive, key).astype(np.float64) for n, key in chosen.items()}
+                return Table(columns, _read_fs(path, archive, notes), notes)
     arrays, cut = _recover_arrays(path)
     if not arrays:
         raise RecordingError(f"{path}: is damaged or cut off before its first number")
-    at = f" inside {cut}" if cut else ""
-    notes.append(f"The file is cut off{at} and was read up to the cut; later columns are missing.")
+    where = f" inside {cut}" if cut else ""
+    notes.append(f"The file is cut off{where} and was read up to the cut; later columns are missing.")
     return _table_of_recovered(path, arrays, cut, notes)
 
 
 def _has_index(path: Path, file: IO[bytes]) -> bool:
-    """Return True for a zip archive with its index, False for one without. Raise RecordingError for any other file."""
+    """Return True for a complete zip archive, False for an archive without index. Raise an error for any other file."""
     if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
-        raise RecordingError(f"{path}: is no .npz file (a zip archive with one array a column){describe_content(path)}")
+        raise RecordingError(
+            f"{path}: is no .npz file, which is a zip archive with one array per column{describe_content(path)}"
+        )
     file.seek(0)
-    whole = zipfile.is_zipfile(file)
+    complete = zipfile.is_zipfile(file)
     file.seek(0)
-    return whole
+    return complete
 
 
 def _open_archive(path: Path, file: IO[bytes]) -> zipfile.ZipFile:
@@ -153,57 +143,54 @@ def _open_archive(path: Path, file: IO[bytes]) -> zipfile.ZipFile:
         raise RecordingError(f"{path}: its index of arrays is damaged: {error}") from error
 
 
-def _keys(archive: zipfile.ZipFile) -> list[str]:
+def _array_names(archive: zipfile.ZipFile) -> list[str]:
     """Return the names of the arrays."""
     return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
-def _member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
+def _find_member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
     """Return the zip entry of an array."""
     names = archive.NameToInfo
     return names[key] if key in names else names[f"{key}.npy"]
 
 
-def _checked_rows(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str]) -> int:
-    """Return the rows of the longest column, after checking all columns against the file size and the memory."""
+def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str]) -> None:
+    """Check the headers of all columns against the file size and the memory."""
     limit = memory_check.read_limit(path)
-    rows = 0
     for key in chosen.values():
-        header = _header(path, archive, key)
+        header = _read_header(path, archive, key)
         if header.dtype.kind not in NUMERIC_KINDS:
-            raise RecordingError(f"{path}: {key} holds {_describe_dtype(header.dtype)}, not numbers")
+            raise RecordingError(f"{path}: {key} contains {_describe_dtype(header.dtype)}, expected numbers")
         if len(header.shape) != 1:
-            raise RecordingError(f"{path}: {key} has shape {header.shape}; a column has one dimension")
-        rows = max(rows, header.values)
-        limit.check_rows(rows)
-        _check_size(path, limit, _member(archive, key), key, header)
-    return rows
+            raise RecordingError(f"{path}: {key} has shape {header.shape}, expected one dimension")
+        limit.check_rows(header.values)
+        _check_size(path, limit, _find_member(archive, key), key, header)
 
 
 def _check_size(path: Path, limit: memory_check.ReadLimit, member: zipfile.ZipInfo, key: str, header: _Header) -> None:
     """Raise RecordingError if the member cannot hold the values that the header of its array states."""
     ratio = 1 if member.compress_type == zipfile.ZIP_STORED else MAX_DEFLATE_RATIO
     packed = min(member.compress_size, limit.size_bytes)
-    held = min(member.file_size, ratio * packed) - header.size_bytes
-    if header.values * header.dtype.itemsize > held:
+    data_bytes = max(min(member.file_size, ratio * packed) - header.size_bytes, 0)
+    if header.values * header.dtype.itemsize > data_bytes:
         raise RecordingError(
             f"{path}: {key} is unreadable: its header states {header.values} values, "
-            f"its data hold {max(held, 0) // max(header.dtype.itemsize, 1)} at most"
+            f"its data hold {data_bytes // max(header.dtype.itemsize, 1)} at most"
         )
 
 
-def _header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
+def _read_header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
     """Return the header of an array without reading its data."""
-    method = _member(archive, key).compress_type
+    method = _find_member(archive, key).compress_type
     if method not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # zipfile unpacks other methods without a limit
         raise RecordingError(
-            f"{path}: {key} is packed by method {method} of zip, expected stored or deflated, as NumPy writes them"
+            f"{path}: {key} is packed by method {method} of zip, expected stored or deflated as written by NumPy"
         )
-    with _member_errors(path, key), archive.open(_member(archive, key)) as member:
+    with _member_errors(path, key), archive.open(_find_member(archive, key)) as member:
         start = member.read(len(NPY_MAGIC) + 4)
         version, size_bytes = start[len(NPY_MAGIC) : len(NPY_MAGIC) + 2], 2
         if not start.startswith(NPY_MAGIC):
-            raise ValueError("it is no array in the format .npy")
+            raise ValueError("it is not an array in the format .npy")
         if version == b"\2\0":
             start += member.read(2)
             size_bytes = 4
@@ -213,10 +200,8 @@ def _header(path: Path, archive: zipfile.ZipFile, key: str) -> _Header:
         if size > MAX_HEADER_BYTES:
             raise ValueError(f"its header has {size} bytes, expected at most {MAX_HEADER_BYTES}")
         text = io.BytesIO(start[-size_bytes:] + member.read(size))
-        if size_bytes == 2:
-            shape, _, dtype = np.lib.format.read_array_header_1_0(text)
-        else:
-            shape, _, dtype = np.lib.format.read_array_header_2_0(text)
+        versioned = np.lib.format.read_array_header_1_0 if size_bytes == 2 else np.lib.format.read_array_header_2_0
+        shape, _, dtype = versioned(text)
         if min(shape, default=0) < 0:
             raise ValueError(f"its shape is {shape}")
         return _Header(shape, dtype, len(start) + size)
@@ -227,15 +212,9 @@ def _describe_dtype(dtype: np.dtype[Any]) -> str:
     return "Python objects" if dtype.hasobject else str(dtype)
 
 
-def _npz_column(path: Path, archive: zipfile.ZipFile, key: str) -> Floats:
-    """Return one column as float64. Its header has been checked."""
-    with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite, hence missing
-        return _npz_array(path, archive, key).astype(np.float64)
-
-
-def _npz_array(path: Path, archive: zipfile.ZipFile, key: str) -> NDArray[Any]:
-    """Return an array of numbers. An array of objects is refused, since reading it would execute code."""
-    with _member_errors(path, key), archive.open(_member(archive, key)) as member:
+def _read_array(path: Path, archive: zipfile.ZipFile, key: str) -> NDArray[Any]:
+    """Return an array of numbers. An array of objects is refused, since unpickling objects would execute code."""
+    with _member_errors(path, key), archive.open(_find_member(archive, key)) as member:
         return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
 
 
@@ -252,22 +231,22 @@ def _member_errors(path: Path, key: str) -> Iterator[None]:
         raise RecordingError(f"{path}: {key} is unreadable: {error}") from error
 
 
-def _npz_rate(path: Path, archive: zipfile.ZipFile, notes: list[str]) -> float | None:
+def _read_fs(path: Path, archive: zipfile.ZipFile, notes: list[str]) -> float | None:
     """Return ``fs`` of an archive in Hz; None if there is none."""
-    if "fs" not in _keys(archive):
+    if "fs" not in _array_names(archive):
         return None
-    header = _header(path, archive, "fs")
+    header = _read_header(path, archive, "fs")
     if header.dtype.hasobject:
-        raise RecordingError(f"{path}: fs holds Python objects, not numbers")
+        raise RecordingError(f"{path}: fs contains Python objects, expected a number")
     single = header.values == 1 and header.dtype.kind in NUMERIC_KINDS
-    return _single_rate(_npz_array(path, archive, "fs") if single else np.empty(0), notes)
+    return _single_number(_read_array(path, archive, "fs") if single else np.empty(0), notes)
 
 
-def _single_rate(fs: NDArray[Any], notes: list[str]) -> float | None:
+def _single_number(fs: NDArray[Any], notes: list[str]) -> float | None:
     """Return ``fs`` in Hz. Return None and add a note if it is not a single number."""
     if fs.size == 1 and fs.dtype.kind in NUMERIC_KINDS:
         return float(fs.item())
-    notes.append("fs is not one number of Hz and was left aside.")
+    notes.append("fs is not one number in Hz and is not used.")
     return None
 
 
@@ -280,21 +259,20 @@ def _table_of_recovered(path: Path, arrays: Mapping[str, NDArray[Any]], cut: str
     columns = {}
     for name, key in chosen.items():
         if arrays[key].ndim != 1:
-            raise RecordingError(f"{path}: {key} has shape {arrays[key].shape}; a column has one dimension")
+            raise RecordingError(f"{path}: {key} has shape {arrays[key].shape}, expected one dimension")
         columns[name] = arrays[key].astype(np.float64)
     short = next((name for name, key in chosen.items() if key == cut), None)
     if short is not None:
         column = columns[short]
         n = max(other.size for other in columns.values())
         columns[short] = np.concatenate([column, np.full(n - column.size, np.nan)])
-    return Table(columns, _single_rate(arrays["fs"], notes) if "fs" in arrays else None, notes)
+    return Table(columns, _single_number(arrays["fs"], notes) if "fs" in arrays else None, notes)
 
 
 def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
-    """Read the arrays of a truncated .npz by the header before each, since the index of a zip archive is at its end.
+    """Read the arrays of a truncated .npz file by the header before each array.
 
-    Return the arrays in order, and the name of the truncated array if there is one. Arrays with unknown names are
-    empty.
+    Return the arrays by name, and the name of the truncated array if there is one. Arrays with unknown names are empty.
     """
     limit = memory_check.read_limit(path)
     arrays: dict[str, NDArray[Any]] = {}
@@ -311,8 +289,8 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
             if packed == 0xFFFFFFFF and extra[:2] == b"\1\0" and len(extra) >= 20:  # ZIP64, APPNOTE 4.5.3
                 packed = int.from_bytes(extra[12:20], "little")
             start += extra_size
-            pieces = _MemberReader(data, start, method, packed, sized=not flags & 8)
-            array = _array_up_to_cut(pieces, limit, unpacked, wanted=key in KNOWN_KEYS)
+            pieces = _MemberReader(data, start, method, None if flags & 8 else packed)
+            array = _read_up_to_cut(pieces, limit, unpacked, wanted=key in KNOWN_KEYS)
             unpacked += pieces.unpacked
             if array is not None:
                 arrays[key] = array
@@ -323,15 +301,14 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
 
 
 class _MemberReader:
-    """Content of a zip member that starts at ``start``, in pieces.
+    """Iterator of the unpacked content of a zip member in pieces. The header of the member may lack the size.
 
-    ``end`` is the end of the member and is known after all pieces have been taken. It is None if the file is truncated
-    before the end.
+    ``end`` is the offset after the member. It is known after all pieces have been taken, and None if the file is
+    truncated inside the member.
     """
 
-    def __init__(self, data: mmap, start: int, method: int, size: int, *, sized: bool) -> None:
-        self._data, self._at, self._method = data, start, method
-        self._size = size if sized else None
+    def __init__(self, data: mmap, start: int, method: int, size: int | None) -> None:
+        self._data, self._at, self._method, self._size = data, start, method, size
         self.unpacked = 0
         self.end: int | None = None
 
@@ -365,31 +342,13 @@ class _MemberReader:
         self.end = self._at
 
 
-def _array_up_to_cut(
+def _read_up_to_cut(
     pieces: _MemberReader, limit: memory_check.ReadLimit, unpacked: int, *, wanted: bool
 ) -> NDArray[Any] | None:
-    """Return the numbers of a .npy member, fewer than its header states if the file is truncated.
+    """Return the numbers of a .npy member up to a truncation; None if the member is not an array.
 
-    Parameters
-    ----------
-    pieces
-        Content of the member.
-    limit
-        Limits on the file.
-    unpacked
-        Unpacked size of all earlier members in bytes.
-    wanted
-        False if only the end of the member has to be found. The array is then empty.
-
-    Returns
-    -------
-    ndarray or None
-        The array; None if the member is not an array.
-
-    Raises
-    ------
-    RecordingError, ConfigError
-        The array exceeds a limit.
+    ``unpacked`` is the unpacked size of all earlier members in bytes. If ``wanted`` is False, the array is empty, and
+    only the end of the member is searched.
     """
     raw = bytearray()
     header: re.Match[bytes] | None = None
@@ -397,7 +356,7 @@ def _array_up_to_cut(
     for part in pieces:
         limit.check_unpacked(unpacked + pieces.unpacked)
         if len(raw) >= most:
-            continue  # continue to the end to find the next member
+            continue  # the next member begins after the last piece
         raw += part
         if header is None and (header := NPY_HEADER.match(raw)) is not None:
             header = NPY_HEADER.match(bytes(raw[: header.end()]))
@@ -408,17 +367,17 @@ def _array_up_to_cut(
             limit.check_rows(min(n, (len(raw) - header.end()) // dtype.itemsize))
     if header is None:
         return None
-    whole = (len(raw) - header.end()) // dtype.itemsize if wanted else 0
-    array = np.frombuffer(raw, dtype, min(n, whole), header.end())
+    complete = (len(raw) - header.end()) // dtype.itemsize if wanted else 0
+    array = np.frombuffer(raw, dtype, min(n, complete), header.end())
     return array if header["n"] or not array.size else array.reshape(())
 
 
 @contextmanager
-def npz_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
+def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[AppendColumns]:
     """Write a compressed .npz file.
 
-    An archive contains one array after the other, so columns are collected in temporary files without a name. These
-    need 8 bytes per number in the folder of ``path`` while it is written.
+    An archive contains one array after the other. The columns are therefore collected in unnamed temporary files, which
+    need 8 bytes per number in the folder of ``path``.
 
     Parameters
     ----------
@@ -428,16 +387,16 @@ def npz_writer(path: Path, names: Sequence[str]) -> Iterator[Append]:
         Names of the columns.
     """
     with ExitStack() as stack:
-        gathered = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}
+        collected = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}
 
         def append(columns: Columns) -> None:
             """Append rows to the temporary files."""
-            for name, file in gathered.items():
+            for name, file in collected.items():
                 file.write(np.ascontiguousarray(columns[name]).data)
 
         yield append
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-            for name, file in gathered.items():
+            for name, file in collected.items():
                 _write_array(archive, name, file)
 
 

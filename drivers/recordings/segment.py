@@ -1,14 +1,15 @@
-"""Segments: the recording files of the daemon. They are Arrow IPC streams that are appended to while samples arrive.
+"""Segments: the recording files of the daemon. A segment is an Arrow IPC stream that grows while samples arrive.
 
-The folder of a device holds segments such as ``00000042_2026-11-22T03-00-00Z.arrows``. The number gives their order,
-whatever the clock of the host did. The time is that of the first row, for the user. The columns are ``t`` (Unix time in
-s), six axes and ``temperature``. The columns ``ticks`` and ``lost`` (samples missing just before the row) allow the
-daemon to continue from a segment. Every batch contains the state of the daemon at its end (``DaemonState``). A segment
-of raw bytes holds chunks as they were received: ``t_ns`` (Unix time), ``address``, ``data``, ``attachment``.
+The folder of a device contains segments such as ``00000042_2026-11-22T03-00-00Z.arrows``. The number gives the order of
+the segments and does not depend on the clock of the host. The time in the name is the time of the first sample. The
+columns are ``t`` (Unix time in s), six axes and ``temperature``. With the columns ``ticks`` and ``lost`` (samples
+missing just before the row), the daemon can continue from a segment. Every batch contains the state of the daemon after
+the batch (``DaemonState``). A segment of raw bytes contains chunks as they were received, with the columns ``t_ns``
+(Unix time), ``address``, ``data`` and ``attachment``.
 
-A growing segment is not compressed, so that each batch can be read on its own. It can be read up to its last complete
-batch. A segment that has ended is written again in large compressed batches. The new file replaces the old one
-completely or not at all.
+A growing segment is not compressed, so that each batch can be read on its own. The segment can be read up to its last
+complete batch. A segment that has ended is written again in large compressed batches. The new file replaces the old
+file completely or not at all.
 """
 
 import errno
@@ -17,6 +18,7 @@ import os
 import re
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from itertools import pairwise
@@ -29,8 +31,8 @@ import numpy as np
 from drivers.errors import ImuError, RecordingError
 from drivers.file_access import open_regular
 from drivers.quantities import COUNTER_STEP, RATE_HZ
-from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, import_pyarrow
-from drivers.recordings.arrow_messages import batch_sizes
+from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, first_line, import_pyarrow
+from drivers.recordings.arrow_messages import iter_batch_sizes
 from drivers.recordings.memory_check import ROW_BYTES
 from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S
 from drivers.sample import AXES, Chunk, SampleBlock, concatenate_blocks, make_block, ns_to_seconds, seconds_to_ns
@@ -42,7 +44,7 @@ RAW_BATCH_BYTES: Final = 4_000_000
 MAX_BATCH_BYTES: Final = 64_000_000
 """Maximum unpacked size of a batch, far above what ``SegmentWriter`` and ``compress_segment`` write."""
 MAX_LOST_SAMPLES: Final = 10**11
-"""Maximum number of samples missing at one place, more than any clock reports."""
+"""Maximum number of consecutive missing samples. No clock reports a larger number."""
 
 Kind = Literal["samples", "raw"]
 
@@ -52,7 +54,7 @@ class SegmentMetadata(msgspec.Struct, frozen=True):
 
     device: str
     kind: Kind
-    axes: str = ""  # mounting of the sensor; samples of another mounting do not continue these
+    axes: str = ""  # mounting of the sensor; samples of another mounting begin a new recording
     carrier: str = ""  # for raw bytes: the carrier that their decoder reads
     decoder: str = ""
     packed: bool = False  # True if the segment has been written again with compression
@@ -60,7 +62,7 @@ class SegmentMetadata(msgspec.Struct, frozen=True):
 
 
 class DaemonState(msgspec.Struct, frozen=True):
-    """State of the daemon at the end of a batch, from which a later run continues."""
+    """State of the daemon at the end of a batch. A later run continues from the state."""
 
     rate: float | None = None  # Hz
     since: tuple[float | None, ...] = (None,) * 6
@@ -85,14 +87,14 @@ class SegmentWriter:
     Parameters
     ----------
     path
-        New file. It appears with its first batch.
+        New file, which appears with its first batch.
     origin
         Source of the data.
 
     Raises
     ------
     OSError
-        Writing to the disk failed. Every method can raise it. Batches that were complete stay readable.
+        If writing to the disk failed. Every method can raise this error. Complete batches stay readable.
     """
 
     def __init__(self, path: Path, origin: SegmentMetadata) -> None:
@@ -106,7 +108,7 @@ class SegmentWriter:
         self._writer = self._pa.ipc.new_stream(self._file, self._schema)
         self._valid_bytes = 0  # length in bytes of all complete batches
 
-    def samples(self, blocks: Sequence[SampleBlock], state: DaemonState) -> None:
+    def write_samples(self, blocks: Sequence[SampleBlock], state: DaemonState) -> None:
         """Write one batch of samples.
 
         Parameters
@@ -116,11 +118,11 @@ class SegmentWriter:
         state
             State of the daemon after these samples.
         """
-        self._write(_sample_batch(self._pa, self._schema, blocks), {b"state": msgspec.json.encode(state)})
+        self._write_batch(_sample_batch(self._pa, self._schema, blocks), {b"state": msgspec.json.encode(state)})
 
-    def chunks(self, chunks: Sequence[Chunk]) -> None:
+    def write_chunks(self, chunks: Sequence[Chunk]) -> None:
         """Write one batch of chunks whose ``t_ns`` are Unix times."""
-        self._write(_chunk_batch(self._pa, self._schema, chunks), None)
+        self._write_batch(_chunk_batch(self._pa, self._schema, chunks), None)
 
     def sync(self) -> None:
         """Flush the written data to the disk, so that they survive a power failure."""
@@ -154,7 +156,7 @@ class SegmentWriter:
             if not self._valid_bytes:
                 self._temporary_path.unlink(missing_ok=True)
 
-    def _write(self, batch: Any, meta: dict[bytes, bytes] | None) -> None:
+    def _write_batch(self, batch: Any, meta: dict[bytes, bytes] | None) -> None:
         """Write one batch. After an error, truncate the file to its complete batches."""
         try:
             self._writer.write_batch(batch, custom_metadata=meta)
@@ -165,7 +167,7 @@ class SegmentWriter:
             raise
         if not self._valid_bytes:
             if os.path.lexists(self.path):
-                raise FileExistsError(errno.EEXIST, f"{self.path.name} is there already", str(self.path))
+                raise FileExistsError(errno.EEXIST, f"{self.path.name} exists already", str(self.path))
             os.rename(self._temporary_path, self.path)
             _sync_folder(self.path.parent)
         self._valid_bytes = self._file.tell()
@@ -211,58 +213,42 @@ def list_segments(folder: Path) -> list[Path]:
 
 
 def segment_number(path: Path) -> int:
-    """Return the number of a segment in its folder; 0 if the name is not that of a segment."""
+    """Return the number of a segment in its folder; 0 if the file name is not the name of a segment."""
     found = NAME.fullmatch(path.name)
     return int(found[1]) if found else 0
 
 
 def read_metadata(path: Path) -> SegmentMetadata:
-    """Return the source of the data in a segment.
-
-    Raises
-    ------
-    RecordingError
-        The file is not a segment.
-    """
+    """Return the source of the data in a segment. Raise RecordingError if the file is not a segment."""
     pa = import_pyarrow(path)
     with _arrow_errors(path), open_regular(path) as file:
-        return _origin(path, pa.ipc.open_stream(file).schema)
+        return _check_schema(path, pa.ipc.open_stream(file).schema)
 
 
 def read_last_piece(path: Path) -> SegmentPiece | None:
     """Read the last piece of a segment that is no longer written; None if the segment is empty.
 
-    The file is mapped into memory, so that the other batches are not read.
-
-    Raises
-    ------
-    RecordingError
-        The file is not a segment.
+    The file is mapped into memory, so that the other batches are not read. The function raises RecordingError if the
+    file is not a segment.
     """
-    last = deque(_batches(path, "samples", mapped=True), maxlen=1)
-    pieces = [piece for batch in last for piece in _pieces(*batch)]
+    last = deque(_read_batches(path, "samples", mapped=True), maxlen=1)
+    pieces = [piece for batch in last for piece in _split_batch(*batch)]
     return pieces[-1] if pieces else None
 
 
 def read_samples(path: Path) -> Iterator[SegmentPiece]:
-    """Yield the pieces of a segment of samples, up to a truncation.
-
-    Raises
-    ------
-    RecordingError
-        The file is not a segment of samples.
-    """
-    for batch, meta in _batches(path, "samples"):
-        yield from _pieces(batch, meta)
+    """Yield the pieces of a segment up to a truncation. Raise RecordingError if the file contains no samples."""
+    for batch, meta in _read_batches(path, "samples"):
+        yield from _split_batch(batch, meta)
 
 
-def _pieces(batch: Any, meta: Any) -> Iterator[SegmentPiece]:
+def _split_batch(batch: Any, meta: Any) -> Iterator[SegmentPiece]:
     """Yield the samples of a batch, split where samples are missing. Yield nothing if the values are implausible."""
     columns = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
     values = np.column_stack([columns[axis] for axis in AXES])
     if not _is_plausible(columns) or np.isinf(values).any():
         return
-    state = _state(meta)
+    state = _decode_state(meta)
     rows = make_block(seconds_to_ns(columns["t"]), values, columns["temperature"].copy(), columns["ticks"].copy())
     lost = columns["lost"]
     edges = [0, *(np.flatnonzero(lost[1:]) + 1).tolist(), len(rows)]
@@ -281,7 +267,7 @@ def _is_plausible(columns: Mapping[str, Any]) -> bool:
     return bool(whole and (np.abs(columns["t"]) < T_LIMIT_S).all() and ((lost >= 0) & (lost <= MAX_LOST_SAMPLES)).all())
 
 
-def _state(meta: Any) -> DaemonState:
+def _decode_state(meta: Any) -> DaemonState:
     """Return the state in the metadata of a batch; an empty state if it cannot be read."""
     try:
         found = msgspec.json.decode(meta.get(b"state", b"{}"), type=DaemonState) if meta else DaemonState()
@@ -294,14 +280,11 @@ def _state(meta: Any) -> DaemonState:
 
 
 def read_chunks(path: Path) -> Iterator[Chunk]:
-    """Yield the chunks of a raw segment, up to a truncation. ``t_ns`` are Unix times.
+    """Yield the chunks of a segment up to a truncation. ``t_ns`` are Unix times.
 
-    Raises
-    ------
-    RecordingError
-        The file is not a segment of raw bytes.
+    The function raises RecordingError if the file is not a segment of raw bytes.
     """
-    for batch, _ in _batches(path, "raw"):
+    for batch, _ in _read_batches(path, "raw"):
         for start in range(0, batch.num_rows, BATCH_ROWS):
             part = batch.slice(start, BATCH_ROWS)
             columns = (part.column(name).to_pylist() for name in ("t_ns", "address", "data", "attachment"))
@@ -311,16 +294,16 @@ def read_chunks(path: Path) -> Iterator[Chunk]:
 
 
 def compress_segment(path: Path) -> Iterator[None]:
-    """Write a segment that has ended again with compression, and replace the original at the end.
+    """Replace a segment that has ended by a compressed copy.
 
     The generator yields after each batch, so that the caller can spread the work.
 
     Raises
     ------
     RecordingError
-        The file is not a segment.
+        If the file is not a segment.
     OSError
-        The disk is full. The original segment is unchanged.
+        If the disk is full. The original segment is then unchanged.
     """
     pa = import_pyarrow(path)
     own = read_metadata(path)
@@ -345,11 +328,11 @@ def compress_segment(path: Path) -> Iterator[None]:
 
 def _sync_folder(folder: Path) -> None:
     """Flush the entries of a folder to the disk. Otherwise a power failure can remove a new file."""
-    place = os.open(folder, os.O_RDONLY)
+    descriptor = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(place)
+        os.fsync(descriptor)
     finally:
-        os.close(place)
+        os.close(descriptor)
 
 
 def _merged_batches(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tuple[Any, dict[bytes, bytes] | None]]:
@@ -357,37 +340,37 @@ def _merged_batches(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tu
     waiting: list[Any] = []
     rows = size = 0
     meta: dict[bytes, bytes] | None = None
-    for batch, found in _batches(path, kind):
+    for batch, found in _read_batches(path, kind):
         waiting.append(batch)
         rows, size = rows + batch.num_rows, size + batch.nbytes
         meta = {b"state": found[b"state"]} if found and b"state" in found else meta
         if rows >= BATCH_ROWS or size >= RAW_BATCH_BYTES:
-            yield _combine(pa, schema, waiting), meta
+            yield _combine_batches(pa, schema, waiting), meta
             waiting, rows, size = [], 0, 0
     if waiting:
-        yield _combine(pa, schema, waiting), meta
+        yield _combine_batches(pa, schema, waiting), meta
 
 
-def _combine(pa: Any, schema: Any, batches: list[Any]) -> Any:
+def _combine_batches(pa: Any, schema: Any, batches: list[Any]) -> Any:
     """Combine batches into one."""
     table = pa.Table.from_batches(batches).combine_chunks()
     return pa.RecordBatch.from_arrays([column.chunk(0) for column in table.columns], schema=schema)
 
 
-def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any, Any]]:
+def _read_batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any, Any]]:
     """Yield batches with their metadata, up to a truncation or a batch with an implausible size.
 
     If ``mapped`` is True, the file is mapped into memory, so that unused rows are not read from the disk.
     """
     pa = import_pyarrow(path)
-    # The file is opened only once, because the daemon may replace it by a packed one meanwhile.
+    # The file is opened only once, because the daemon may replace it by a compressed file meanwhile.
     with _arrow_errors(path), open_regular(path) as file:
-        count = _regular_batches(file)
+        count = _count_regular_batches(file)
         file.seek(0)
         reader = pa.ipc.open_stream(_memory_map(pa, file) if mapped else file)
-        found = _origin(path, reader.schema)
+        found = _check_schema(path, reader.schema)
         if found.kind != kind:
-            raise RecordingError(f"{path}: a segment of {found.kind}, where one of {kind} is read")
+            raise RecordingError(f"{path}: is a segment of {found.kind}, expected a segment of {kind}")
         for _ in range(count):
             try:
                 batch, meta = reader.read_next_batch_with_custom_metadata()
@@ -398,10 +381,10 @@ def _batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any
                 yield batch, meta
 
 
-def _regular_batches(file: IO[bytes]) -> int:
+def _count_regular_batches(file: IO[bytes]) -> int:
     """Return the number of batches before the first one whose stated size the daemon would not write."""
     count = 0
-    for size in batch_sizes(file):
+    for size in iter_batch_sizes(file):
         large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
         if large or size.dictionary:  # the daemon writes no dictionaries
             break
@@ -416,34 +399,33 @@ def _memory_map(pa: Any, file: IO[bytes]) -> Any:
     return pa.BufferReader(pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
 
 
-class _arrow_errors:  # noqa: N801 - used like a function
-    """Context that raises Arrow's errors as RecordingError."""
+@contextmanager
+def _arrow_errors(path: Path) -> Iterator[None]:
+    """Raise the errors of pyarrow and msgspec for a file that is not a segment as RecordingError."""
+    try:
+        yield
+    except ImuError:
+        raise
+    except OSError as error:
+        if error.errno in (errno.EINVAL, errno.EISDIR):  # not a regular file
+            raise RecordingError(f"{path}: {error.strerror}") from error
+        if error.errno is not None:
+            raise
+        raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
+    except (import_pyarrow(path).ArrowException, UnicodeDecodeError, RecursionError, msgspec.DecodeError) as error:
+        raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
 
-    def __enter__(self) -> None: ...
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _trace: object) -> None:
-        unread = UnicodeDecodeError | RecursionError | msgspec.DecodeError
-        if isinstance(error, OSError) and error.errno in (errno.EINVAL, errno.EISDIR):  # not a regular file
-            raise RecordingError(f"{self._path}: {error.strerror}") from error
-        nonsense = isinstance(error, OSError) and error.errno is None and not isinstance(error, ImuError)
-        if nonsense or isinstance(error, import_pyarrow(self._path).ArrowException | unread):
-            first = str(error).strip().partition("\n")[0]
-            raise RecordingError(f"{self._path}: is no segment of a recording ({first})") from error
-
-
-def _origin(path: Path, schema: Any) -> SegmentMetadata:
+def _check_schema(path: Path, schema: Any) -> SegmentMetadata:
     """Return the source of a segment from its schema. Raise RecordingError if it is not a segment."""
     meta = (schema.metadata or {}).get(METADATA_KEY)
     if meta is None:
-        raise RecordingError(f"{path}: is no segment of a recording: nothing says which device it is of")
+        raise RecordingError(f"{path}: is no segment of a recording: it does not state its device")
     found = msgspec.json.decode(meta, type=SegmentMetadata)
     if found.schema != SCHEMA:
         raise RecordingError(f'{path}: schema "{found.schema[:64]}" is not {SCHEMA}')
     if not schema.equals(_schema(import_pyarrow(path), found), check_metadata=False):
-        raise RecordingError(f"{path}: is no segment of a recording: its columns are others")
+        raise RecordingError(f"{path}: is no segment of a recording: its columns differ")
     return found
 
 

@@ -1,6 +1,6 @@
-"""Types that readers and writers of recordings share, and the choice of columns by their names.
+"""The table that a reader returns, the function that a writer yields, and the selection of known columns.
 
-A reader returns a ``Table``: the known columns by name, the rate that the file states, and notes.
+Every format module uses these definitions.
 """
 
 from collections import Counter
@@ -19,13 +19,13 @@ COLUMNS: Final = ("t", *AXES, "temperature")
 """Names of the known columns."""
 
 ALIASES: Final = {"temp": "temperature"}
-"""Other names under which files may contain a known column."""
+"""Alternative names of known columns."""
 
 EXAMPLE_HEADER: Final = "t,gx,gy,gz,ax,ay,az"
 """Header line that error messages show as an example."""
 
 BATCH_ROWS: Final = 1 << 16
-"""Number of rows written at a time. A truncated Arrow file loses at most this many."""
+"""Number of rows written at a time. A truncated Arrow file loses at most this number of rows."""
 
 T_LIMIT_S: Final = 4.6e9
 """Largest absolute time in s. The difference of two times fits into int64 nanoseconds, 9.22e9 s.
@@ -39,10 +39,10 @@ PARTIAL_SUFFIX: Final = ".part"
 Columns = Mapping[str, Floats]
 """Columns as float64 arrays [n] of equal length, by their names in COLUMNS."""
 
-Append = Callable[[Columns], None]
+AppendColumns = Callable[[Columns], None]
 """Function that appends rows to a file that is being written."""
 
-Writer = Callable[[Path, Sequence[str]], AbstractContextManager[Append]]
+OpenWriter = Callable[[Path, Sequence[str]], AbstractContextManager[AppendColumns]]
 """Function that begins a file with columns of these names. The file is complete when the context has been left."""
 
 
@@ -68,17 +68,16 @@ def check_width(path: Path, columns: int) -> None:
     Raises
     ------
     RecordingError
-        The file has more columns than any recording.
+        If the file has more columns than any recording.
     """
     if columns > memory_check.MAX_COLUMNS:
         raise RecordingError(
-            f"{path}: has {columns} columns, expected at most {memory_check.MAX_COLUMNS}; keep those of the recording: "
-            f"{' '.join(COLUMNS)}"
+            f"{path}: has {columns} columns, expected at most {memory_check.MAX_COLUMNS}; keep only {' '.join(COLUMNS)}"
         )
 
 
 def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: str = "") -> dict[str, str]:
-    """Choose the known columns of a file.
+    """Select the known columns of a file.
 
     Parameters
     ----------
@@ -89,7 +88,7 @@ def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: st
     notes
         List to which a note about unused columns is appended.
     where
-        Place of the names in the file, such as " in line 3".
+        Position of the names in the file, such as " in line 3".
 
     Returns
     -------
@@ -99,13 +98,13 @@ def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: st
     Raises
     ------
     RecordingError
-        There is no axis among the columns, a known column occurs twice, or there are too many columns.
+        If there is no axis among the columns, a known column occurs twice, or there are too many columns.
     """
     check_width(path, len(names))
     known = {*COLUMNS, *ALIASES}
-    twice = sorted(name for name, count in Counter(names).items() if count > 1 and name in known)
-    if twice:
-        raise RecordingError(f"{path}: column {twice[0]} occurs twice; each may occur once")
+    repeated = sorted(name for name, count in Counter(names).items() if count > 1 and name in known)
+    if repeated:
+        raise RecordingError(f"{path}: column {repeated[0]} occurs twice; each may occur once")
     chosen = {name: name for name in COLUMNS if name in names}
     for alias, name in ALIASES.items():
         if alias in names:
@@ -118,7 +117,7 @@ def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: st
     used = {*chosen.values(), "fs"}
     others = [name for name in names if name not in used]
     if others:
-        notes.append(f"Other columns were left aside: {format_names(others)}.")
+        notes.append(f"Other columns are not used: {format_names(others)}.")
     return chosen
 
 
@@ -135,7 +134,7 @@ CONTENTS: Final = (
     (b"\x89PNG", "a picture", ()),
     (b"%PDF", "a PDF document", ()),
 )
-"""First bytes of files, the kind of such a file, and the suffixes under which a reader expects it."""
+"""First bytes of a file, the content that they indicate, and the suffixes of recordings with this content."""
 
 
 def describe_content(path: Path) -> str:

@@ -1,7 +1,7 @@
-"""Writing of recordings. Rows are appended to a file that appears complete or not at all.
+"""Writing of recordings. A file appears complete or not at all.
 
-A file is written under a temporary name and renamed when it is complete. If a run fails or is interrupted (Ctrl-C), it
-leaves no file behind, and an existing file of that name stays unchanged. Memory does not grow with the number of rows.
+A file is written under a temporary name and renamed when it is complete. If writing fails or is interrupted (Ctrl-C),
+the temporary file is removed, and an existing recording stays unchanged. Memory does not grow with the number of rows.
 """
 
 import os
@@ -42,7 +42,7 @@ def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) ->
     Parameters
     ----------
     path
-        File to write. It appears when the context is left without an exception.
+        File to write. The file appears when the context is left without an exception.
     axes
         Columns to write, some of AXES.
     temperature
@@ -51,20 +51,20 @@ def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) ->
     Raises
     ------
     ConfigError
-        The suffix is unknown, or the file cannot be written there.
+        If the suffix is unknown, or the file cannot be written.
     RecordingError
-        An axis is unknown, the arrays have different lengths, or a time is missing.
+        If an axis is unknown, the arrays have different lengths, or a time is missing.
     """
     unknown = [axis for axis in axes if axis not in AXES]
     if unknown or not axes:
         what = f"unknown axis {format_names(unknown)}" if unknown else "no axis has a value"
         raise RecordingError(f"{path}: {what}; axes are {' '.join(AXES)}")
-    begin = format_for_path(path).writer
+    open_writer = format_for_path(path).open_writer
     names = ["t", *axes, *(["temperature"] if temperature else [])]
-    with atomic_write_path(path) as part, begin(part, names) as append_columns:
+    with atomic_write_path(path) as part, open_writer(part, names) as append_columns:
 
         def append(t_s: Floats, values: Floats, temperature_c: Floats | None = None) -> None:
-            _check(path, t_s, values, temperature_c)
+            _check_arrays(path, t_s, values, temperature_c)
             table = {"t": t_s} | {axis: values[:, AXES.index(axis)] for axis in axes}
             if temperature:
                 table["temperature"] = np.full(len(t_s), np.nan) if temperature_c is None else temperature_c
@@ -85,7 +85,7 @@ def save_samples(
     Parameters
     ----------
     path
-        File to write. It appears complete or not at all.
+        File to write. The file appears complete or not at all.
     t_s
         [n] float64, times in s.
     values
@@ -98,11 +98,11 @@ def save_samples(
     Raises
     ------
     ConfigError
-        The suffix is unknown, or the file cannot be written there.
+        If the suffix is unknown, or the file cannot be written.
     RecordingError
-        The arrays have different lengths, an axis is unknown, or a time is missing.
+        If the arrays have different lengths, an axis is unknown, or a time is missing.
     """
-    _check(path, t_s, values, temperature_c)
+    _check_arrays(path, t_s, values, temperature_c)
     if axes is None:
         axes = [axis for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()]
     temperature = temperature_c is not None and not np.isnan(temperature_c).all()
@@ -117,11 +117,11 @@ def atomic_write_path(path: Path) -> Iterator[Path]:
     Raises
     ------
     ConfigError
-        The folder does not exist, ``path`` is a folder, or writing is not permitted.
+        If the folder does not exist, ``path`` is a folder, or writing is not permitted.
     """
     if not path.parent.is_dir():
         raise ConfigError(f"{path}: cannot be written: there is no folder {path.parent}")
-    if path.is_dir():  # report this before the work rather than after it
+    if path.is_dir():  # report the error before the work rather than after it
         raise ConfigError(f"{path}: cannot be written: it is a folder")
     part = path.with_name(path.name + PARTIAL_SUFFIX)
     try:
@@ -142,12 +142,12 @@ def atomic_write_path(path: Path) -> Iterator[Path]:
         part.unlink(missing_ok=True)
 
 
-def _check(path: Path, t_s: Floats, values: Floats, temperature_c: Floats | None) -> None:
+def _check_arrays(path: Path, t_s: Floats, values: Floats, temperature_c: Floats | None) -> None:
     """Raise RecordingError if arrays have different lengths or a time is missing."""
     n = len(t_s)
     if n == 0 or values.shape != (n, len(AXES)):
-        raise RecordingError(f"{path}: {n} times do not fit values of shape {values.shape}; need [n, 6], n ≥ 1")
+        raise RecordingError(f"{path}: {n} times and values of shape {values.shape}, expected shape [n, 6] with n ≥ 1")
     if temperature_c is not None and temperature_c.shape != (n,):
-        raise RecordingError(f"{path}: {n} times do not fit {temperature_c.size} temperatures")
+        raise RecordingError(f"{path}: {n} times and {temperature_c.size} temperatures, expected equal numbers")
     if not np.all(np.abs(t_s) < T_LIMIT_S):
         raise RecordingError(f"{path}: a time is missing or not in seconds")

@@ -1,9 +1,9 @@
 """Causes of connection errors. zenoh itself only reports that it could not connect.
 
-The input is an endpoint and the configuration of the attempt. The result is one line, or "" if no program listens at
-the endpoint or if its protocol cannot be tested (QUIC, UDP). The test repeats the first steps of zenoh: a connection
-and, for TLS, the handshake with the same certificates. The reasons are therefore those of the failure itself. Nothing
-is sent after the handshake. The test can wait for ``timeout_s`` twice and must not be used in the path of the samples.
+``explain_refusal`` tests an endpoint with the configuration of the failed attempt. The test repeats the first steps of
+zenoh: a connection and, for TLS, the handshake with the same certificates. Nothing is sent after the handshake. The
+result is one line, or "" if no program listens at the endpoint or its protocol cannot be tested (QUIC, UDP). The test
+can wait for ``timeout_s`` twice, and must not delay samples.
 """
 
 import json
@@ -14,20 +14,22 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.credential_masking import mask_secrets
+from drivers.errors import describe_error
 
 if TYPE_CHECKING:
     import zenoh
 
 TIMEOUT_S: Final = 2.0
-LOGIN_REFUSED: Final = "answers, but lets us not in: check user and password"
-"""Reason that remains if connection and handshake succeed."""
+LOGIN_REFUSED: Final = "answers, but refuses the login: check user and password"
+"""Only remaining reason if connection and handshake succeed."""
+UNKNOWN_AUTHORITY: Final = "does not accept our certificate: it is not signed by its authority"
 _ENDPOINT: Final = re.compile(r"(tcp|tls|ws|wss)/\[?([^\]?#]+?)\]?:(\d+)(?:[?#].*)?")
 _TLS_REASONS: Final = {
-    "CERTIFICATE_REQUIRED": "wants a certificate of ours: set connect_certificate and connect_private_key",
-    "UNKNOWN_CA": "does not accept our certificate: it is not signed by its authority",
+    "CERTIFICATE_REQUIRED": "requires a certificate of ours: set connect_certificate and connect_private_key",
+    "UNKNOWN_CA": UNKNOWN_AUTHORITY,
     "CERTIFICATE_EXPIRED": "does not accept our certificate: it has expired",
     "BAD_CERTIFICATE": "does not accept our certificate",
-    "DECRYPT_ERROR": "does not accept our certificate: it is not signed by its authority",
+    "DECRYPT_ERROR": UNKNOWN_AUTHORITY,
     "WRONG_VERSION_NUMBER": "speaks no TLS",
     "UNEXPECTED_EOF_WHILE_READING": "speaks no TLS",
 }
@@ -67,7 +69,7 @@ def explain_refusal(endpoint: str, config: "zenoh.Config", timeout_s: float = TI
         with socket.create_connection((host, int(port)), timeout_s) as plain:
             if protocol not in ("tls", "wss"):
                 return LOGIN_REFUSED
-            return _handshake(plain, host, config)
+            return _explain_handshake_failure(plain, host, config)
     except ConnectionRefusedError:
         return ""
     except socket.gaierror:
@@ -75,22 +77,22 @@ def explain_refusal(endpoint: str, config: "zenoh.Config", timeout_s: float = TI
     except TimeoutError:
         return "does not answer"
     except OSError as error:
-        return f"cannot be reached: {error.strerror or error}"
+        return f"cannot be reached: {describe_error(error)}"
 
 
-def _handshake(plain: socket.socket, host: str, config: "zenoh.Config") -> str:
+def _explain_handshake_failure(plain: socket.socket, host: str, config: "zenoh.Config") -> str:
     """Perform the TLS handshake and return the reason for its failure."""
     try:
-        context = _context(json.loads(config.get_json("transport/link/tls")))
+        context = _tls_context(json.loads(config.get_json("transport/link/tls")))
     except (OSError, ssl.SSLError) as error:
-        return f"our certificates cannot be read: {getattr(error, 'strerror', None) or error}"
+        return f"our certificates cannot be read: {describe_error(error)}"
     try:
         with context.wrap_socket(plain, server_hostname=host) as secure:
             secure.recv(1)  # in TLS 1.3 a refusal of our certificate is sent after the handshake
     except TimeoutError:
         return LOGIN_REFUSED  # the other side waits for zenoh's first message
     except ssl.SSLCertVerificationError as error:
-        return f"its certificate does not hold: {error.verify_message}"
+        return f"its certificate is not valid: {error.verify_message}"
     except ssl.SSLError as error:
         reason = error.reason or ""
         return next((text for word, text in _TLS_REASONS.items() if word in reason), f"refuses TLS: {reason.lower()}")
@@ -99,7 +101,7 @@ def _handshake(plain: socket.socket, host: str, config: "zenoh.Config") -> str:
     return LOGIN_REFUSED
 
 
-def _context(tls: dict[str, Any]) -> ssl.SSLContext:
+def _tls_context(tls: dict[str, Any]) -> ssl.SSLContext:
     """Return the TLS context that zenoh creates from these settings."""
     context = ssl.create_default_context(cafile=tls.get("root_ca_certificate"))
     context.check_hostname = tls.get("verify_name_on_connect") is not False

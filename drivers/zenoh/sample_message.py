@@ -1,13 +1,13 @@
 """Message format of samples: conversion between ``SampleBlock`` and the msgpack map of ``<prefix>/<device>/samples``.
 
-Only this module knows the layout. The daemon publishes with ``encode_samples``, the ``samples`` decoder reads with
-``decode_samples``, and a replayed recording uses the same message. The format is documented in
-``docs/samples-format.md``.
+The layout is defined only in this module. The daemon publishes with ``encode_samples``, the ``samples`` decoder reads
+with ``decode_samples``, and a replayed recording uses the same message. ``docs/samples-format.md`` documents the
+format.
 
-If the rows are evenly spaced to within half a microsecond, ``t`` is the Unix time of the newest sample in seconds,
-``t0`` that of the first sample, and ``rate`` the sample rate in Hz. Otherwise ``t`` holds the time of each row as
-little-endian float64. A float64 of Unix seconds resolves 0.24 µs. Unknown keys and columns are ignored. Sizes are
-limited and must agree, otherwise a ``DecodeError`` is raised.
+If the samples are evenly spaced to within half a microsecond, ``t`` is the Unix time of the newest sample in seconds,
+``t0`` the Unix time of the first sample, and ``rate`` the sample rate in Hz. Otherwise ``t`` contains the time of each
+sample as little-endian float64. The resolution of Unix seconds as float64 is 0.24 µs. Unknown keys and columns are
+ignored. Sizes are limited and must be consistent, otherwise a ``DecodeError`` is raised.
 """
 
 from collections.abc import Sequence
@@ -30,14 +30,14 @@ MAX_ROWS: Final = 1_000_000
 MAX_COLUMNS: Final = 64
 MAX_BYTES: Final = 1 << 26  # a million rows of seven columns
 MAX_GRID_DEVIATION_NS: Final = 500
-"""Largest deviation of a row from an even grid: twice the resolution of a float64 of Unix seconds."""
+"""Largest deviation of a sample from an even grid. It is twice the resolution of Unix seconds as float64."""
 T_LIMIT_S: Final = 4.6e9
-"""Largest absolute time, years 1824 to 2115. The difference of two times fits into int64 nanoseconds."""
+"""Largest absolute time, which is in the years 1824 to 2115. Differences of times fit into int64 nanoseconds."""
 RATE_LIMITS_HZ: Final = (1e-6, 1e9)
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
 Lost = Annotated[int, msgspec.Meta(ge=0, le=1_000_000_000)]
-"""Number of lost samples, at most eleven days at 1 kHz. A publisher cannot know of a larger loss."""
+"""Number of lost samples. The largest number corresponds to eleven days at 1 kHz."""
 
 
 class _Payload(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -59,11 +59,11 @@ _DECODER: Final = msgspec.msgpack.Decoder(_Payload)
 
 
 @dataclass(frozen=True, slots=True)
-class Batch:
+class SampleMessage:
     """Content of one message."""
 
     device: str
-    samples: int  # received by the publisher since it started, including these
+    samples: int  # number received by the publisher since it started, including the samples of the message
     block: SampleBlock  # t_ns are Unix times
 
 
@@ -77,9 +77,9 @@ def encode_samples(
     device
         Name of the device.
     samples
-        Number of samples of the device since the start, including these.
+        Number of samples of the device since the start, including the samples of the message.
     rows
-        Samples to encode. Axes without any value are left out. If all values are NaN, all six axes are kept.
+        Samples to encode. Axes without a value are left out. If all values are NaN, all six axes are kept.
     offset_ns
         Added to ``t_ns`` to give Unix time, in ns.
     schema
@@ -90,7 +90,7 @@ def encode_samples(
     if not measured.any():
         measured[: len(AXES)] = True
     t: float | bytes
-    t, t0, rate = _times(rows.t_ns + offset_ns)
+    t, t0, rate = _encode_times(rows.t_ns + offset_ns)
     return _ENCODER.encode(
         _Payload(
             schema=schema,
@@ -106,22 +106,16 @@ def encode_samples(
     )
 
 
-def decode_samples(data: bytes) -> Batch:
-    """Decode the samples of one message.
-
-    Raises
-    ------
-    DecodeError
-        The message violates the format. The text names the reason.
-    """
+def decode_samples(data: bytes) -> SampleMessage:
+    """Decode the samples of one message. Raise DecodeError with the reason if the message violates the format."""
     try:
         payload = _DECODER.decode(data)
     except (msgspec.DecodeError, msgspec.ValidationError, UnicodeDecodeError, RecursionError) as error:
         raise DecodeError(f"no samples message: {error}") from error
     if payload.schema not in SCHEMAS:
         raise DecodeError(f'schema "{payload.schema[:64]}" is not {SCHEMA}')
-    table = _table(payload)
-    t_ns = _times_ns(payload, table.shape[0])
+    table = _decode_values(payload)
+    t_ns = _decode_times_ns(payload, table.shape[0])
     values = np.full((t_ns.size, len(AXES)), np.nan)
     temperature_c = np.full(t_ns.size, np.nan)
     for column, name in zip(table.T, payload.axes, strict=True):
@@ -130,11 +124,11 @@ def decode_samples(data: bytes) -> Batch:
         elif name in AXES:
             values[:, AXES.index(name)] = column
     rows = make_block(t_ns, values, temperature_c, lost=payload.lost)
-    return Batch(payload.device, payload.samples, rows)
+    return SampleMessage(payload.device, payload.samples, rows)
 
 
-def _times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
-    """Return ``t``, ``t0`` and ``rate``, in the short form if the rows are evenly spaced."""
+def _encode_times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
+    """Return the values of the keys ``t``, ``t0`` and ``rate`` of a message."""
     n = unix_ns.size
     span_ns = int(unix_ns[-1] - unix_ns[0])
     rate = (n - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
@@ -145,34 +139,34 @@ def _times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
     return ns_to_seconds(unix_ns).astype("<f8").tobytes(), None, None
 
 
-def _table(payload: _Payload) -> Floats:
-    """Return the data as an array [rows, columns] after checking their sizes."""
+def _decode_values(payload: _Payload) -> Floats:
+    """Return the data as an array [rows, columns] after checking the sizes."""
     names: Sequence[str] = payload.axes
     if not 0 < len(names) <= MAX_COLUMNS or len(set(names)) != len(names):
-        raise DecodeError(f"axes: {len(names)} names; need 1 to {MAX_COLUMNS}, each once")
+        raise DecodeError(f"axes: {len(names)} names, expected 1 to {MAX_COLUMNS} different names")
     if len(payload.data) > MAX_BYTES:
-        raise DecodeError(f"data: {len(payload.data)} bytes; at most {MAX_BYTES} are read")
+        raise DecodeError(f"data: {len(payload.data)} bytes, expected at most {MAX_BYTES}")
     n, rest = divmod(len(payload.data), 8 * len(names))
     if rest or not 0 < n <= MAX_ROWS:
-        raise DecodeError(f"data: {len(payload.data)} bytes are no 1 to {MAX_ROWS} rows of {len(names)} float64")
+        raise DecodeError(f"data: {len(payload.data)} bytes, expected 1 to {MAX_ROWS} rows of {len(names)} float64")
     return np.frombuffer(payload.data, "<f8").reshape(n, len(names)).astype(np.float64)
 
 
-def _times_ns(payload: _Payload, n: int) -> Ints:
+def _decode_times_ns(payload: _Payload, n: int) -> Ints:
     """Return the Unix times [n] of the rows in ns."""
     if isinstance(payload.t, bytes):
         if len(payload.t) != 8 * n:
-            raise DecodeError(f"t: {len(payload.t)} bytes for {n} rows; need one float64 a row")
+            raise DecodeError(f"t: {len(payload.t)} bytes for {n} rows, expected one float64 per row")
         seconds = np.frombuffer(payload.t, "<f8").astype(np.float64)
         _check_times(seconds)
         return seconds_to_ns(seconds)
     t0, rate = payload.t0, payload.rate
     if t0 is None or rate is None:
         if n > 1:
-            raise DecodeError("t is one number, so t0 and rate must be there too")
+            raise DecodeError("t is one number, so t0 and rate must be given")
         t0, rate = payload.t, 1.0
     if not RATE_LIMITS_HZ[0] <= rate <= RATE_LIMITS_HZ[1]:
-        raise DecodeError(f"rate: {rate:g} Hz is no sample rate")
+        raise DecodeError(f"rate: {rate:g} Hz is not a sample rate")
     _check_times(np.array([t0, t0 + (n - 1) / rate]))
     steps: Ints = np.rint(np.arange(n) * (1e9 / rate)).astype(np.int64)
     first: Ints = seconds_to_ns(np.array([t0]))
@@ -182,4 +176,4 @@ def _times_ns(payload: _Payload, n: int) -> Ints:
 def _check_times(seconds: Floats) -> None:
     """Raise DecodeError if a time is missing or out of range."""
     if not np.all(np.abs(seconds) < T_LIMIT_S):
-        raise DecodeError("t: a time is no Unix time in seconds")
+        raise DecodeError("t: a time is not a Unix time in seconds")

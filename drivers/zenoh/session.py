@@ -26,10 +26,9 @@ DEFAULT_CONFIGURATION: Final[Mapping[str, Any]] = {
 }
 """Default configuration of a session. zenoh's own defaults scout and listen everywhere, and accept 1 GiB at once.
 
-A lost connection is retried at least every second. A longer message is dropped while it arrives, and the connection
-stays open. An hour of samples at 1 kHz in one batch would fit.
+A lost connection is retried at least every second. A message longer than 64 MB is dropped while it arrives, and the
+connection stays open. An hour of samples at 1 kHz in one batch would fit.
 """
-
 
 SECRET_FILES: Final = (
     "transport/link/tls/listen_private_key",
@@ -48,8 +47,8 @@ PUBLIC_FILES: Final = (
 """Configuration keys of files that other users may read."""
 
 
-def configuration(
-    own: Mapping[str, Any], file: str | Path | None = None, unsaid: Mapping[str, Any] = DEFAULT_CONFIGURATION
+def build_session_config(
+    own: Mapping[str, Any], file: str | Path | None = None, defaults: Mapping[str, Any] = DEFAULT_CONFIGURATION
 ) -> "zenoh.Config":
     """Return the configuration of a session.
 
@@ -59,24 +58,24 @@ def configuration(
         Values by configuration key, which take precedence over the file. None means not set.
     file
         zenoh configuration file; None for zenoh's defaults.
-    unsaid
+    defaults
         Values for keys that the file leaves at zenoh's default.
 
     Raises
     ------
     zenoh.ZError
-        zenoh refuses the file or a value.
+        If zenoh refuses the file or a value.
     """
     import zenoh
 
-    defaults = zenoh.Config()
+    unchanged = zenoh.Config()
     if file:
         _check_file(Path(file))
     config = zenoh.Config.from_file(str(file)) if file else zenoh.Config()
     for named in _named_files(config):
         _check_file(named)
-    for key, value in unsaid.items():
-        if config.get_json(key) == defaults.get_json(key):
+    for key, value in defaults.items():
+        if config.get_json(key) == unchanged.get_json(key):
             config.insert_json5(key, json.dumps(value))
     for key, value in own.items():
         if value is not None:
@@ -87,8 +86,8 @@ def configuration(
 def format_error(error: Exception) -> str:
     """Return the text of a zenoh error in one line.
 
-    Positions in zenoh's source code and quoted file contents are removed. zenoh quotes a line of a file that it cannot
-    read, and that line may contain a password.
+    Positions in zenoh's source code and quoted file contents are removed, since a line of a configuration file may
+    contain a password.
     """
     text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error))
     text = re.sub(r"\s*-->\s*(\d+):(\d+)\s*\n.*\n\s*=\s*", r"line \1, column \2: ", text, flags=re.DOTALL)
@@ -102,7 +101,7 @@ def format_error(error: Exception) -> str:
 
 
 def is_unconnected(session: "zenoh.Session") -> bool:
-    """Return True if the session has no connection; False once it is closed."""
+    """Return True if the session has no connection. Return False for a closed session."""
     import zenoh
 
     with contextlib.suppress(zenoh.ZError):
@@ -110,19 +109,16 @@ def is_unconnected(session: "zenoh.Session") -> bool:
     return False
 
 
-def endpoints(config: "zenoh.Config") -> tuple[str, ...]:
-    """Return the endpoints that a configuration connects to.
-
-    A list for each mode is resolved to the mode of the session.
-    """
+def find_connect_endpoints(config: "zenoh.Config") -> tuple[str, ...]:
+    """Return the endpoints to which a configuration connects in the mode of the session."""
     found = json.loads(config.get_json("connect/endpoints"))
     if isinstance(found, dict):
         found = found.get(json.loads(config.get_json("mode")) or "peer", [])
-    return tuple(str(one) for one in found)
+    return tuple(str(endpoint) for endpoint in found)
 
 
-def secret_files(config: "zenoh.Config") -> tuple[Path, ...]:
-    """Return the files of a configuration that other users must not read: private keys and password lists."""
+def find_secret_files(config: "zenoh.Config") -> tuple[Path, ...]:
+    """Return the private keys and password lists that a configuration names. Other users must not read them."""
     return _named_files(config, SECRET_FILES)
 
 
@@ -133,12 +129,12 @@ def _named_files(config: "zenoh.Config", keys: Sequence[str] | None = None) -> t
 
 
 def _check_file(path: Path) -> None:
-    """Raise ZError if the path is not a regular file. zenoh would wait for a FIFO without end."""
+    """Raise ZError if the path is not a regular file. zenoh would wait forever for a FIFO."""
     import zenoh
 
     try:
         check_regular(path)
     except FileNotFoundError:
-        return  # zenoh reports this itself
+        return  # zenoh reports a missing file
     except OSError as error:
         raise zenoh.ZError(f"{path}: {error.strerror or error}") from error

@@ -20,13 +20,13 @@ from scipy.special import expit
 from drivers.sample import AXES
 from monitor.noise.effect import Leak
 from monitor.noise.effects import (
-from monitor.noise.standard_terms import UNIT_SOURCES
     AngleRandomWalk,
     Bias,
     RateRamp,
     SampleRateError,
 )
 from monitor.noise.model import NoiseModel
+from monitor.noise.standard_terms import UNIT_SOURCES
 from monitor.reconcile.description import describe_axis
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, null_distributions, run_diagnostics
 from monitor.reconcile.likelihood.axis import Axis, Effects, RegressorCache

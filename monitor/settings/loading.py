@@ -11,7 +11,7 @@ from typing import Any, Final
 from drivers import file_access
 from drivers.errors import ConfigError, format_one_line
 from drivers.settings_model import CheckedTable, Problem, check_table
-from drivers.zenoh.session import configuration, format_error, secret_files
+from drivers.zenoh.session import build_session_config, find_secret_files, format_error
 from monitor.settings import file_permissions, toml_text
 from monitor.settings.driver_settings import Driver, FaultsTable, VirtualTable
 from monitor.settings.field_types import Metrics, check_viewer_mode, period, seconds
@@ -195,7 +195,7 @@ def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
     import zenoh
 
     try:
-        return secret_files(configuration({}, path))
+        return find_secret_files(build_session_config({}, path))
     except zenoh.ZError as error:
         text = format_error(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from error

@@ -15,7 +15,7 @@ from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.links import replay_link
 from drivers.recordings import load_samples, segment
 from drivers.recordings.writing import atomic_write_path
-from drivers.zenoh.session import configuration
+from drivers.zenoh.session import build_session_config
 from monitor.commands import thermal
 from monitor.common import config_files
 from monitor.history import sqlite_store
@@ -180,7 +180,7 @@ def test_a_file_that_a_zenoh_file_names(tmp_path: Path) -> None:
     file = tmp_path / "zenoh.json5"
     file.write_text(f'{{transport: {{link: {{tls: {{listen_private_key: "{tmp_path / "key.pem"}"}}}}}}}}')
     with pytest.raises(zenoh.ZError, match="is a FIFO"):
-        configuration({}, file)
+        build_session_config({}, file)
 
 
 @pytest.mark.parametrize("suffix", [".dbc", ".kcd"])

@@ -31,7 +31,7 @@ from drivers.recordings import (
     open_recording_writer,
     save_samples,
 )
-from drivers.recordings.arrow_messages import batch_sizes, buffer_count, check_buffers
+from drivers.recordings.arrow_messages import check_buffer_sizes, count_buffers, iter_batch_sizes
 from drivers.recordings.csv_format import MAX_LINE_BYTES, READ_BYTES
 from drivers.recordings.writing import atomic_write_path
 from drivers.sample import AXES, concatenate_blocks
@@ -202,7 +202,7 @@ class TestPieceByPiece:
 
 class TestSaveRefuses:
     def test_unknown_suffix(self, tmp_path):
-        with pytest.raises(ConfigError, match=r"x\.mat: not the suffix of a recording; known are \.csv"):
+        with pytest.raises(ConfigError, match=r"x\.mat: the suffix is not that of a recording; known are \.csv"):
             save_samples(tmp_path / "x.mat", *samples())
 
     def test_missing_folder(self, path):
@@ -234,7 +234,7 @@ class TestSaveRefuses:
     def test_arrays_that_do_not_fit(self, tmp_path):
         t, values, temperature = samples()
         for wrong in ((t[1:], values), (t, values[:, :3]), (t[:0], values[:0]), (t, values, temperature[1:])):
-            with pytest.raises(RecordingError, match="do not fit"):
+            with pytest.raises(RecordingError, match="expected"):
                 save_samples(tmp_path / "x.csv", *wrong)
         with pytest.raises(RecordingError, match="unknown axis wx"):
             save_samples(tmp_path / "x.csv", t, values, axes=["wx"])
@@ -257,7 +257,7 @@ class TestColumns:
     def test_others_are_left_aside_with_a_note(self, tmp_path):
         text = "t,gx,mx,label,temperature,temp\n0,1,2,a,20,30\n1,2,3,b,21,31\n"
         recording = load_samples(written(tmp_path / "x.csv", text))
-        assert recording.notes == ("Other columns were left aside: mx, label, temp.",)
+        assert recording.notes == ("Other columns are not used: mx, label, temp.",)
         assert recording.temperature_c.tolist() == [20.0, 21.0]
 
     def test_raw_counts_are_other_columns(self, tmp_path):
@@ -315,7 +315,7 @@ class TestRate:
         np.savez(path, fs=100.0, gx=np.zeros(3))
         recording = load_samples(path, 50.0)
         assert recording.rate_hz == 50.0
-        assert recording.notes == ("The file states 100 Hz; 50 Hz was asked for and is used.",)
+        assert recording.notes == ("The file states 100 Hz; the requested 50 Hz are used.",)
 
     @pytest.mark.parametrize("fs", [0.0, -5.0, np.nan, [1.0, 2.0], "fast"])
     def test_useless_fs_is_none(self, tmp_path, fs):
@@ -323,7 +323,7 @@ class TestRate:
         np.savez(path, fs=fs, gx=np.zeros(3))
         with pytest.raises(ConfigError, match="--rate HZ"):
             load_samples(path)
-        assert re.match("fs (is not one number|was left aside: .* Hz is outside)", load_samples(path, 9.0).notes[0])
+        assert re.match("fs (is not one number|is not used: .* Hz is outside)", load_samples(path, 9.0).notes[0])
 
     def test_rows_without_time_are_left_out(self, tmp_path):
         recording = load_samples(written(tmp_path / "x.csv", "t,gx\n0,1\n,2\n2,3\n1e30,4\n4,5\n"))
@@ -333,11 +333,11 @@ class TestRate:
 
     def test_times_in_milliseconds_since_1970(self, tmp_path):
         path = written(tmp_path / "x.csv", "t,gx\n1763700000000,1\n1763700000010,2\n")
-        with pytest.raises(RecordingError, match="no time in seconds"):
+        with pytest.raises(RecordingError, match="not times in seconds"):
             load_samples(path)
         recording = load_samples(path, 100.0)
         assert recording.t_s is None
-        assert "t was left aside" in recording.notes[0]
+        assert "is used instead of t" in recording.notes[0]
 
 
 class TestBlocks:
@@ -422,11 +422,11 @@ class TestText:
     @pytest.mark.parametrize(
         ("line", "why"),
         [
-            ("0.1,ERR,9.7", "line 3: gx reads 'ERR'"),
+            ("0.1,ERR,9.7", "line 3: gx is 'ERR'"),
             ("0.1,2.5", "line 3: 2 fields where the header has 3"),
             ("0.1,2.5,9.7,1", "line 3: 4 fields where the header has 3"),
-            ("0.1,2_5,9.7", "line 3: gx reads '2_5'"),
-            ("0.1,2\0\0,9.7", r"line 3: gx reads '2\x00\x00'"),
+            ("0.1,2_5,9.7", "line 3: gx is '2_5'"),
+            ("0.1,2\0\0,9.7", r"line 3: gx is '2\x00\x00'"),
             ('0.1,"2.5,9.7', "line 3: 2 fields where the header has 3"),
         ],
     )
@@ -434,7 +434,7 @@ class TestText:
         recording = load_samples(written(tmp_path / f"x{suffix}", ROWS.replace("0.1,2.5,9.7", line)))
         assert recording.t_s.tolist() == [0.0, 0.2]
         assert recording.values[:, 0].tolist() == [1.5, 3.5]
-        assert recording.notes[0] == f"1 of 3 lines are no samples: read as missing ({why})."
+        assert recording.notes[0] == f"1 of 3 lines are not samples and are read as missing ({why})."
 
     def test_without_t_a_bad_line_keeps_its_place(self, tmp_path, suffix):
         recording = load_samples(written(tmp_path / f"x{suffix}", "gx\n1\nx\n3\n"), 10.0)
@@ -447,29 +447,29 @@ class TestText:
         text = "t,gx\n" + line * n + "1.25,oops\n" + line * 5
         recording = load_samples(written(tmp_path / f"x{suffix}", text))
         assert len(recording) == n + 5
-        assert f"(line {n + 2}: gx reads 'oops')" in recording.notes[0]
+        assert f"(line {n + 2}: gx is 'oops')" in recording.notes[0]
 
     def test_mostly_bad_lines_are_no_recording(self, tmp_path, suffix):
         text = "t,gx\n" + "2024-01-01T00:00:00,1\n" * 9
-        with pytest.raises(RecordingError, match=r"9 of 9 lines are no samples \(line 2: t reads '2024-01-01T"):
+        with pytest.raises(RecordingError, match=r"9 of 9 lines are not samples \(line 2: t is '2024-01-01T"):
             load_samples(written(tmp_path / f"x{suffix}", text))
 
     @pytest.mark.parametrize(
         ("text", "why"),
         [
-            ("t,gx\n", "no whole line of samples"),
-            ("t,gx\n\n\n", "no whole line of samples"),
-            ("t,gx\n0.1,2", "no whole line of samples"),
-            ("t,gx", "not one whole line"),
+            ("t,gx\n", "no complete line of samples"),
+            ("t,gx\n\n\n", "no complete line of samples"),
+            ("t,gx\n0.1,2", "no complete line of samples"),
+            ("t,gx", "not one complete line"),
             ("\n\n", "no CSV text"),
             ("# a log\n", "no CSV text"),
-            ("# t,gx,az\n", "no whole line of samples"),
-            ("# a log\n% of nothing\n1,2\n", "header line is missing, line 3 is all numbers"),
+            ("# t,gx,az\n", "no complete line of samples"),
+            ("# a log\n% of nothing\n1,2\n", "header line is missing: line 3 consists of numbers"),
             ("# a log\nstart of the log\nt,gx\n0,1\n", r"no axis among its columns \(start of the log\) in line 2"),
             ("# a log\n\nt;gx\n0;1\n", "line 3 are separated by semicolons"),
             ("# a\n" * 300_000, "no header line within its first 262145 lines"),
             ("0.1,2,3\n0.2,3,4\n", "header line is missing.*t,gx,gy"),
-            ("t;gx\n0;1\n", "separated by semicolons; a recording has commas"),
+            ("t;gx\n0;1\n", "separated by semicolons; separate them by commas"),
             ("t\tgx\n0\t1\n", "separated by tabs"),
             ("a,b\n1,2\n", r"no axis among its columns \(a, b\) in line 1"),
             (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + b"\0" * 99, "no CSV text|no axis"),
@@ -620,7 +620,7 @@ class TestNoRecording:
         path = tmp_path / "x.npz"
         arrays = {"t": np.arange(1.0), "gx": np.arange(1.0), "fs": np.array(1.0)}
         np.savez(path, **{**arrays, key: np.array([Bomb()], dtype=object)})
-        with pytest.raises(RecordingError, match=f"x.npz: {key} holds Python objects") as error:
+        with pytest.raises(RecordingError, match=f"x.npz: {key} contains Python objects") as error:
             load_samples(path)
         assert "\n" not in str(error.value)
         assert not (tmp_path / "exploded").exists()
@@ -633,7 +633,7 @@ class TestNoRecording:
     def test_columns_that_are_none(self, tmp_path, column):
         path = tmp_path / "x.npz"
         np.savez(path, t=np.arange(2.0), gx=column)
-        with pytest.raises(RecordingError, match=r"gx (holds|has shape)"):
+        with pytest.raises(RecordingError, match=r"gx (contains|has shape)"):
             load_samples(path)
 
     @pytest.mark.parametrize("suffix", [".parquet", ".arrow"])
@@ -654,9 +654,9 @@ class TestNoRecording:
         recording = load_samples(path)
         assert np.array_equal(recording.values[:, 0], [1.5, np.nan, 3.5], equal_nan=True)
         assert np.isnan(recording.values[:, 1]).all()
-        assert recording.notes == ("Other columns were left aside: label.",)
+        assert recording.notes == ("Other columns are not used: label.",)
         write(t=pa.array([0, 1], pa.timestamp("ns")), gx=[1.0, 2.0])
-        with pytest.raises(RecordingError, match=r"t holds timestamp\[ns\], not numbers; t is in seconds"):
+        with pytest.raises(RecordingError, match=r"t contains timestamp\[ns\], expected numbers; t is in seconds"):
             load_samples(path)
         write(t=pa.array([], pa.float64()), gx=pa.array([], pa.float64()))
         with pytest.raises(RecordingError, match="no samples"):
@@ -741,7 +741,7 @@ class TestTheEndAlone:
         assert np.array_equal(recording.t_s, t[175:])
         assert np.array_equal(recording.values, values[175:])
         assert np.array_equal(recording.temperature_c, temperature[175:])
-        assert recording.notes == ("Its last 1.25 s were taken, 125 samples.",)
+        assert recording.notes == ("Only the last 1.25 s are used, 125 samples.",)
         assert len(load_samples(tmp_path, last_s=60.0)) == 200
 
     def test_of_a_file_with_every_format(self, path):
@@ -780,8 +780,8 @@ class TestRoom:
         ("MemAvailable:\n", None), ("MemAvailable: x kB\n", None),
     ])  # fmt: skip
     def test_what_the_system_says(self, tmp_path, text, free):
-        assert memory_check.system_bytes(written(tmp_path / "meminfo", text)) == free
-        assert memory_check.system_bytes(tmp_path / "absent") is None
+        assert memory_check.available_system_bytes(written(tmp_path / "meminfo", text)) == free
+        assert memory_check.available_system_bytes(tmp_path / "absent") is None
 
     def test_a_control_group_leaves_less(self, tmp_path):
         def group(name, **files):
@@ -790,15 +790,15 @@ class TestRoom:
                 (tmp_path / name / file.replace("__", ".")).write_text(text)
 
         own = written(tmp_path / "own", "0::/service/imu\n")
-        assert memory_check.cgroup_bytes(tmp_path / "absent", tmp_path) is None
-        assert memory_check.cgroup_bytes(own, tmp_path) is None
+        assert memory_check.available_cgroup_bytes(tmp_path / "absent", tmp_path) is None
+        assert memory_check.available_cgroup_bytes(own, tmp_path) is None
         group("service/imu", memory__max="max\n", memory__current="5000\n")
-        assert memory_check.cgroup_bytes(own, tmp_path) is None
+        assert memory_check.available_cgroup_bytes(own, tmp_path) is None
         stat = "anon 4000\nactive_file 300\ninactive_file 700\n"
         group("service", memory__max="9000\n", memory__current="6000\n", memory__stat=stat)
-        assert memory_check.cgroup_bytes(own, tmp_path) == 4000
+        assert memory_check.available_cgroup_bytes(own, tmp_path) == 4000
         group("service/imu", memory__max="7000\n", memory__current="5000\n")
-        assert memory_check.cgroup_bytes(own, tmp_path) == 2000
+        assert memory_check.available_cgroup_bytes(own, tmp_path) == 2000
 
     def test_a_control_group_of_version_1(self, tmp_path):
         own = written(tmp_path / "own", "7:cpu,cpuacct:/a\n4:memory:/a\n")
@@ -806,25 +806,29 @@ class TestRoom:
         written(tmp_path / "memory/a/memory.limit_in_bytes", "9000\n")
         written(tmp_path / "memory/a/memory.usage_in_bytes", "6000\n")
         written(tmp_path / "memory/a/memory.stat", "total_inactive_file 500\ninactive_file 9\n")
-        assert memory_check.cgroup_bytes(own, tmp_path) == 3500
+        assert memory_check.available_cgroup_bytes(own, tmp_path) == 3500
 
     def test_a_limit_of_the_process(self, tmp_path, monkeypatch):
         page = resource.getpagesize()
         statm = written(tmp_path / "statm", "500 100 50 10 0 200 0\n")
         limits = {resource.RLIMIT_AS: resource.RLIM_INFINITY, resource.RLIMIT_DATA: resource.RLIM_INFINITY}
         monkeypatch.setattr(resource, "getrlimit", lambda kind: (limits[kind], limits[kind]))
-        assert memory_check.process_bytes(statm) is None
-        assert memory_check.process_bytes(tmp_path / "absent") is None
+        assert memory_check.available_process_bytes(statm) is None
+        assert memory_check.available_process_bytes(tmp_path / "absent") is None
         limits[resource.RLIMIT_AS] = 1500 * page
-        assert memory_check.process_bytes(statm) == 1000 * page
+        assert memory_check.available_process_bytes(statm) == 1000 * page
         limits[resource.RLIMIT_DATA] = 300 * page
-        assert memory_check.process_bytes(statm) == 100 * page
+        assert memory_check.available_process_bytes(statm) == 100 * page
 
     def test_the_least_counts(self, monkeypatch):
-        for name, free in (("system_bytes", 900), ("cgroup_bytes", None), ("process_bytes", 300)):
+        for name, free in (
+            ("available_system_bytes", 900),
+            ("available_cgroup_bytes", None),
+            ("available_process_bytes", 300),
+        ):
             monkeypatch.setattr(memory_check, name, lambda free=free: free)
         assert memory_check.available_bytes() == 300
-        monkeypatch.setattr(memory_check, "process_bytes", lambda: -5)
+        monkeypatch.setattr(memory_check, "available_process_bytes", lambda: -5)
         assert memory_check.available_bytes() == 0
 
     def test_a_file_that_does_not_fit_is_refused_before_it_is_read(self, path, monkeypatch):
@@ -853,7 +857,7 @@ class TestRoom:
             parquet.write_table(pytest.importorskip("pyarrow").table({"gx": np.zeros(n)}), path)
         assert len(load_samples(path, 100.0)) == n  # below the number of rows that any file may have
         monkeypatch.setattr(memory_check, "MIN_ROW_LIMIT", n // 2)
-        with pytest.raises(RecordingError, match=r"rows in a file of \d+ bytes are no measured samples"):
+        with pytest.raises(RecordingError, match=r"rows in a file of \d+ bytes are not measured samples"):
             load_samples(path, 100.0)
 
     def test_a_file_that_unpacks_to_more_than_the_limit(self, tmp_path, monkeypatch):
@@ -882,8 +886,8 @@ class TestLimits:
     def test_a_line_without_end_ends_the_reading(self, tmp_path, suffix):
         recording = load_samples(written(tmp_path / f"x{suffix}", ROWS + "0" * (3 * MAX_LINE_BYTES)))
         assert len(recording) == 3
-        assert recording.notes == ("Line 5 is longer than 1048576 bytes; the file was read up to there.",)
-        with pytest.raises(RecordingError, match=r"not one whole line.*Line 1 is longer than 1048576 bytes"):
+        assert recording.notes == ("Line 5 is longer than 1048576 bytes; the file was read up to this line.",)
+        with pytest.raises(RecordingError, match=r"not one complete line.*Line 1 is longer than 1048576 bytes"):
             load_samples(written(tmp_path / f"y{suffix}", "t,gx," + "x" * (3 * MAX_LINE_BYTES)))
 
     def test_zeros_at_the_end_as_after_a_power_cut(self, tmp_path):
@@ -892,7 +896,7 @@ class TestLimits:
 
     def test_mostly_bad_lines_are_not_all_looked_at(self, tmp_path, monkeypatch):
         path = written(tmp_path / "x.csv", "t,gx\n" + "x\n" * 3 * READ_BYTES)
-        with pytest.raises(RecordingError, match=r"\d{6} of \d{6} lines are no samples \(line 2"):
+        with pytest.raises(RecordingError, match=r"\d{6} of \d{6} lines are not samples \(line 2"):
             load_samples(path)
 
     def test_empty_members_of_gzip(self, tmp_path):
@@ -900,7 +904,7 @@ class TestLimits:
         path.write_bytes(gzip.compress(b"") * 500 + gzip.compress(ROWS.encode()) + gzip.compress(b"") * 5000)
         recording = load_samples(path)
         assert len(recording) == 3
-        assert recording.notes == ("1001 gzip members in a row are empty; read up to there.",)
+        assert recording.notes == ("1001 consecutive gzip members are empty; the file was read up to these members.",)
 
     @pytest.mark.parametrize("suffix", [".csv", ".npz", ".parquet", ".arrows"])
     def test_columns_beyond_the_limit(self, tmp_path, suffix, monkeypatch):
@@ -970,20 +974,20 @@ class TestArrowMessages:
         with new(str(path), table.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as writer:
             writer.write_table(table, max_chunksize=2000)
         with path.open("rb") as file:
-            dictionary, *batches = batch_sizes(file, 8 if suffix == ".arrow" else 0)
+            dictionary, *batches = iter_batch_sizes(file, 8 if suffix == ".arrow" else 0)
         assert dictionary.dictionary
         assert [batch.rows for batch in batches] == [2000, 2000, 1000]
-        counts = [buffer_count(pa, field.type) for field in table.schema]
+        counts = [count_buffers(pa, field.type) for field in table.schema]
         assert counts == [2, 2, 3, 0, 2]
         for batch in batches:
             assert len(batch.buffers) == sum(counts)
             assert batch.buffers[1] == 8 * batch.rows
             assert batch.buffers[3] == 4 * batch.rows
             assert batch.buffers[6] == 4 * batch.rows
-            assert check_buffers(batch, counts, 0) == ""
-        assert "unpacks to 16000 bytes" in check_buffers(replace(batches[0], rows=1999), counts, 0)
-        assert check_buffers(replace(batches[0], rows=1999), [-2, -2, -3, 0, -2], 0) == ""
-        assert check_buffers(replace(batches[0], rows=0), [-2, None], 0) != ""
+            assert check_buffer_sizes(batch, counts, 0) == ""
+        assert "unpacks to 16000 bytes" in check_buffer_sizes(replace(batches[0], rows=1999), counts, 0)
+        assert check_buffer_sizes(replace(batches[0], rows=1999), [-2, -2, -3, 0, -2], 0) == ""
+        assert check_buffer_sizes(replace(batches[0], rows=0), [-2, None], 0) != ""
 
     def test_any_cut_and_any_byte_end_quietly(self, tmp_path):
         path = tmp_path / "x.arrows"
@@ -992,11 +996,11 @@ class TestArrowMessages:
         data = path.read_bytes()
         rng = np.random.default_rng(2)
         for cut in range(0, len(data), 7):
-            assert len(list(batch_sizes(io.BytesIO(data[:cut])))) <= 1
+            assert len(list(iter_batch_sizes(io.BytesIO(data[:cut])))) <= 1
         for _ in range(500):
             damaged = bytearray(data)
             damaged[int(rng.integers(len(data)))] = int(rng.integers(256))
-            assert len(list(batch_sizes(io.BytesIO(damaged)))) <= 2
+            assert len(list(iter_batch_sizes(io.BytesIO(damaged)))) <= 2
 
 
 @pytest.mark.data
@@ -1037,7 +1041,7 @@ class TestRealRecordings:
             assert recording.rate_hz == float(archive["fs"])
             assert np.array_equal(recording.values[:, 2], archive["gz"].astype(float))
             assert np.array_equal(recording.temperature_c, archive["temp"].astype(float))
-        assert recording.notes == ("Other columns were left aside: temp2, mx, my, mz, roll_deg, pitch_deg, yaw_deg.",)
+        assert recording.notes == ("Other columns are not used: temp2, mx, my, mz, roll_deg, pitch_deg, yaw_deg.",)
 
     def test_frames_beside_a_recording_are_left_out(self, folder):
         recording = load_samples(folder / "can-boat")

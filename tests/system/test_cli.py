@@ -367,7 +367,7 @@ WRONG_ARGUMENTS = {
     "no rate of samples": (simulating("consumer-mems", "--rate", "0"), "--rate: 0 Hz is outside the supported range"),
     "negative seed": (simulating("consumer-mems", "--seed", "-1"), "--seed: -1 is outside the supported range"),
     "nothing to write": (("simulate", "consumer-mems", "--seconds", "1"), "Missing option '--out'"),
-    "unknown form": (simulating("consumer-mems", "--out", "x.mat"), "x.mat: not the suffix of a recording"),
+    "unknown form": (simulating("consumer-mems", "--out", "x.mat"), "x.mat: the suffix is not that of a recording"),
     "nowhere to write it": (simulating("consumer-mems", "--out", "nowhere/x.csv"), "there is no folder nowhere"),
     "nowhere to say it": (simulating("consumer-mems", "--json", "nowhere/x.json"), "--json: nowhere/x.json: cannot be"),
     "folder to write": (simulating("consumer-mems", "--out", ".csv/../.csv"), "cannot be written"),
@@ -523,7 +523,7 @@ def test_the_end_of_a_recording_alone(call: Call, recording: Path) -> None:
     assert said.status == 0
     found = json.loads(said.out)
     assert found["samples"] == 6000
-    assert "Its last 60 s were taken, 6000 samples." in found["notes"]
+    assert "Only the last 60 s are used, 6000 samples." in found["notes"]
     said = call("reconcile", str(recording), "--last", "never", "--out", "r")
     assert (said.status, said.err.count("\n")) == (2, 1)
     assert "--last: " in said.err
@@ -619,7 +619,7 @@ def test_deviations_are_those_of_allantools(call: Call, recording: Path, grid: s
         ("x.csv", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.csv: no axis among its columns"),
         ("x.npz", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.npz: is no .npz file"),
         ("x.csv.gz", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + bytes(range(256)) * 9, "x.csv.gz: "),
-        ("x.png", b"\x89PNG\r\n\x1a\n", "x.png: not the suffix of a recording; known are .csv"),
+        ("x.png", b"\x89PNG\r\n\x1a\n", "x.png: the suffix is not that of a recording; known are .csv"),
     ],
 )
 def test_what_is_no_recording_is_said_in_one_line(call: Call, name: str, content: bytes, words: str) -> None:

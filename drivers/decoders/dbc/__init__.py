@@ -22,11 +22,11 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Bytes, Decoder, Timing
+from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Bytes, Decoder
 from drivers.decoders.dbc.database import Database
 from drivers.decoders.dbc.join import Message, Sample, SampleAssembler
 from drivers.decoders.dbc.settings import COLUMNS, Settings, SignalSettings
-from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock
+from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock, Timing
 
 __all__ = ["DbcDecoder", "Settings", "SignalSettings", "build"]
 
@@ -61,7 +61,7 @@ class DbcDecoder:
         self._left_out = 0  # number of samples left out, bad or late
         self.hint = ""
         self._two_senders_hint = ""  # hint that two senders are on the bus
-        self._samples_since_reject = 0  # number of good samples since the last rejected one
+        self._samples_since_reject = 0  # number of good samples since the last rejected sample
         self._builder = BlockBuilder()
         self._assembler = SampleAssembler(self._messages, settings)
         self._known = {m.address: i for i, m in self._numbered_messages() if not m.j1939}
@@ -182,7 +182,7 @@ class DbcDecoder:
             self._assembler.temperature = data[: self._slow.size]
 
     def _decode_samples(self, done: Sequence[Sample]) -> list[SampleBlock]:
-        """Return joined samples as blocks. Each signal is extracted from all of them at once."""
+        """Return joined samples as blocks. Each signal is extracted from all samples at once."""
         n = len(done)
         table = np.full((n, len(COLUMNS)), np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
@@ -212,7 +212,7 @@ class DbcDecoder:
 
 
 def _stack_frames(done: Sequence[Sample], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
-    """Return the frames [n, size] of one message, and a mask [n] of those that exist."""
+    """Return the frames [n, size] of one message, and a mask [n] of the frames that exist."""
     frames = [s.temperature if which < 0 else s.frames[which] for s in done]
     empty = bytes(size)
     data = np.frombuffer(b"".join(f or empty for f in frames), np.uint8)

@@ -1,4 +1,4 @@
-"""Bit field of one CAN signal: extraction from, and insertion into, many frames at once.
+"""Extraction of one CAN signal from many frames at once, and insertion into frames.
 
 Frames are bytes [n, size], physical values are [n]. Bits are numbered in the order in which the byte order of the
 signal counts them. Intel signals count from the least significant bit of each byte, Motorola signals from the most

@@ -12,13 +12,13 @@ from typing import Any, Final
 
 import drivers
 from drivers import file_access, units
-from drivers.decoders.base import ArrivalTiming, CounterTiming, Timing
 from drivers.decoders.dbc.bits import SignalBits
 from drivers.decoders.dbc.join import Column, Message
 from drivers.decoders.dbc.settings import COLUMNS, TEMPERATURE, Settings, SignalSettings
 from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.extras import check_extra
+from drivers.sample import ArrivalTiming, CounterTiming, Timing
 
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
 SHIPPED_PREFIX: Final = "shipped:"
@@ -192,7 +192,7 @@ class Database:
 
 
 def _locate(file: str) -> Path:
-    """Return the path of a database, which may be a shipped one."""
+    """Return the path of a database file. A name without a folder may be that of a shipped database."""
     path = file_access.expand_user(file)
     name = file.removeprefix(SHIPPED_PREFIX)
     if name == file and (file_access.is_file(path) or len(path.parts) != 1):

@@ -39,7 +39,7 @@ After that, the order of the received frames is used.
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """Signal of one axis, and its conversion to SI."""
+    """Signal of one axis, with the conversion to SI units."""
 
     index: int  # in COLUMNS
     bits: SignalBits
@@ -80,13 +80,13 @@ class Message:
 
 @dataclass(slots=True)
 class Sample:
-    """Frames of one sample. None means not arrived, and b"" means too short."""
+    """Frames of one sample. None stands for a frame that has not arrived, and b"" for a frame that is too short."""
 
     frames: list[bytes | None]
     t_ns: int  # arrival of the newest frame
     start_ns: int
     count: int  # value of the counter; NO_TICK = none yet
-    missing_before: int = 0  # samples left out since the last good one, bad or late
+    missing_before: int = 0  # bad and late samples since the last good sample
     late: set[int] = field(default_factory=set)  # messages that arrived after the window
     temperature: bytes | None = None  # newest frame of the message that contains only the temperature
 
@@ -124,7 +124,7 @@ class SampleAssembler:
         self._open: Sample | None = None
         self._synchronized = False
         self._missing = 0
-        self._count_before = NO_TICK  # count of the sample before the open one
+        self._count_before = NO_TICK  # count of the previous sample
         self._newest_ns: int | None = None  # arrival of the newest frame
         self._pauses: list[deque[int]] = [deque(maxlen=PAUSE_HISTORY) for _ in range(self._n)]  # ns before each message
         self._undecided: deque[tuple[int, bytes, int]] = deque()

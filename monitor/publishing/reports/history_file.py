@@ -37,7 +37,7 @@ def save_history(past: HistoryTable, path: Path) -> None:
         If the suffix is unknown or the file cannot be written.
     """
     columns = history_columns(past)
-    begin = format_for_path(path).writer
+    begin = format_for_path(path).open_writer
     with atomic_write_path(path) as part, begin(part, list(columns)) as append:
         append(columns)
 

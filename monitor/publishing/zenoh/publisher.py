@@ -26,7 +26,13 @@ from typing import TYPE_CHECKING, Any, Final
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError, ImuError, NotReady
 from drivers.zenoh.connection_errors import explain_refusals
-from drivers.zenoh.session import DEFAULT_CONFIGURATION, configuration, endpoints, format_error, is_unconnected
+from drivers.zenoh.session import (
+    DEFAULT_CONFIGURATION,
+    build_session_config,
+    find_connect_endpoints,
+    format_error,
+    is_unconnected,
+)
 from monitor.common import topics
 from monitor.settings.loading import ZenohTable
 
@@ -267,7 +273,7 @@ class ZenohPublisher:
 
         listen = self.settings.listen
         config = self._configuration(listen)
-        self._connect = endpoints(config)
+        self._connect = find_connect_endpoints(config)
         try:
             return zenoh.open(config), "ok"
         except zenoh.ZError as error:
@@ -286,7 +292,7 @@ class ZenohPublisher:
             "connect/endpoints": own.connect or None,
         }
         unsaid = {**DEFAULT_CONFIGURATION, "listen/endpoints": [topics.ENDPOINT], "timestamping/enabled": True}
-        return configuration(keys, own.config, unsaid)
+        return build_session_config(keys, own.config, unsaid)
 
     def _publisher(
         self, session: "zenoh.Session", topic: topics.Topic, key: str

@@ -24,7 +24,13 @@ from typing import TYPE_CHECKING, Any, Final
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
 from drivers.zenoh.connection_errors import explain_refusal
-from drivers.zenoh.session import DEFAULT_CONFIGURATION, configuration, endpoints, format_error, is_unconnected
+from drivers.zenoh.session import (
+    DEFAULT_CONFIGURATION,
+    build_session_config,
+    find_connect_endpoints,
+    format_error,
+    is_unconnected,
+)
 from monitor.common import topics
 from monitor.publishing.bounded_queue import BoundedQueue
 from monitor.settings import file_permissions
@@ -320,7 +326,7 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
     if file is not None and (line := file_permissions.describe_write_access(file)):
         raise ConfigError(f"{file}: {line}")
     try:
-        theirs = endpoints(configuration({}, file))
+        theirs = find_connect_endpoints(build_session_config({}, file))
     except zenoh.ZError as error:
         text = format_error(error)
         raise ConfigError(text if text.startswith(str(file)) else f"{file}: {text}") from error
@@ -329,7 +335,7 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
     for endpoint in dict.fromkeys(connect or theirs or (topics.ENDPOINT,)):
         own = {"mode": "client", "connect/endpoints": [endpoint], "listen/endpoints": []}
         try:
-            found[endpoint] = configuration(own, file, unsaid)
+            found[endpoint] = build_session_config(own, file, unsaid)
         except (zenoh.ZError, UnicodeEncodeError) as error:
             raise ConfigError(
                 f'connect "{mask_secrets(endpoint)}": no endpoint; write e.g. {topics.ENDPOINT}'

@@ -11,12 +11,22 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.decoders import dbc
-from drivers.decoders.base import ArrivalTiming, CounterTiming
 from drivers.decoders.dbc.bits import SignalBits
 from drivers.decoders.dbc.database import SHIPPED
 from drivers.errors import ConfigError, LinkEnded
 from drivers.links import replay_link
-from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, SampleBlock, concatenate_blocks, make_block
+from drivers.sample import (
+    ANY_SOURCE,
+    AXES,
+    EXTENDED_ID,
+    NO_TICK,
+    ArrivalTiming,
+    Chunk,
+    CounterTiming,
+    SampleBlock,
+    concatenate_blocks,
+    make_block,
+)
 from drivers.settings_model import read_settings
 from drivers.units import DEGREE, G0
 from tests.support.recordings import recordings

@@ -22,7 +22,7 @@ from drivers.links import serial_link
 from drivers.recordings import load_samples, segment
 from drivers.sample import make_block
 from drivers.zenoh.sample_message import encode_samples
-from drivers.zenoh.session import configuration
+from drivers.zenoh.session import build_session_config
 from monitor.common import topics
 from monitor.daemon.operations.metrics import MetricsOutput
 from monitor.publishing.zenoh.publisher import ZenohPublisher
@@ -56,7 +56,7 @@ class Publisher:
     def __init__(self) -> None:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.sent = 0
-        self._session = zenoh.open(configuration({"listen/endpoints": [self.endpoint]}))
+        self._session = zenoh.open(build_session_config({"listen/endpoints": [self.endpoint]}))
         self._publisher = self._session.declare_publisher("lab/imu", congestion_control=zenoh.CongestionControl.BLOCK)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)

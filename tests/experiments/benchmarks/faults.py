@@ -424,14 +424,14 @@ def full_disk(folder: Path, times: int) -> Outcome:
 
 def slow_disk(folder: Path, times: int) -> Outcome:
     """Every batch takes two seconds to write."""
-    write = segment.SegmentWriter.samples
+    write = segment.SegmentWriter.write_samples
 
     def slowly(writer: segment.SegmentWriter, *arguments: Any) -> None:
         time.sleep(2.0)
         write(writer, *arguments)
 
     with (
-        mock.patch("drivers.recordings.segment.SegmentWriter.samples", slowly),
+        mock.patch("drivers.recordings.segment.SegmentWriter.write_samples", slowly),
         running(folder, _storage(folder / "store")) as rig,
     ):
         for _ in range(4):

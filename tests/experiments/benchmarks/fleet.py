@@ -26,7 +26,7 @@ from typing import Any, Final
 import psutil
 import zenoh
 
-from drivers.zenoh.session import configuration
+from drivers.zenoh.session import build_session_config
 from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from tests.support.ports import free_port
@@ -113,7 +113,7 @@ def route(endpoint: str, *above: str) -> None:
     own: dict[str, Any] = {"mode": "router", "listen/endpoints": [endpoint], "connect/endpoints": list(above)}
     own["connect/timeout_ms"] = -1  # what is above may start later
     own["transport/shared_memory/enabled"] = False  # on one machine longer messages would not pass the interface
-    with zenoh.open(configuration(own)):
+    with zenoh.open(build_session_config(own)):
         while sys.stdin.readline():
             pass
 
@@ -243,7 +243,7 @@ def settings(seconds: float) -> list[dict[str, Any]]:
             process = daemon(Path(name), leaves[0], 0, rate, publish)
             ending.callback(process.end)
             own = {"mode": "client", "connect/endpoints": [root], "connect/timeout_ms": -1}
-            session: Any = ending.enter_context(zenoh.open(configuration(own)))
+            session: Any = ending.enter_context(zenoh.open(build_session_config(own)))
             subscriber: Any = session.declare_subscriber("imu/**", zenoh.handlers.RingChannel(100_000))
             channel = subscriber.handler
             _wait_for_coefficients(channel)

@@ -18,7 +18,7 @@ import zenoh
 
 from drivers.errors import LinkUnavailable, NotReady
 from drivers.links import zenoh_link
-from drivers.zenoh.session import configuration
+from drivers.zenoh.session import build_session_config
 from monitor.common import topics
 from monitor.common.config_files import CONFIG_FOLDER
 from monitor.publishing.messages.results import StatusMessage
@@ -57,7 +57,7 @@ class World:
     def __init__(self, folder: Path, certificates: Path, router: str) -> None:
         self.endpoint = free_endpoint().replace("tcp/", "tls/")
         self._folder, self._certificates = folder, certificates
-        self.router = configuration({}, self.file(router))
+        self.router = build_session_config({}, self.file(router))
 
     def file(self, shipped: str, **swaps: str) -> Path:
         """A shipped file at home here; ``swaps`` of words in it."""
@@ -126,7 +126,7 @@ def daemon(file: Path) -> Iterator[ZenohPublisher]:
 
 
 def replies(file: Path, key: str) -> list[bytes]:
-    with zenoh.open(configuration({"mode": "client"}, file)) as session:
+    with zenoh.open(build_session_config({"mode": "client"}, file)) as session:
         return [bytes(reply.ok.payload) for reply in session.get(key, timeout=PATIENCE_S) if reply.ok]
 
 
@@ -174,8 +174,8 @@ def test_a_reader_is_refused_commands(by_certificate: World, key: str) -> None:
 def test_a_reader_cannot_publish(by_certificate: World) -> None:
     with (
         contextlib.closing(ZenohSubscriber("imu/**", file=by_certificate.certified("operator"))) as arriving,
-        zenoh.open(configuration({"mode": "client"}, by_certificate.certified("reader"))) as reader,
-        zenoh.open(configuration({"mode": "client"}, by_certificate.certified("nose"))) as nose,
+        zenoh.open(build_session_config({"mode": "client"}, by_certificate.certified("reader"))) as reader,
+        zenoh.open(build_session_config({"mode": "client"}, by_certificate.certified("nose"))) as nose,
     ):
         arriving.start()
         so_far: set[str] = set()
@@ -195,17 +195,17 @@ def test_a_reader_cannot_publish(by_certificate: World) -> None:
     ("swaps", "why"),
     [
         ({"/reader.": "/impostor."}, "does not accept our certificate: it is not signed by its authority"),
-        ({"ca.pem": "their-ca.pem"}, "its certificate does not hold: unable to get local issuer certificate"),
-        ({"enable_mtls: true": "enable_mtls: false"}, "wants a certificate of ours: set connect_certificate"),
+        ({"ca.pem": "their-ca.pem"}, "its certificate is not valid: unable to get local issuer certificate"),
+        ({"enable_mtls: true": "enable_mtls: false"}, "requires a certificate of ours: set connect_certificate"),
         ({"reader.key": "nobody.key"}, "our certificates cannot be read: No such file or directory"),
-        ({"tls/127": "tcp/127"}, "answers, but lets us not in"),
+        ({"tls/127": "tcp/127"}, "answers, but refuses the login"),
     ],
 )
 def test_the_wrong_certificate_is_refused_and_told(by_certificate: World, swaps: dict[str, str], why: str) -> None:
     file = by_certificate.file("watch.json5", **swaps)
     said = refusal(file)
     assert why in said
-    assert said.startswith(json.loads(configuration({}, file).get_json("connect/endpoints"))[0])
+    assert said.startswith(json.loads(build_session_config({}, file).get_json("connect/endpoints"))[0])
     with daemon(file) as out:  # the daemon's status says the same
         wait_for(lambda: why in out.state)
 
@@ -228,7 +228,7 @@ def test_who_knows_the_password_watches_and_commands_by_its_right(by_password: W
 @pytest.mark.parametrize(("user", "password"), [("reader", "wrong"), ("stranger", PASSWORD), ("", "")])
 def test_the_wrong_password_is_refused_and_not_repeated(by_password: World, user: str, password: str) -> None:
     said = refusal(by_password.user(user, password))
-    assert "answers, but lets us not in: check user and password" in said
+    assert "answers, but refuses the login: check user and password" in said
     assert not password or password not in said
 
 
@@ -250,7 +250,7 @@ def test_samples_of_another_daemon_come_through_the_link_with_a_certificate(by_c
     link = zenoh_link.build(zenoh_link.Settings(key="imu/nose/samples", config=str(by_certificate.certified("reader"))))
     link.open()
     try:
-        with zenoh.open(configuration({"mode": "client"}, by_certificate.certified("nose"))) as nose:
+        with zenoh.open(build_session_config({"mode": "client"}, by_certificate.certified("nose"))) as nose:
 
             def come() -> Any:
                 nose.put("imu/nose/samples", b"batch")
@@ -274,4 +274,4 @@ def test_the_shipped_daemon_reads_its_files(tmp_path: Path) -> None:
     assert config is not None
     assert config.zenoh.listen is None
     for file in SECURE.glob("*.json5"):
-        configuration({}, file)
+        build_session_config({}, file)

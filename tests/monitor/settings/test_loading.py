@@ -181,7 +181,7 @@ CASES = {
             driver='driver = { link = "serial", port = "x", decoder = "text", '
             'decoder_options = { columns = ["gx"], gyro_unit = "deg/h2" } }'
         ),
-        ['driver.decoder_options.gyro_unit: "deg/h2" is no unit of angular rate; possible are deg/h, deg/hr, '],
+        ['driver.decoder_options.gyro_unit: "deg/h2" is not a unit of angular rate; possible are deg/h, deg/hr, '],
     ),
     "port missing": (
         device(driver='driver = { link = "serial", decoder = "stim300" }'),
@@ -287,7 +287,7 @@ def test_a_signal_that_the_dbc_does_not_have(tmp_path):
 def test_a_file_that_is_no_recording(tmp_path):
     (tmp_path / "a.jpg").write_bytes(b"")
     (line,) = wrong(tmp_path, device(driver='driver = { link = "replay", path = "a.jpg" }'))
-    assert "nothing to replay by its suffix" in line
+    assert "has no suffix of a file to replay" in line
 
 
 def test_all_that_is_wrong_is_told_at_once(tmp_path):

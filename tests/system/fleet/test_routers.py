@@ -7,7 +7,7 @@ from typing import Any
 
 import zenoh
 
-from drivers.zenoh.session import configuration
+from drivers.zenoh.session import build_session_config
 from monitor.common.config_files import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
@@ -22,7 +22,7 @@ def shipped(folder: Path, name: str, **swaps: str) -> Any:
         assert old in text
         text = text.replace(old, new)
     (folder / name).write_text(text)
-    return configuration({}, folder / name)
+    return build_session_config({}, folder / name)
 
 
 def counted(subscriber: Any) -> Counter[str]:

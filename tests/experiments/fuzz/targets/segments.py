@@ -31,9 +31,9 @@ def _written(of: SegmentMetadata, packed: bool) -> bytes:
         rng = np.random.default_rng(i)
         rows = make_block(10**18 + np.arange(4) * 10**7, rng.normal(size=(4, 6)), np.full(4, 20.0), np.arange(4), i)
         if of.kind == "samples":
-            writer.samples([rows], DaemonState(100.0, (1.7e9,) * 6, 5.0, (1e-4,) * 30, (True,) * 30))
+            writer.write_samples([rows], DaemonState(100.0, (1.7e9,) * 6, 5.0, (1e-4,) * 30, (True,) * 30))
         else:
-            writer.chunks([Chunk(rng.bytes(9), 10**18 + i, i, b"beside"[:i])])
+            writer.write_chunks([Chunk(rng.bytes(9), 10**18 + i, i, b"beside"[:i])])
     writer.close()
     if packed:
         list(compress_segment(path))

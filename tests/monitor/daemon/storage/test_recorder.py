@@ -76,7 +76,7 @@ def test_every_value_counter_and_hole_comes_back(tmp_path: Path) -> None:
     assert len(segment.list_segments(tmp_path / "bench")) > 1
     whole = load_samples(tmp_path / "bench")
     np.testing.assert_array_equal(whole.values, expected.values)
-    assert not any("left aside" in note for note in whole.notes)
+    assert not any("not used" in note for note in whole.notes)
 
 
 def test_segments_that_have_ended_are_packed_and_say_the_same(tmp_path: Path) -> None:
@@ -116,7 +116,7 @@ def test_a_segment_that_was_cut_is_read_up_to_the_cut(tmp_path: Path, cut: int) 
     path = tmp_path / segment.segment_name(1, 1.7e9)
     writer = SegmentWriter(path, SAMPLES)
     for first in range(0, 100, 10):
-        writer.samples([rows(first, 10)], DaemonState())
+        writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
     data = path.read_bytes()
     path.write_bytes(data[:-cut])
@@ -140,7 +140,7 @@ def test_a_segment_that_is_packed_while_it_is_opened_is_read_whole(
     path = tmp_path / segment.segment_name(1, 1.7e9)
     writer = SegmentWriter(path, SAMPLES)
     for first in range(0, 100, 10):
-        writer.samples([rows(first, 10)], DaemonState())
+        writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
     opened = segment.open_regular
 
@@ -168,7 +168,7 @@ class Broken(SegmentWriter):
     refused = 0
     released = threading.Event()
 
-    def samples(self, blocks, state) -> None:
+    def write_samples(self, blocks, state) -> None:
         assert Broken.released.wait(PATIENCE_S)
         if Broken.why is not None:
             Broken.refused += 1
@@ -176,7 +176,7 @@ class Broken(SegmentWriter):
             self._file.truncate(self._valid_bytes)
             self._file.seek(self._valid_bytes)
             raise OSError(Broken.why, os.strerror(Broken.why))
-        super().samples(blocks, state)
+        super().write_samples(blocks, state)
 
 
 @pytest.fixture
