@@ -6,13 +6,12 @@ from typing import Annotated, Final
 import typer
 
 from monitor.cli import output
+from monitor.cli.errors import FAILED
 
 SCHEMA: Final = "imu-monitor/doctor/1"
 """Schema of the JSON."""
 SIGNS: Final = {"well": "[green]✓[/]", "doubt": "[yellow]![/]", "wrong": "[red]✗[/]"}
 """Sign of each mark in the table."""
-WRONG: Final = 1
-"""Exit status if a finding is wrong."""
 
 
 def doctor(
@@ -33,7 +32,7 @@ def doctor(
     if json != Path("-"):
         _print(findings)
     if checks.worst_mark(findings) == "wrong":
-        raise typer.Exit(WRONG)
+        raise typer.Exit(FAILED)
 
 
 def _print(findings: list) -> None:  # type: ignore[type-arg]

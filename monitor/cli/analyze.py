@@ -1,0 +1,55 @@
+"""Command ``analyze``: prints the Allan deviation and the noise coefficients of a recording."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers.errors import ConfigError, NotReady
+from monitor.cli import options, output
+
+
+def analyze(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
+    rate: options.Rate = None,
+    last: options.Last = None,
+    tau: Annotated[
+        str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or seconds.")
+    ] = "octave",
+    window: Annotated[
+        str | None, typer.Option(metavar="S", help="Curves over time too, in a window of S seconds; also 5min, 1h.")
+    ] = None,
+    rest: Annotated[bool, typer.Option("--rest", help="Strike out stretches in which the sensor moved.")] = False,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png|.html", help="The curves as a picture, or all of it as a page.")
+    ] = None,
+) -> None:
+    """Allan deviation of a recording, with Q, N, B, K, R and their intervals; motion and changes in it."""
+    from monitor.commands import analyze as offline
+    from monitor.publishing.messages import encoding
+
+    if plot is not None and plot.suffix not in (".png", ".html"):
+        raise ConfigError(f"--plot: {plot}: a name ending in .png or .html is needed")
+    window_s = options.duration("--window", window)
+    last_s = options.duration("--last", last)
+    wanted = offline.Request(recording, rate, options.tau(tau), window_s, rest, bool(json or plot), last_s)
+    try:
+        with output.progress() as tell:
+            output.compile_kernels(tell)
+            results = offline.run_analysis(wanted, tell)
+    except offline.TooFewSamples as error:
+        if json is not None:
+            output.write("--json", json, encoding.encode_failed_analysis(str(error), error.samples) + b"\n")
+        raise
+    if json is not None:
+        payload = encoding.encode_analysis(
+            results.analysis, results.total, results.hadamard, results.dynamic, results.without_temperature
+        )
+        output.write("--json", json, payload + b"\n")
+    if plot is not None:
+        offline.draw_plots(results, plot, recording.name)
+    if json != Path("-"):
+        output.print_analysis(results.analysis)
+    if results.lacking:
+        raise NotReady(results.lacking)

@@ -1,0 +1,23 @@
+"""Command ``run``: runs the service."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from monitor.cli import options, terminal_session
+
+
+def run(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="Configuration file.")],
+    seconds: options.Seconds = None,
+    viewer: options.Viewer = None,
+    history: Annotated[
+        str | None, typer.Option(metavar="S", help="Open the live view on what was: 1d, 12h; needs [storage].")
+    ] = None,
+) -> None:
+    """The daemon: every device in the file, until a signal."""
+    from monitor.settings import loading
+
+    found = terminal_session.with_history(loading.load(config, pipe=True), options.duration("--history", history))
+    terminal_session.serve(found, seconds, viewer)

@@ -1,0 +1,21 @@
+"""Command ``view``: shows several daemons in one viewer."""
+
+from typing import Annotated
+
+import typer
+
+from monitor.cli import options, terminal_session
+
+
+def view(
+    keyexpr: options.KeyExpr = "imu/**",
+    connect: options.Connect = None,
+    zenoh: options.ZenohFile = None,
+    detail: Annotated[
+        list[str] | None, typer.Option(metavar="DEVICE", help="Show its samples and curves too; repeatable.")
+    ] = None,
+    viewer: options.Viewer = None,
+    seconds: options.Seconds = None,
+) -> None:
+    """One viewer for any number of daemons, from zenoh alone: a table of all, chosen devices in detail."""
+    terminal_session.view(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)
