@@ -14,18 +14,22 @@ def analyze(
     rate: options.Rate = None,
     last: options.Last = None,
     tau: Annotated[
-        str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or seconds.")
+        str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or a list of seconds.")
     ] = "octave",
     window: Annotated[
-        str | None, typer.Option(metavar="S", help="Curves over time too, in a window of S seconds; also 5min, 1h.")
+        str | None,
+        typer.Option(
+            metavar="S", help="Also compute Allan deviations over time, in a window of S seconds; also 5min, 1h."
+        ),
     ] = None,
-    rest: Annotated[bool, typer.Option("--rest", help="Strike out stretches in which the sensor moved.")] = False,
+    rest: Annotated[bool, typer.Option("--rest", help="Leave out periods in which the sensor moved.")] = False,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     plot: Annotated[
-        Path | None, typer.Option(metavar="FILE.png|.html", help="The curves as a picture, or all of it as a page.")
+        Path | None,
+        typer.Option(metavar="FILE.png|.html", help="Allan deviations as a picture, or the whole result as a page."),
     ] = None,
 ) -> None:
-    """Allan deviation of a recording, with Q, N, B, K, R and their intervals; motion and changes in it."""
+    """Print the Allan deviation of a recording, Q, N, B, K, R with confidence intervals, motion and changes."""
     from monitor.commands import analyze as offline
     from monitor.publishing.messages import encoding
 

@@ -9,22 +9,23 @@ from monitor.cli import options, terminal_session
 
 def demo(
     sensor: Annotated[
-        str | None, typer.Option(metavar="NAME|MODEL.toml", help="A sensor of the catalogue, or a model file.")
+        str | None, typer.Option(metavar="NAME|MODEL.toml", help="Name of a shipped sensor model, or a model file.")
     ] = None,
     effect: Annotated[
         list[str] | None,
         typer.Option(
             metavar="AXIS.EFFECT:P=V,…",
-            help="An effect that the sensor takes on, e.g. gz.sinusoidal:amplitude=3e-3,frequency=17; repeatable.",
+            help="Effect that begins later, e.g. gz.sinusoidal:amplitude=3e-3,frequency=17; repeatable.",
         ),
     ] = None,
     effect_at: Annotated[
-        str | None, typer.Option(metavar="S", help="When, after the start; 90 s, by then changes are looked for.")
+        str | None,
+        typer.Option(metavar="S", help="Start time of the effects; 90 s by default, when change detection is active."),
     ] = None,
     seconds: options.Seconds = None,
     viewer: options.Viewer = None,
 ) -> None:
-    """The whole service on a simulated MEMS IMU that speaks a real wire format over a pseudo-terminal."""
+    """Run the service on a simulated MEMS IMU that sends a real wire format over a pseudo-terminal."""
     from monitor.simulator.demo import demo_config as configuration
 
     terminal_session.serve(

@@ -16,11 +16,12 @@ SIGNS: Final = {"well": "[green]✓[/]", "doubt": "[yellow]![/]", "wrong": "[red
 
 def doctor(
     config: Annotated[
-        Path | None, typer.Argument(metavar="[CONFIG.toml]", help="Configuration file; else the machine alone.")
+        Path | None,
+        typer.Argument(metavar="[CONFIG.toml]", help="Configuration file; by default only the machine is checked."),
     ] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Findings as JSON; - = standard output.")] = None,
 ) -> None:
-    """Look at this machine and a configuration before they are left alone; opens no device."""
+    """Check this machine and a configuration for unattended operation. No device is opened."""
     import msgspec
 
     from monitor.commands import doctor as checks

@@ -14,14 +14,18 @@ def export(
         Path,
         typer.Argument(metavar="MODEL.toml|RESULT.json", help="Model, or JSON of analyze; - = standard input."),
     ],
-    form: Annotated[str, typer.Option("--format", metavar="kalibr|gyroparams|kalman", help="For which tool.")],
+    form: Annotated[
+        str, typer.Option("--format", metavar="kalibr|gyroparams|kalman", help="Tool that reads the parameters.")
+    ],
     inflation: options.Inflation = 1.0,
     dt: options.TimeStep = None,
     correlation_time: options.CorrelationTime = None,
-    rostopic: Annotated[str | None, typer.Option(metavar="T", help="kalibr: topic of the IMU; /imu0.")] = None,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where to write; else standard output.")] = None,
+    rostopic: Annotated[
+        str | None, typer.Option(metavar="T", help="kalibr: topic of the IMU; /imu0 by default.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="File to write; by default standard output.")] = None,
 ) -> None:
-    """Noise parameters for other tools: Kalibr's imu.yaml, MATLAB's gyroparams, a Kalman filter's F and Q."""
+    """Write noise parameters for other tools: Kalibr's imu.yaml, MATLAB's gyroparams, F and Q of a Kalman filter."""
     from monitor.publishing import exporters as exports
 
     keys = {"dt_s": dt, "correlation_time_s": correlation_time, "rostopic": rostopic}

@@ -14,14 +14,16 @@ from monitor.cli import options, output, terminal_session
 def reconcile(
     recordings: Annotated[
         list[Path],
-        typer.Argument(metavar="RECORDING…", help="File, or folder of segments; several of one sensor are compared."),
+        typer.Argument(
+            metavar="RECORDING…", help="File, or folder of segments; several recordings of one sensor are compared."
+        ),
     ],
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the report and the augmented model.")],
     model: Annotated[
         str | None,
         typer.Option(
             metavar="MODEL.toml|NAME",
-            help="Model under test; else the five classic terms are fitted first, to the first recording.",
+            help="Model under test; by default Q, N, B, K and R are fitted to the first recording.",
         ),
     ] = None,
     seed: options.ReportSeed = 1,
@@ -29,7 +31,7 @@ def reconcile(
     last: options.Last = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
-    """Where recording and model disagree, which effect is missing, and what is left once it is added."""
+    """Find where recording and model disagree, which effects are missing, and what remains with these effects."""
     check_extra("reconcile", "reconcile")
     from rich.console import Console
 

@@ -13,10 +13,11 @@ def run(
     seconds: options.Seconds = None,
     viewer: options.Viewer = None,
     history: Annotated[
-        str | None, typer.Option(metavar="S", help="Open the live view on what was: 1d, 12h; needs [storage].")
+        str | None,
+        typer.Option(metavar="S", help="Show the last part of the history in the live view: 1d, 12h; needs [storage]."),
     ] = None,
 ) -> None:
-    """The daemon: every device in the file, until a signal."""
+    """Run the service for all devices of a file, until a signal."""
     from monitor.settings import loading
 
     found = terminal_session.with_history(loading.load(config, pipe=True), options.duration("--history", history))

@@ -11,22 +11,25 @@ from monitor.cli import options, output, terminal_session
 
 
 def simulate(
-    model: Annotated[str, typer.Argument(metavar="MODEL.toml|NAME", help="Model file, or one of the catalogue.")],
+    model: Annotated[str, typer.Argument(metavar="MODEL.toml|NAME", help="Model file, or name of a shipped model.")],
     seconds: Annotated[str, typer.Option(metavar="S", help="Length in seconds; also 30min, 1h, 2d.")],
     out: Annotated[
-        Path, typer.Option(metavar="FILE", help="What to write: .csv, .csv.gz, .npz, .parquet, .arrow, .feather.")
+        Path, typer.Option(metavar="FILE", help="Recording to write: .csv, .csv.gz, .npz, .parquet, .arrow, .feather.")
     ],
     seed: options.SimulationSeed = 1,
     rate: options.ModelRate = None,
     temperature_from: Annotated[
-        Path | None, typer.Option(metavar="RECORDING", help="Take the temperature of this recording.")
+        Path | None, typer.Option(metavar="RECORDING", help="Use the temperature of this recording.")
     ] = None,
     truth: Annotated[
-        bool, typer.Option("--truth", help="Write FILE.truth.json too: the model, and what was drawn from the seed.")
+        bool,
+        typer.Option(
+            "--truth", help="Also write FILE.truth.json with the model and the random values drawn from the seed."
+        ),
     ] = False,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
-    """A recording from a model, of any length; it appears whole or not at all."""
+    """Write a recording of a noise model. An incomplete file never appears."""
     from monitor.commands import simulate as simulation
     from monitor.noise.catalogue import load_model
 

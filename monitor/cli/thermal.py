@@ -17,14 +17,17 @@ def thermal_fit(
     recording: RecordingPath,
     out: Annotated[Path | None, typer.Option(metavar="MODEL.json", help="Where to write the model.")] = None,
     interval: Annotated[
-        str | None, typer.Option(metavar="S", help="Length of a mean; also 10min, 1h. Else about 72 in the recording.")
+        str | None,
+        typer.Option(
+            metavar="S", help="Averaging interval; also 10min, 1h. By default about 72 intervals per recording."
+        ),
     ] = None,
     rate: options.Rate = None,
     last: options.Last = None,
     json: JsonPath = None,
     plot: PlotPath = None,
 ) -> None:
-    """Fit the bias of each axis as a function of temperature and its past."""
+    """Fit the bias of each axis as a function of the temperature and its history."""
     from rich.console import Console
 
     from monitor.commands import thermal
@@ -50,13 +53,13 @@ def thermal_fit(
 
 def thermal_predict(
     recording: RecordingPath,
-    model: Annotated[Path, typer.Option(metavar="MODEL.json", help="What thermal fit wrote.")],
+    model: Annotated[Path, typer.Option(metavar="MODEL.json", help="Model file that thermal fit has written.")],
     rate: options.Rate = None,
     last: options.Last = None,
     json: JsonPath = None,
     plot: PlotPath = None,
 ) -> None:
-    """What a model expects of another recording's bias, and how far off it is."""
+    """Predict the bias of another recording with a model, and print the errors of the prediction."""
     from rich.console import Console
 
     from monitor.commands import thermal

@@ -12,10 +12,11 @@ def view(
     connect: options.Connect = None,
     zenoh: options.ZenohFile = None,
     detail: Annotated[
-        list[str] | None, typer.Option(metavar="DEVICE", help="Show its samples and curves too; repeatable.")
+        list[str] | None,
+        typer.Option(metavar="DEVICE", help="Also show samples and Allan deviations of this device; repeatable."),
     ] = None,
     viewer: options.Viewer = None,
     seconds: options.Seconds = None,
 ) -> None:
-    """One viewer for any number of daemons, from zenoh alone: a table of all, chosen devices in detail."""
+    """Show any number of daemons in one viewer: a table of all devices, and chosen devices in detail."""
     terminal_session.view(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)

@@ -11,7 +11,7 @@ def watch(
     zenoh: options.ZenohFile = None,
     seconds: options.Seconds = None,
 ) -> None:
-    """A live table of any number of daemons, from zenoh alone."""
+    """Show a live table of any number of daemons, received over zenoh."""
     from rich.console import Console
 
     from monitor.publishing.terminal.live_table import watch as show
