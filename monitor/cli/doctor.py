@@ -6,22 +6,22 @@ from typing import Annotated, Final
 import typer
 
 from monitor.cli import output
+from monitor.cli.errors import FAILED
 
 SCHEMA: Final = "imu-monitor/doctor/1"
 """Schema of the JSON."""
 SIGNS: Final = {"well": "[green]✓[/]", "doubt": "[yellow]![/]", "wrong": "[red]✗[/]"}
 """Sign of each mark in the table."""
-WRONG: Final = 1
-"""Exit status if a finding is wrong."""
 
 
 def doctor(
     config: Annotated[
-        Path | None, typer.Argument(metavar="[CONFIG.toml]", help="Configuration file; else the machine alone.")
+        Path | None,
+        typer.Argument(metavar="[CONFIG.toml]", help="Configuration file; by default only the machine is checked."),
     ] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Findings as JSON; - = standard output.")] = None,
 ) -> None:
-    """Look at this machine and a configuration before they are left alone; opens no device."""
+    """Check this machine and a configuration for unattended operation. No device is opened."""
     import msgspec
 
     from monitor.commands import doctor as checks
@@ -33,7 +33,7 @@ def doctor(
     if json != Path("-"):
         _print(findings)
     if checks.worst_mark(findings) == "wrong":
-        raise typer.Exit(WRONG)
+        raise typer.Exit(FAILED)
 
 
 def _print(findings: list) -> None:  # type: ignore[type-arg]

@@ -24,27 +24,32 @@ Get = Callable[["HistoryQuery"], "HistoryTable"]
 
 def history(
     source: Annotated[
-        Path | None, typer.Argument(metavar="[CONFIG.toml|FOLDER]", help="Whose history: configuration, or its folder.")
+        Path | None, typer.Argument(metavar="[CONFIG.toml|FOLDER]", help="Configuration file, or folder of [storage].")
     ] = None,
     connect: Annotated[
-        str | None, typer.Option(metavar="ENDPOINT", help="Ask a running daemon instead, e.g. tcp/127.0.0.1:7450.")
+        str | None, typer.Option(metavar="ENDPOINT", help="Query a running daemon instead, e.g. tcp/127.0.0.1:7450.")
     ] = None,
     zenoh: options.ZenohFile = None,
-    prefix: Annotated[str, typer.Option(metavar="KEY", help="Of the daemon's keys.")] = "imu",
-    device: Annotated[str | None, typer.Option(metavar="NAME", help="Which device, where there are several.")] = None,
+    prefix: Annotated[str, typer.Option(metavar="KEY", help="Prefix of the keys of the daemon.")] = "imu",
+    device: Annotated[str | None, typer.Option(metavar="NAME", help="Device; needed if there are several.")] = None,
     since: Annotated[
-        str | None, typer.Option("--from", metavar="T", help="-1d, 2026-11-20, 2026-11-20T14:30; the last day.")
+        str | None,
+        typer.Option("--from", metavar="T", help="Start: -1d, 2026-11-20, 2026-11-20T14:30; by default -1d."),
     ] = None,
-    until: Annotated[str | None, typer.Option("--to", metavar="T", help="As --from.")] = None,
-    step: Annotated[str | None, typer.Option(metavar="S", help="Rows at least so long: 15min, 1h, 1d.")] = None,
-    axis: Annotated[str | None, typer.Option(metavar="AXIS", help="One axis over time: gz.")] = None,
+    until: Annotated[
+        str | None, typer.Option("--to", metavar="T", help="End, written like the start; by default now.")
+    ] = None,
+    step: Annotated[str | None, typer.Option(metavar="S", help="Minimum time per row: 15min, 1h, 1d.")] = None,
+    axis: Annotated[str | None, typer.Option(metavar="AXIS", help="Print one axis over time: gz.")] = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="All numbers as a table: .csv, .parquet, .npz, .arrow.")
     ] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Courses and events as a picture.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Coefficients over time and events as a picture.")
+    ] = None,
 ) -> None:
-    """What the noise was: coefficients, temperature, losses and events of hours or years."""
+    """Print past coefficients, temperatures, losses and events of hours or years."""
     from rich.console import Console
 
     from drivers.sample import AXES

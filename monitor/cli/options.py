@@ -46,39 +46,50 @@ def within(quantity: Quantity) -> Callable[[typer.CallbackParam, Number | None],
     return check
 
 
-KeyExpr = Annotated[str, typer.Argument(metavar="[KEYEXPR]", help="Which keys to show.")]
+Viewer = Annotated[
+    str | None, typer.Option(metavar="auto|native|web|none|FILE.rrd", help="Where to show the live view.")
+]
+KeyExpr = Annotated[str, typer.Argument(metavar="[KEYEXPR]", help="Keys to show.")]
 Connect = Annotated[
     list[str] | None, typer.Option(metavar="ENDPOINT", help="Daemon or router, e.g. tcp/127.0.0.1:7450; repeatable.")
 ]
 ZenohFile = Annotated[
     Path | None,
-    typer.Option("--zenoh", metavar="FILE.json5", help="A zenoh file: certificates, user and password, endpoints."),
+    typer.Option("--zenoh", metavar="FILE.json5", help="zenoh file: certificates, user and password, endpoints."),
 ]
 Rate = Annotated[
     float | None,
-    typer.Option(metavar="HZ", help="Sample rate, where the file says none.", callback=within(RATE_HZ)),
+    typer.Option(
+        metavar="HZ", help="Sample rate for a recording that has neither times nor a rate.", callback=within(RATE_HZ)
+    ),
 ]
 ModelRate = Annotated[
     float | None,
-    typer.Option(metavar="HZ", help="Sample rate; the model's own unless given.", callback=within(RATE_HZ)),
+    typer.Option(metavar="HZ", help="Sample rate; by default that of the model.", callback=within(RATE_HZ)),
 ]
-Seconds = Annotated[
-    float | None, typer.Option(metavar="S", help="Stop by itself after S seconds.", callback=within(RUN_TIME_S))
+Seconds = Annotated[float | None, typer.Option(metavar="S", help="Stop after S seconds.", callback=within(RUN_TIME_S))]
+SimulationSeed = Annotated[
+    int, typer.Option(metavar="N", help="Seed of the random numbers: same seed, same recording.", callback=within(SEED))
 ]
-SimulationSeed = Annotated[int, typer.Option(metavar="N", help="Same seed, same recording.", callback=within(SEED))]
-ReportSeed = Annotated[int, typer.Option(metavar="N", help="Same seed, same report.", callback=within(SEED))]
+ReportSeed = Annotated[
+    int, typer.Option(metavar="N", help="Seed of the random numbers: same seed, same report.", callback=within(SEED))
+]
 Inflation = Annotated[
     float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=within(INFLATION))
 ]
 TimeStep = Annotated[
     float | None,
-    typer.Option(metavar="S", help="kalman: time step; the samples' own unless given.", callback=within(DURATION_S)),
+    typer.Option(metavar="S", help="kalman: time step; by default the sample period.", callback=within(DURATION_S)),
 ]
 CorrelationTime = Annotated[
     float | None,
-    typer.Option(metavar="S", help="kalman: of the process that stands for B.", callback=within(DURATION_S)),
+    typer.Option(
+        metavar="S", help="kalman: correlation time of the process that represents B.", callback=within(DURATION_S)
+    ),
 ]
-Last = Annotated[str | None, typer.Option(metavar="S", help="The end of the recording alone; also 1h, 1d.")]
+Last = Annotated[
+    str | None, typer.Option(metavar="S", help="Use only the last S seconds of the recording; also 1h, 1d.")
+]
 
 
 def tau(text: str) -> "TauGrid":

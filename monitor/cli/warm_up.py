@@ -11,7 +11,7 @@ from monitor.cli import output
 
 
 def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True)] = False) -> None:
-    """Compile the numerical kernels and keep them on disk, so that the next start is quick; then end."""
+    """Compile the numerical kernels and keep them on disk, so that the next start is quick."""
     from monitor.common.compiled import cache_folder
     from monitor.daemon import kernel_compilation, kernel_parts
 

@@ -12,6 +12,7 @@ not counted.
 
 import ctypes
 import errno
+import operator
 import os
 import re
 import shutil
@@ -20,7 +21,7 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from importlib.util import find_spec
@@ -34,6 +35,7 @@ from drivers.links.replay_link import ReplayLink
 from drivers.quantities import DAY_S
 from monitor.commands.check import check
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, lock_holder
+from monitor.settings.file_permissions import contains_secret
 from monitor.settings.loading import Config, Storage
 
 Mark = Literal["well", "doubt", "wrong"]
@@ -59,8 +61,6 @@ PACKAGE: Final = "imu-monitor"
 """Name of the distribution package."""
 PACKAGES: Final = ("monitor", "drivers")
 """Import packages of the program. Their names are common, so other packages may have the same."""
-PROJECT_FILE: Final = Path(__file__).resolve().parents[2] / "pyproject.toml"
-"""Project file of a checkout."""
 TCP_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
 """Regular expression for the host and the port of a zenoh endpoint over TCP or TLS."""
 REQUIREMENT: Final = re.compile(r"([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;(.*))?")
@@ -135,16 +135,16 @@ def check_permissions(path: Path, about: str = "permissions", secret: bool = Tru
         return [Finding("wrong", about, f"{path}: {error.strerror or error}")]
     mode = stat.S_IMODE(seen.st_mode)
     if mode & stat.S_IWOTH:
-        text = f"{path}: everyone may write it, and so have commands run as the service's user"
+        text = f"{path}: everyone can write it, and run commands as the user of the service"
         return [Finding("wrong", about, text, f"chmod o-w {path}")]
     if seen.st_uid not in (0, os.geteuid()):
-        text = f"{path}: belongs to another user ({_user(seen.st_uid)}), who may change what the service does"
+        text = f"{path}: belongs to another user ({_user(seen.st_uid)}), who can change what the service does"
         return [Finding("doubt", about, text, f"chown root {path}")]
     if mode & stat.S_IWGRP:
-        text = f"{path}: the group {_group(seen.st_gid)} may write it"
+        text = f"{path}: the group {_group(seen.st_gid)} can write it"
         return [Finding("doubt", about, text, f"chmod g-w {path}")]
-    if secret and mode & stat.S_IROTH and _has_secret(path):
-        text = f"{path}: everyone may read the password in it"
+    if secret and mode & stat.S_IROTH and contains_secret(path):
+        text = f"{path}: everyone can read the password in it"
         return [Finding("wrong", about, text, f"chmod o-r {path}")]
     return [Finding("well", about, f"{path}: {mode:04o}, owner {_user(seen.st_uid)}")]
 
@@ -174,7 +174,7 @@ def check_device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
             endpoints = driver.get("connect", [])
             return [one for endpoint in endpoints for one in reachable(about, str(endpoint))]
         case other:
-            return [Finding("well", about, f"link {other}: nothing to look for on this machine")]
+            return [Finding("well", about, f"link {other}: nothing to check on this machine")]
 
 
 def check_serial_port(about: str, port: str) -> list[Finding]:
@@ -188,24 +188,28 @@ def check_serial_port(about: str, port: str) -> list[Finding]:
         Path or URL of the port.
     """
     if "://" in port:
-        return [Finding("well", about, f"{port}: a port of the network or a pattern, not tried from here")]
+        return [Finding("well", about, f"{port}: network port or pattern, not checked")]
     path = Path(port)
     if not path.exists():
         there = sorted(str(one) for kind in ("ttyUSB*", "ttyACM*", "ttyAMA*") for one in Path("/dev").glob(kind))
-        text = f"{port}: there is no such port; there are {', '.join(there) or 'none that look like a sensor'}"
-        return [Finding("wrong", about, text, "plug it in, or name another one; dmesg says what was plugged in last")]
+        text = f"{port}: no such port; existing ports: {', '.join(there) or 'none'}"
+        return [
+            Finding("wrong", about, text, "plug it in, or choose another port; dmesg shows what was plugged in last")
+        ]
     seen = path.stat()
     if not stat.S_ISCHR(seen.st_mode):
-        return [Finding("wrong", about, f"{port}: is no serial port")]
+        return [Finding("wrong", about, f"{port}: not a serial port")]
     if not os.access(path, os.R_OK | os.W_OK):
         group = _group(seen.st_gid)
-        text = f"{port}: {_user(os.geteuid())} may not read and write it; its group {group} may"
+        text = f"{port}: {_user(os.geteuid())} cannot read and write it; members of group {group} can"
         return [Finding("wrong", about, text, f"sudo usermod -aG {group} {_user(os.geteuid())}, and log in again")]
     holders = list(processes_using(path))
     if holders:
-        text = f"{port}: held by {', '.join(holders)}"
-        return [Finding("doubt", about, text, "if that is not the service itself, end it: a port has one reader")]
-    return [Finding("well", about, f"{port}: there, may be read, held by no program that can be seen from here")]
+        text = f"{port}: in use by {', '.join(holders)}"
+        return [
+            Finding("doubt", about, text, "if this is not the service itself, end it: only one program can read a port")
+        ]
+    return [Finding("well", about, f"{port}: exists, is readable, and no visible program uses it")]
 
 
 def processes_using(port: Path) -> Iterator[str]:
@@ -242,19 +246,19 @@ def check_can_interface(
         text, _, command = missing.partition(": ")
         return [Finding("wrong", about, text, command)]
     if interface != "socketcan":
-        return [Finding("well", about, f"{interface} {channel}: not tried, only its own driver could tell")]
+        return [Finding("well", about, f"{interface} {channel}: not checked")]
     if not hasattr(socket, "AF_CAN"):
         return [Finding("wrong", about, "this system has no socketcan", "use another interface of python-can")]
     network = sysfs / channel
-    up = f"sudo ip link set {channel} up type can bitrate 500000, with the bus's own bit rate"
+    up = f"sudo ip link set {channel} up type can bitrate 500000, with the bit rate of the bus"
     try:
         kind, flags = (network / "type").read_text().strip(), int((network / "flags").read_text(), 16)
     except OSError:
-        kinds = {one.name: _read(one / "type") for one in sysfs.glob("*")} if sysfs.is_dir() else {}
-        there = ", ".join(sorted(name for name, one in kinds.items() if one == CAN_TYPE)) or "none"
-        return [Finding("wrong", about, f"{channel}: there is no such interface; CAN interfaces are: {there}", up)]
+        types = [one for one in sysfs.glob("*/type") if os.access(one, os.R_OK) and one.read_text().strip() == CAN_TYPE]
+        there = ", ".join(sorted(one.parent.name for one in types)) or "none"
+        return [Finding("wrong", about, f"{channel}: no such interface; existing CAN interfaces: {there}", up)]
     if kind != CAN_TYPE:
-        return [Finding("wrong", about, f"{channel}: is no CAN interface", up)]
+        return [Finding("wrong", about, f"{channel}: not a CAN interface", up)]
     if not flags & 1:  # IFF_UP
         return [Finding("wrong", about, f"{channel}: is down", up)]
     return [Finding("well", about, f"{channel}: is up")]
@@ -273,7 +277,7 @@ def check_zenoh(config: Config) -> list[Finding]:
     for endpoint in own.listen or ():
         host = _host(endpoint)
         if host and not host.startswith(LOOPBACK) and own.config is None:
-            text = f"{endpoint}: whoever reaches this machine may read all and command it"
+            text = f"{endpoint}: everyone who reaches this machine can read all data and send commands"
             found.append(Finding("doubt", "zenoh", text, "listen on 127.0.0.1, or use TLS and access control"))
     if own.config is not None:
         found += check_permissions(own.config, "zenoh file")
@@ -292,19 +296,23 @@ def port_is_free(about: str, endpoint: str) -> list[Finding]:
     """
     match = TCP_ENDPOINT.fullmatch(endpoint)
     if match is None:
-        return [Finding("well", about, f"{endpoint}: not tried, only TCP ports can be from here")]
+        return [Finding("well", about, f"{endpoint}: not checked, since only TCP ports can be checked")]
     if int(match[2]) > MAX_PORT:
-        return [Finding("wrong", about, f"{endpoint}: cannot be listened on: ports end at {MAX_PORT}")]
+        return [Finding("wrong", about, f"{endpoint}: cannot listen: the largest port is {MAX_PORT}")]
     try:
         family = socket.AF_INET6 if ":" in match[1] else socket.AF_INET
         with socket.create_server((match[1], int(match[2])), family=family):
-            return [Finding("well", about, f"{endpoint}: free to listen on")]
+            return [Finding("well", about, f"{endpoint}: free")]
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             text = f"{endpoint}: another program listens there"
-            return [Finding("doubt", about, text, "well if it is this service; else end it or name another port")]
+            return [
+                Finding(
+                    "doubt", about, text, "no problem if it is this service; otherwise end it, or choose another port"
+                )
+            ]
         why = getattr(error, "strerror", None) or error
-        return [Finding("wrong", about, f"{endpoint}: cannot be listened on: {why}")]
+        return [Finding("wrong", about, f"{endpoint}: cannot listen: {why}")]
 
 
 def reachable(about: str, endpoint: str) -> list[Finding]:
@@ -319,15 +327,19 @@ def reachable(about: str, endpoint: str) -> list[Finding]:
     """
     match = TCP_ENDPOINT.fullmatch(endpoint)
     if match is None:
-        return [Finding("well", about, f"{endpoint}: not tried, only TCP can be from here")]
+        return [Finding("well", about, f"{endpoint}: not checked, since only TCP endpoints can be checked")]
     if int(match[2]) > MAX_PORT:
-        return [Finding("wrong", about, f"{endpoint}: nobody answers: ports end at {MAX_PORT}")]
+        return [Finding("wrong", about, f"{endpoint}: no answer: the largest port is {MAX_PORT}")]
     try:
         with socket.create_connection((match[1], int(match[2])), timeout=CONNECT_TIMEOUT_S):
-            return [Finding("well", about, f"{endpoint}: somebody answers")]
+            return [Finding("well", about, f"{endpoint}: answers")]
     except (OSError, UnicodeError) as error:
-        text = f"{endpoint}: nobody answers: {getattr(error, 'strerror', None) or error}"
-        return [Finding("doubt", about, text, "start it, or look at cables and firewalls; the service tries again")]
+        text = f"{endpoint}: no answer: {getattr(error, 'strerror', None) or error}"
+        return [
+            Finding(
+                "doubt", about, text, "start the program there, or check cables and firewalls; the service tries again"
+            )
+        ]
 
 
 def check_viewer(config: Config) -> list[Finding]:
@@ -335,9 +347,9 @@ def check_viewer(config: Config) -> list[Finding]:
     if config.viewer.mode == "none":
         return []
     if find_spec("rerun") is None:
-        text = f'viewer.mode is "{config.viewer.mode}", and rerun-sdk is not installed: there will be no view'
+        text = f'viewer.mode is "{config.viewer.mode}", but rerun-sdk is not installed: there will be no live view'
         return [Finding("doubt", "viewer", text, 'pip install "imu-monitor[viewer]", or mode = "none"')]
-    return [Finding("well", "viewer", f"rerun-sdk is there, mode {config.viewer.mode}")]
+    return [Finding("well", "viewer", f"rerun-sdk is installed, mode {config.viewer.mode}")]
 
 
 def check_metrics(config: Config) -> list[Finding]:
@@ -346,13 +358,13 @@ def check_metrics(config: Config) -> list[Finding]:
     if own is None:
         return []
     if find_spec("prometheus_client") is None:
-        text = "metrics.listen is set, and prometheus-client is not installed"
+        text = "metrics.listen is set, but prometheus-client is not installed"
         return [Finding("wrong", "metrics", text, 'pip install "imu-monitor[metrics]"')]
     host = f"[{own.host}]" if ":" in own.host else own.host
     found = port_is_free("metrics", f"tcp/{host}:{own.port}")
     if not own.host.startswith(LOOPBACK):
-        text = f"{own.host}: whoever reaches this machine may read the numbers"
-        found.append(Finding("doubt", "metrics", text, "listen on 127.0.0.1, and let a local agent forward them"))
+        text = f"{own.host}: everyone who reaches this machine can read the metrics"
+        found.append(Finding("doubt", "metrics", text, "listen on 127.0.0.1, and let a local collector forward them"))
     return found
 
 
@@ -361,7 +373,9 @@ def check_reconcile(config: Config) -> list[Finding]:
     missing = missing_packages("reconcile")
     if not missing or not any(one.reconcile_folder for one in config.devices):
         return []
-    text = f"reconcile_folder is set, and {' and '.join(missing)} is not installed: command/reconcile will be refused"
+    text = (
+        f"reconcile_folder is set, but {' and '.join(missing)} is not installed: the service refuses command/reconcile"
+    )
     return [Finding("doubt", "reconcile", text, 'pip install "imu-monitor[reconcile]"')]
 
 
@@ -369,10 +383,14 @@ def check_storage(config: Config) -> list[Finding]:
     """Check the library for recordings, the storage folder and the free disk space."""
     own = config.storage
     if own is None:
-        return [Finding("doubt", "storage", "nothing is kept: a restart begins with empty windows", "[storage] folder")]
+        return [
+            Finding(
+                "doubt", "storage", "nothing is kept: after a restart the window is empty", "set folder in [storage]"
+            )
+        ]
     found = []
     if (own.record or own.raw) and find_spec("pyarrow") is None:
-        text = "samples are to be recorded, and pyarrow is not installed"
+        text = "samples are to be recorded, but pyarrow is not installed"
         found.append(Finding("wrong", "storage", text, 'pip install "imu-monitor[arrow]"'))
     folder = next(one for one in (own.folder, *own.folder.parents) if os.path.exists(one))
     try:
@@ -382,7 +400,7 @@ def check_storage(config: Config) -> list[Finding]:
         usage = shutil.disk_usage(folder)
     except OSError as error:
         text = f"{own.folder}: cannot be written: {error.strerror or error}"
-        return [*found, Finding("wrong", "storage", text, f"make it, and have {_user(os.geteuid())} own it")]
+        return [*found, Finding("wrong", "storage", text, f"create it, owned by {_user(os.geteuid())}")]
     found += check_in_use(own)
     return [*found, *disk_space(own, bytes_a_day(config), usage.total, usage.free)]
 
@@ -391,7 +409,7 @@ def check_in_use(own: Storage) -> list[Finding]:
     """Check whether another process records into the storage folder or writes its history there."""
     wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
     holders = sorted({held for name, on in wanted.items() if on and (held := lock_holder(own.folder, name))})
-    do = "well if it is this service; else end it, or choose another folder: only one of them records"
+    do = "no problem if it is this service; otherwise end it, or choose another folder: only one program records"
     return [Finding("doubt", "storage", f"{own.folder}: in use by {one}", do) for one in holders]
 
 
@@ -404,7 +422,7 @@ def bytes_a_day(config: Config) -> float | None:
     >>> from monitor.common.config_files import CONFIG_FOLDER
     >>> from monitor.settings.loading import load
     >>> one = load(CONFIG_FOLDER / "demo.toml")
-    >>> kept = Storage(Path("kept"))
+    >>> kept = Storage(folder=Path("kept"))
     >>> bytes_a_day(dataclasses.replace(one, storage=kept)) == one.devices[0].rate_hz * DAY_S * SAMPLE_BYTES
     True
     """
@@ -433,16 +451,16 @@ def disk_space(own: Storage, a_day: float | None, total: int, available: int) ->
     """
     allowed = available - (1.0 - own.disk_share) * total
     if a_day is None:
-        text = f"{own.folder}: {_gb(available)} free; what a day takes is not known, as rates are found from the data"
+        text = f"{own.folder}: {_gb(available)} free; disk use per day unknown, since a device has no configured rate"
         return [Finding("doubt", "storage", text, "add rate to every device")]
     wanted, days = a_day * own.keep_s / DAY_S, max(allowed, 0.0) / a_day if a_day else float("inf")
-    text = f"{own.folder}: {_gb(available)} free, about {_gb(a_day)} a day, {_gb(wanted)} in all that is to be kept"
+    text = f"{own.folder}: {_gb(available)} free, about {_gb(a_day)} per day, {_gb(wanted)} for the whole time of keep"
     if allowed <= 0.0 or days < 1.0:
-        do = "free some room, or record on another disk"
-        return [Finding("wrong", "storage", f"{text}: not room for a day below disk_share", do)]
+        do = "free disk space, or record on another disk"
+        return [Finding("wrong", "storage", f"{text}: not enough for one day below disk_share", do)]
     if wanted > allowed:
         do = "a larger disk, or a shorter keep"
-        return [Finding("doubt", "storage", f"{text}: the oldest will be deleted after about {days:.0f} days", do)]
+        return [Finding("doubt", "storage", f"{text}: the oldest data will be deleted after about {days:.0f} days", do)]
     return [Finding("well", "storage", text)]
 
 
@@ -453,7 +471,13 @@ def check_libraries() -> list[Finding]:
     """Check the version of each library against the requirements of this program."""
     wanted = list(requirements())
     if not wanted:
-        return [Finding("doubt", "libraries", "cannot tell which versions are required: the package is not installed")]
+        return [
+            Finding(
+                "doubt",
+                "libraries",
+                "the required versions are unknown, because the package imu-monitor is not installed",
+            )
+        ]
     wrong, count = [], 0
     for name, versions, optional in wanted:
         try:
@@ -466,7 +490,9 @@ def check_libraries() -> list[Finding]:
         if not satisfies(there, versions):
             text = f"{name} {there} is installed, {versions} is required"
             wrong.append(Finding("wrong", "libraries", text, f'pip install "{name}{versions}"'))
-    return wrong or [Finding("well", "libraries", f"Python {sys.version.split()[0]}, {count} libraries as required")]
+    return wrong or [
+        Finding("well", "libraries", f"Python {sys.version.split()[0]}, {count} libraries with the required versions")
+    ]
 
 
 def requirements() -> Iterator[tuple[str, str, bool]]:
@@ -474,7 +500,7 @@ def requirements() -> Iterator[tuple[str, str, bool]]:
     try:
         lines = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
-        lines = list(_project_requirements())
+        return
     for line in lines:
         match = REQUIREMENT.fullmatch(line.strip())
         if match is None or match[1] == PACKAGE:
@@ -482,19 +508,6 @@ def requirements() -> Iterator[tuple[str, str, bool]]:
         extra = re.search(r"extra\s*==\s*['\"](\w+)['\"]", match[3] or "")
         if extra is None or extra[1] not in ("test", "all"):
             yield match[1], match[2].replace(" ", ""), extra is not None
-
-
-def _project_requirements() -> Iterator[str]:
-    """Yield the requirements of a checkout that is not installed."""
-    import tomllib
-
-    try:
-        project = tomllib.loads(PROJECT_FILE.read_text("utf-8"))["project"]
-    except (OSError, tomllib.TOMLDecodeError, KeyError):
-        return
-    yield from project["dependencies"]
-    for extra, lines in project["optional-dependencies"].items():
-        yield from (f"{line}; extra == '{extra}'" for line in lines)
 
 
 def satisfies(version: str, wanted: str) -> bool:
@@ -512,18 +525,9 @@ def satisfies(version: str, wanted: str) -> bool:
     >>> satisfies("0.41.2", ">=0.41,<0.42"), satisfies("0.42.0", ">=0.41,<0.42"), satisfies("2.0rc1", ">=1.9")
     (True, False, True)
     """
-    compare: dict[str, Callable[[list[int], list[int]], bool]] = {
-        ">=": lambda a, b: a >= b,
-        "<=": lambda a, b: a <= b,
-        ">": lambda a, b: a > b,
-        "<": lambda a, b: a < b,
-        "==": lambda a, b: a == b,
-    }
-    for bound in filter(None, wanted.split(",")):
-        match = re.fullmatch(r"(>=|<=|==|>|<)\s*([\d.]+)", bound)
-        if match is not None and not compare[match[1]](*_same_length(_numbers(version), _numbers(match[2]))):
-            return False
-    return True
+    compare = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt, "==": operator.eq}
+    bounds = re.findall(r"(>=|<=|==|>|<)\s*([\d.]+)", wanted)
+    return all(compare[sign](_numbers(version), _numbers(bound)) for sign, bound in bounds)
 
 
 def check_packages(module_path: Sequence[str]) -> list[Finding]:
@@ -561,19 +565,19 @@ def check_kernels() -> list[Finding]:
 
     folder = cache_folder()
     if folder is None:
-        text = "no folder for compiled kernels can be written: every start compiles them anew, for a minute or two"
+        text = "no folder for compiled kernels is writable: every start compiles them again, for one or two minutes"
         return [Finding("doubt", "kernels", text, "set NUMBA_CACHE_DIR to a folder of the service's user")]
     if not is_warm(SERVICE):
-        text = f"not compiled yet for this version on this machine, in {folder}: the next start takes longer, once"
-        return [Finding("doubt", "kernels", text, "imu-monitor warm-up, as the user of the service")]
-    return [Finding("well", "kernels", f"compiled and kept in {folder}")]
+        text = f"not compiled for this version on this machine, in {folder}: the next start takes longer"
+        return [Finding("doubt", "kernels", text, "run imu-monitor warm-up as the user of the service")]
+    return [Finding("well", "kernels", f"compiled, in {folder}")]
 
 
 def check_clock() -> list[Finding]:
     """Check that the host clock is synchronised, because results carry its time."""
     state = _adjtimex()
     if state is None:
-        return [Finding("doubt", "clock", "cannot tell whether it is synchronised: the system does not say")]
+        return [Finding("doubt", "clock", "the system does not report whether it is synchronised")]
     if state == TIME_ERROR:
         text = "not synchronised: the times of results and recordings will drift, or jump when it is set"
         return [Finding("doubt", "clock", text, "timedatectl set-ntp true, or install chrony")]
@@ -588,7 +592,7 @@ def check_systemd_unit() -> list[Finding]:
     try:
         said = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False).stdout
     except (OSError, subprocess.TimeoutExpired) as error:
-        return [Finding("doubt", "systemd", f"cannot tell: {error}")]
+        return [Finding("doubt", "systemd", f"the state is unknown: {error}")]
     return unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
 
 
@@ -605,11 +609,13 @@ def unit_state(seen: Mapping[str, str]) -> list[Finding]:
     active, restarts = seen.get("ActiveState", ""), seen.get("NRestarts", "0")
     text = f"{UNIT}: {active} ({seen.get('SubState', '')}), {restarts} restarts, {seen.get('UnitFileState', '')}"
     if active == "failed":
-        return [Finding("wrong", "systemd", text, f"journalctl -u {UNIT} -e says why")]
+        return [Finding("wrong", "systemd", text, f"journalctl -u {UNIT} -e shows the reason")]
     if active == "active" and restarts == "0" and seen.get("UnitFileState") == "enabled":
         return [Finding("well", "systemd", text)]
     if active == "active" and restarts == "0":
-        return [Finding("doubt", "systemd", text, f"systemctl enable {UNIT}: else it is not started with the machine")]
+        return [
+            Finding("doubt", "systemd", text, f"systemctl enable {UNIT}; otherwise it does not start with the machine")
+        ]
     return [Finding("doubt", "systemd", text, f"journalctl -u {UNIT} -e; systemctl enable --now {UNIT}")]
 
 
@@ -627,24 +633,10 @@ def _adjtimex() -> int | None:
     return state if state >= 0 else None
 
 
-def _has_secret(path: Path) -> bool:
-    """Return True if a file seems to contain a password."""
-    try:
-        text = file_access.read_small_file(path).decode("utf-8", errors="replace")
-    except OSError:
-        return False
-    return re.search(r"(?i)\b(password|secret|private_key_base64)\b[\"']?\s*[:=]", text) is not None
-
-
-def _numbers(version: str) -> list[int]:
-    """Return the numbers of a version."""
-    return [int(part) for part in re.match(r"[\d.]*", version)[0].split(".") if part]  # type: ignore[index]
-
-
-def _same_length(a: list[int], b: list[int]) -> tuple[list[int], list[int]]:
-    """Pad two lists of numbers with zeros to the same length."""
-    length = max(len(a), len(b))
-    return a + [0] * (length - len(a)), b + [0] * (length - len(b))
+def _numbers(version: str) -> tuple[int, ...]:
+    """Return the first four numbers of a version. Missing numbers are 0."""
+    numbers = [int(part) for part in re.split(r"[^\d.]", version)[0].split(".") if part]
+    return (*numbers, 0, 0, 0, 0)[:4]
 
 
 def _host(endpoint: str) -> str:
@@ -676,14 +668,6 @@ def _group(gid: int) -> str:
         return grp.getgrgid(gid).gr_name
     except KeyError:
         return str(gid)
-
-
-def _read(path: Path) -> str:
-    """Return the content of a file without surrounding white space; "" if it cannot be read."""
-    try:
-        return path.read_text().strip()
-    except OSError:
-        return ""
 
 
 def worst_mark(findings: Iterable[Finding]) -> Mark:

@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -290,6 +291,24 @@ def test_check_accepts_the_defaults_that_it_prints(call: Call) -> None:
     Path("defaults.toml").write_text(printed.out)
     said = call("check", "defaults.toml")
     assert (said.status, said.out, said.err) == (0, "defaults.toml: 1 device, nothing wrong\n", "")
+
+
+def test_check_prints_the_keys_of_one_link_and_one_decoder(call: Call) -> None:
+    printed = call("check", "--print-defaults", "--link", "serial", "--decoder", "text")
+    assert (printed.status, printed.err) == (0, "")
+    assert 'link = "serial"' in printed.out
+    assert "baudrate = 115200" in printed.out
+    assert 'columns = ["gx", ' in printed.out
+    assert "sentence" not in printed.out
+    said = call("check", "--print-defaults", "--decoder", "tekst")
+    assert said.status == 2
+    assert '--decoder: "tekst"; possible are text, ' in said.only_line()
+    assert call("check", "--decoder", "text").status == 2
+
+
+def test_the_version_is_that_of_the_package(call: Call) -> None:
+    said = call("--version")
+    assert (said.status, said.out, said.err) == (0, f"imu-monitor {metadata.version('imu-monitor')}\n", "")
 
 
 # --- arguments -------------------------------------------------------------------------------------

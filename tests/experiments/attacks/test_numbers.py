@@ -15,7 +15,6 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Final, get_args, get_origin, get_type_hints
 
-import msgspec
 import numpy as np
 import pytest
 
@@ -26,13 +25,14 @@ from drivers.errors import ConfigError, ImuError
 from drivers.quantities import Quantity
 from drivers.recordings import load_samples
 from drivers.sample import AXES
+from drivers.settings_model import SettingsModel, WordOr, describe_keys
 from monitor import cli
 from monitor.commands.analyze import Request, run_analysis
 from monitor.common import config_files
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature
-from monitor.settings import loading, schema
+from monitor.settings import driver_settings, loading, schema
 
 pytestmark = pytest.mark.timeout(900)
 ROOT: Final = Path(cli.__file__).resolve().parents[2]
@@ -193,19 +193,19 @@ TOML_VALUES: Final = (
 FEW_TOML: Final = ("-1", "1e-300", "1e300", "nan", '"1e300 Hz"', '"1e300s"')
 
 
-def key_cases() -> Iterator[tuple[str, type[msgspec.Struct], str]]:
-    """A text with {} for ``key = value``, the struct whose keys belong there, and a name."""
+def key_cases() -> Iterator[tuple[str, type[SettingsModel], str]]:
+    """A text with {} for ``key = value``, the model whose keys belong there, and a name."""
     quiet = '[viewer]\nmode = "none"\n'
     virtual = DEVICE.format(keys="", driver=VIRTUAL)
-    yield '[[device]]\nname = "a"\n{}\ndriver = { link = "virtual" }\n', schema.DeviceTable, "device"
+    yield '[[device]]\nname = "a"\n{}\ndriver = { link = "virtual" }\n', schema.Device, "device"
     limit = '[[device.limit]]\naxes = "gz"\nletter = "N"\n{}\n'
-    yield virtual + limit, schema.LimitTable, "limit"
-    yield virtual + "[device.driver.faults]\n{}\n", schema.FaultsTable, "faults"
-    yield DEVICE.format(keys="", driver=VIRTUAL + "\n{}"), schema.VirtualTable, "virtual"
+    yield virtual + limit, schema.Limit, "limit"
+    yield virtual + "[device.driver.faults]\n{}\n", driver_settings.FaultsTable, "faults"
+    yield DEVICE.format(keys="", driver=VIRTUAL + "\n{}"), driver_settings.VirtualTable, "virtual"
     for name, kind in (("viewer", schema.ViewerTable), ("metrics", schema.MetricsTable), ("log", schema.LogTable)):
         yield virtual + f"[{name}]\n{{}}\n", kind, name
-    yield virtual + '[storage]\nfolder = "kept"\n{}\n', schema.StorageTable, "storage"
-    yield virtual + '[[hook]]\non = ["*"]\nkey = "a/b"\n{}\n', schema.HookTable, "hook"
+    yield virtual + '[storage]\nfolder = "kept"\n{}\n', schema.Storage, "storage"
+    yield virtual + '[[hook]]\non = ["*"]\nkey = "a/b"\n{}\n', schema.Hook, "hook"
     yield virtual + quiet + "[zenoh]\n{}\n", schema.ZenohTable, "zenoh"
     for name, driver in (
         ("serial", 'link = "serial"\nport = "/dev/x"\ndecoder = "stim300"\n{}'),
@@ -231,18 +231,18 @@ def key_cases() -> Iterator[tuple[str, type[msgspec.Struct], str]]:
         )
 
 
-def numeric_keys(kind: type[msgspec.Struct]) -> list[str]:
+def numeric_keys(kind: type[SettingsModel]) -> list[str]:
     """Keys that take a number, and keys whose text stands for one."""
     found = []
-    for field in msgspec.structs.fields(kind):
+    for key, field in describe_keys(kind).items():
         worded = isinstance(field.default, str) and any(c.isdigit() for c in field.default)
-        if worded or field.encode_name == "listen" or {int, float} & set(leaves(field.type)):
-            found.append(field.encode_name)
+        if worded or key == "listen" or {int, float} & set(leaves(field.annotation)):
+            found.append(key)
     return found
 
 
 def all_keys() -> list[tuple[str, str, str]]:
-    """Text with {}, key, name; a bool is an int to Python, but not to msgspec."""
+    """Text with {}, key, name; a bool is an int to Python, but not in the settings."""
     return [(text, key, name) for text, kind, name in key_cases() for key in numeric_keys(kind)]
 
 
@@ -292,30 +292,24 @@ def test_every_number_of_the_settings_names_its_quantity() -> None:
     """A new key cannot be forgotten: its type names the range that is supported."""
     lacking = []
     for _, kind, name in key_cases():
-        for field in msgspec.structs.fields(kind):
-            for info in numbers(msgspec.inspect.type_info(field.type)):
-                if not isinstance((info or {}).get("quantity"), Quantity):
-                    lacking.append(f"{name}: {field.encode_name}")
-    # checked against a list of what exists, or passed on to a library as they are
-    assert sorted(set(lacking)) == ["decoder stim300: identifier", "link can: channel", "link serial: stopbits"]
+        for key, field in describe_keys(kind).items():
+            if {int, float} & set(leaves(field.annotation)) and not names_quantity((field.annotation, field.metadata)):
+                lacking.append(f"{name}: {key}")
+    # checked against a list of what exists, converted from a rate with its own check, or passed on to a library
+    assert sorted(set(lacking)) == [
+        *("decoder stim300: identifier", "device: publish", "device: refit"),
+        *("link can: channel", "link serial: stopbits"),
+    ]
 
 
-def numbers(info: Any, extra: dict[str, Any] | None = None) -> Iterator[dict[str, Any] | None]:
-    """``extra`` of every number within a type."""
-    if isinstance(info, msgspec.inspect.Metadata):
-        yield from numbers(info.type, info.extra)
-    elif isinstance(info, msgspec.inspect.IntType | msgspec.inspect.FloatType):
-        yield extra
-    elif isinstance(info, msgspec.inspect.UnionType):
-        for one in info.types:
-            yield from numbers(one)
-    elif isinstance(info, msgspec.inspect.CollectionType):
-        yield from numbers(info.item_type)
-    elif isinstance(info, msgspec.inspect.DictType):
-        yield from numbers(info.value_type)
-    elif isinstance(info, msgspec.inspect.StructType):
-        for field in info.fields:
-            yield from numbers(field.type)
+def names_quantity(parts: Any) -> bool:
+    """Whether a quantity is among annotations, or in a type that a word may replace."""
+    if isinstance(parts, Quantity):
+        return True
+    if isinstance(parts, WordOr):
+        return names_quantity(parts._kind)
+    inner = parts if isinstance(parts, tuple | list) else (*get_args(parts), *getattr(parts, "__metadata__", ()))
+    return any(names_quantity(one) for one in inner)
 
 
 # --- parameters of models

@@ -57,7 +57,7 @@ def _brisk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_every_value_counter_and_hole_comes_back(tmp_path: Path) -> None:
-    keeper = Recorder(Storage(folder=tmp_path, segment_s=3.0), [SAMPLES])
+    keeper = Recorder(Storage.model_construct(folder=tmp_path, segment_s=3.0), [SAMPLES])
     keeper.set_state("bench", DaemonState(RATE, (None, None, 5.0, None, None, None), 1.0))
     keeper.start()
     given = [rows(0, 150), rows(160, 150, lost=10), rows(310, 1), rows(311, 700)]
@@ -80,7 +80,7 @@ def test_every_value_counter_and_hole_comes_back(tmp_path: Path) -> None:
 
 
 def test_segments_that_have_ended_are_packed_and_say_the_same(tmp_path: Path) -> None:
-    keeper = Recorder(Storage(folder=tmp_path, segment_s=5.0), [SAMPLES])
+    keeper = Recorder(Storage.model_construct(folder=tmp_path, segment_s=5.0), [SAMPLES])
     keeper.start()
     given = [rows(first, 20) for first in range(0, 2000, 20)]
     for one in given:
@@ -446,7 +446,7 @@ def rows_of_all(folder: Path) -> tuple[np.ndarray, int]:
 
 def test_two_recorders_on_one_folder_lose_nothing_and_keep_nothing_twice(tmp_path: Path) -> None:
     """Both receive the same samples; the times of the second are 3 ms late."""
-    first, second = (Recorder(Storage(folder=tmp_path, segment_s=10.0), [SAMPLES]) for _ in range(2))
+    first, second = (Recorder(Storage.model_construct(folder=tmp_path, segment_s=10.0), [SAMPLES]) for _ in range(2))
     for one in (first, second):
         one.set_state("bench", DaemonState(RATE))
     first.start()
@@ -513,7 +513,7 @@ def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.99)
     monkeypatch.setattr(first, "_delete_old", lambda: None)
     before = sorted(path.name for path in tmp_path.rglob("*"))
-    second = Recorder(Storage(folder=tmp_path, keep_s=10.0, segment_s=10.0), [SAMPLES])
+    second = Recorder(Storage.model_construct(folder=tmp_path, keep_s=10.0, segment_s=10.0), [SAMPLES])
     second.start()
     second.samples("bench", rows(0, 100), 0)
     wait_for(lambda: "in use" in second.state)
@@ -636,7 +636,7 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
                 path.mkdir()
             case _:
                 path.symlink_to(path.name)
-    again = Recorder(Storage(folder=tmp_path, keep_s=1.0, segment_s=1.0), [SAMPLES])
+    again = Recorder(Storage.model_construct(folder=tmp_path, keep_s=1.0, segment_s=1.0), [SAMPLES])
     tail = again.tail("bench")
     assert tail is not None
     assert tail.newest.samples.ticks[-1] == 99

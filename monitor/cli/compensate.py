@@ -12,22 +12,25 @@ from monitor.cli import options, output, terminal_session
 
 def compensate(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="The recording without drift: .npz, .csv, .parquet, ….")],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Recording without drift: .npz, .csv, .parquet, ….")],
     method: Annotated[
         str,
         typer.Option(
-            metavar="M", help="adaptive, as the daemon does; to compare with: fixed, ar, emd, wavelet (extra: denoise)."
+            metavar="M", help="adaptive, as in the service; for comparison: fixed, ar, emd, wavelet (extra: denoise)."
         ),
     ] = "adaptive",
     order: Annotated[
-        str | None, typer.Option(metavar="P,Q", help="Of the ARMA model of the drift, up to 2,1; else by criterion.")
+        str | None,
+        typer.Option(metavar="P,Q", help="Order of the ARMA model of the drift, up to 2,1; by default by a criterion."),
     ] = None,
     rate: options.Rate = None,
     last: options.Last = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
-    plot: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan curves as a picture.")] = None,
+    plot: Annotated[
+        Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan deviations as a picture.")
+    ] = None,
 ) -> None:
-    """A recording without the drift of its gyros: what the daemon does live, and others to compare with."""
+    """Write a recording without the drift of its gyroscopes, by the method of the service or another method."""
     from rich.console import Console
 
     from monitor.commands import compensate as compensating

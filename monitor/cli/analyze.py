@@ -1,0 +1,59 @@
+"""Command ``analyze``: prints the Allan deviation and the noise coefficients of a recording."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers.errors import ConfigError, NotReady
+from monitor.cli import options, output
+
+
+def analyze(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")],
+    rate: options.Rate = None,
+    last: options.Last = None,
+    tau: Annotated[
+        str, typer.Option(metavar="octave|decade10|S,S,…", help="Averaging times: a grid, or a list of seconds.")
+    ] = "octave",
+    window: Annotated[
+        str | None,
+        typer.Option(
+            metavar="S", help="Also compute Allan deviations over time, in a window of S seconds; also 5min, 1h."
+        ),
+    ] = None,
+    rest: Annotated[bool, typer.Option("--rest", help="Leave out periods in which the sensor moved.")] = False,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+    plot: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.png|.html", help="Allan deviations as a picture, or the whole result as a page."),
+    ] = None,
+) -> None:
+    """Print the Allan deviation of a recording, Q, N, B, K, R with confidence intervals, motion and changes."""
+    from monitor.commands import analyze as offline
+    from monitor.publishing.messages.analysis import AnalysisMessage, FailedAnalysisMessage
+
+    if plot is not None and plot.suffix not in (".png", ".html"):
+        raise ConfigError(f"--plot: {plot}: a name ending in .png or .html is needed")
+    window_s = options.duration("--window", window)
+    last_s = options.duration("--last", last)
+    wanted = offline.Request(recording, rate, options.tau(tau), window_s, rest, bool(json or plot), last_s)
+    try:
+        with output.progress() as tell:
+            output.compile_kernels(tell)
+            results = offline.run_analysis(wanted, tell)
+    except offline.TooFewSamples as error:
+        if json is not None:
+            output.write("--json", json, FailedAnalysisMessage(error.samples, [str(error)]).encode() + b"\n")
+        raise
+    if json is not None:
+        message = AnalysisMessage.of(
+            results.analysis, results.total, results.hadamard, results.dynamic, results.without_temperature
+        )
+        output.write("--json", json, message.encode() + b"\n")
+    if plot is not None:
+        offline.draw_plots(results, plot, recording.name)
+    if json != Path("-"):
+        output.print_analysis(results.analysis)
+    if results.lacking:
+        raise NotReady(results.lacking)

@@ -1,0 +1,33 @@
+"""Command ``demo``: runs the service on a simulated sensor."""
+
+from typing import Annotated
+
+import typer
+
+from monitor.cli import options, terminal_session
+
+
+def demo(
+    sensor: Annotated[
+        str | None, typer.Option(metavar="NAME|MODEL.toml", help="Name of a shipped sensor model, or a model file.")
+    ] = None,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="AXIS.EFFECT:P=V,…",
+            help="Effect that begins later, e.g. gz.sinusoidal:amplitude=3e-3,frequency=17; repeatable.",
+        ),
+    ] = None,
+    effect_at: Annotated[
+        str | None,
+        typer.Option(metavar="S", help="Start time of the effects; 90 s by default, when change detection is active."),
+    ] = None,
+    seconds: options.Seconds = None,
+    viewer: options.Viewer = None,
+) -> None:
+    """Run the service on a simulated MEMS IMU that sends a real wire format over a pseudo-terminal."""
+    from monitor.simulator.demo import demo_config as configuration
+
+    terminal_session.serve(
+        configuration(sensor, effect or (), options.duration("--effect-at", effect_at)), seconds, viewer
+    )

@@ -1,0 +1,88 @@
+"""Messages and exit statuses for the errors that end a command."""
+
+import os
+import signal
+from collections.abc import Mapping
+from difflib import get_close_matches
+from typing import Any, Final
+
+import typer
+from typer.exceptions import TyperException
+
+from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, format_one_line
+
+FAILED: Final = 1
+"""Exit status of a failure at run time."""
+WRONG: Final = 2
+"""Exit status of a wrong argument or input file."""
+NO_ANSWER: Final = 3
+"""Exit status if the data do not support an answer."""
+INTERRUPTED: Final = 128 + signal.SIGINT
+"""Exit status after Ctrl-C."""
+DEBUG: Final = "--debug"
+"""Option that prints tracebacks."""
+MAX_CAUSE_CHARACTERS: Final = 300
+"""Maximum length of the text of an unexpected error. Libraries may write pages."""
+
+
+def explain(error: Exception) -> tuple[str, int]:
+    """Return the line for standard error and the exit status of an error that ended a command."""
+    match error:
+        case TyperException():
+            return format_one_line(_usage(error)), WRONG
+        case ConfigError() | RecordingError():
+            return str(error), WRONG
+        case NotReady():
+            return str(error), NO_ANSWER
+        case ImuError():
+            return str(error), FAILED
+        case typer.Abort():
+            return "interrupted", INTERRUPTED
+        case OSError():
+            return format_one_line(_system_error(error)), FAILED
+        case MemoryError():
+            why = f" ({cause})" if (cause := _cause(error)) else ""
+            return f"not enough memory{why}; read less at once, e.g. the end of a recording with --last 1h", FAILED
+    return (
+        f"internal error: {type(error).__name__}: {_cause(error)}; please report it with the output of the same "
+        f"command with {DEBUG}",
+        FAILED,
+    )
+
+
+def _cause(error: Exception) -> str:
+    """Return the text of an error in one line of limited length."""
+    text = " ".join(format_one_line(str(error)).split())
+    return text if len(text) <= MAX_CAUSE_CHARACTERS else f"{text[:MAX_CAUSE_CHARACTERS]} …"
+
+
+def _system_error(error: OSError) -> str:
+    """Return the text of a system error; a missing working directory gets its own message."""
+    if error.filename is None:
+        try:
+            os.getcwd()
+        except OSError:
+            return f"the current folder is gone or cannot be read ({error.strerror}); change to another folder"
+    return str(error)
+
+
+def _usage(error: TyperException) -> str:
+    """Return a message about wrong arguments, with the missing or the possible arguments."""
+    text, context = error.format_message(), getattr(error, "ctx", None)
+    if isinstance(error, typer.BadParameter) and error.param is not None and not error.message:
+        option: Any = error.param
+        what = f" ({option.metavar})" if option.metavar and option.param_type_name == "option" else ""
+        where = f" See {context.command_path} --help" if context else ""
+        return f"{text.rstrip('.')}{what}: {option.help or ''}{where}"
+    if context is None:
+        return text
+    unknown = getattr(error, "option_name", None)
+    if unknown is not None and text.startswith("No such option"):
+        known = {name.lstrip("-"): name for option in context.command.params for name in option.opts if name[0] == "-"}
+        near = get_close_matches(unknown.lstrip("-"), known, n=1)
+        hint = f"did you mean {known[near[0]]}?" if near else f"known are {', '.join(known.values())}"
+        return f"No such option: {unknown} of {context.command_path}; {hint}"
+    commands: Mapping[str, object] = getattr(context.command, "commands", {})
+    if commands and "Did you mean" not in text:
+        return f"{text.rstrip('.')}; known are {', '.join(commands)}"
+    return text

@@ -1,0 +1,68 @@
+"""Command ``reconcile``: compares recordings with a noise model."""
+
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers.errors import NotReady
+from drivers.extras import check_extra
+from monitor.cli import options, output, terminal_session
+
+
+def reconcile(
+    recordings: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RECORDING…", help="File, or folder of segments; several recordings of one sensor are compared."
+        ),
+    ],
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for the report and the augmented model.")],
+    model: Annotated[
+        str | None,
+        typer.Option(
+            metavar="MODEL.toml|NAME",
+            help="Model under test; by default Q, N, B, K and R are fitted to the first recording.",
+        ),
+    ] = None,
+    seed: options.ReportSeed = 1,
+    rate: options.Rate = None,
+    last: options.Last = None,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+) -> None:
+    """Find where recording and model disagree, which effects are missing, and what remains with these effects."""
+    check_extra("reconcile", "reconcile")
+    from rich.console import Console
+
+    from monitor.commands import reconcile as reconciling
+    from monitor.noise.catalogue import load_model
+    from monitor.publishing.terminal import reconcile_text as text
+    from monitor.reconcile import report
+    from monitor.reconcile.several_recordings import comparison_report
+
+    last_s = options.duration("--last", last)
+    output.check_place("--json", json)
+    tested = None if model is None else load_model(model, Path.cwd())
+    several = len(recordings) > 1
+    terminal_session.end_on_sigterm()
+    try:
+        with output.progress() as tell:
+            output.compile_kernels(tell)
+            if several:
+                every = reconciling.ComparisonRequest(tuple(recordings), tested, out, seed, rate, last_s)
+                runs = reconciling.compare_recordings(every, tell)
+                data, show = comparison_report.encode_comparison(runs), partial(text.print_comparison, runs)
+            else:
+                one = reconciling.run_reconciliation(
+                    reconciling.Request(recordings[0], tested, out, seed, rate, last_s=last_s), tell
+                )
+                data, show = report.encode_report(one), partial(text.print_report, one)
+    except NotReady:
+        if json is not None:
+            output.write("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")
+        raise
+    if json is not None:
+        output.write("--json", json, data + b"\n")
+    if json != Path("-"):
+        show(Console())

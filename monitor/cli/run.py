@@ -1,0 +1,24 @@
+"""Command ``run``: runs the service."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from monitor.cli import options, terminal_session
+
+
+def run(
+    config: Annotated[Path, typer.Argument(metavar="CONFIG.toml", help="Configuration file.")],
+    seconds: options.Seconds = None,
+    viewer: options.Viewer = None,
+    history: Annotated[
+        str | None,
+        typer.Option(metavar="S", help="Show the last part of the history in the live view: 1d, 12h; needs [storage]."),
+    ] = None,
+) -> None:
+    """Run the service for all devices of a file, until a signal."""
+    from monitor.settings import loading
+
+    found = terminal_session.with_history(loading.load(config, pipe=True), options.duration("--history", history))
+    terminal_session.serve(found, seconds, viewer)

@@ -1,0 +1,95 @@
+"""Commands ``thermal fit`` and ``thermal predict``: model the bias as a function of temperature."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers.errors import ConfigError, NotReady
+from monitor.cli import options, output
+
+RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")]
+JsonPath = Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")]
+PlotPath = Annotated[Path | None, typer.Option(metavar="FILE.png", help="Means and model as a picture.")]
+
+
+def thermal_fit(
+    recording: RecordingPath,
+    out: Annotated[Path | None, typer.Option(metavar="MODEL.json", help="Where to write the model.")] = None,
+    interval: Annotated[
+        str | None,
+        typer.Option(
+            metavar="S", help="Averaging interval; also 10min, 1h. By default about 72 intervals per recording."
+        ),
+    ] = None,
+    rate: options.Rate = None,
+    last: options.Last = None,
+    json: JsonPath = None,
+    plot: PlotPath = None,
+) -> None:
+    """Fit the bias of each axis as a function of the temperature and its history."""
+    from rich.console import Console
+
+    from monitor.commands import thermal
+    from monitor.publishing.terminal import thermal_text as text
+
+    _check_thermal(json, plot)
+    output.check_place("--out", out)
+    interval_s, last_s = options.duration("--interval", interval), options.duration("--last", last)
+    study = thermal.fit_recording(recording, interval_s, rate, last_s)
+    if json is not None:
+        output.write("--json", json, text.encode_thermal_fit(study) + b"\n")
+    if not study.fits:
+        raise NotReady("; ".join(f"{axis}: {why}" for axis, why in study.refused.items()))
+    if out is not None:
+        output.write("--out", out, thermal.write_model_file(study) + b"\n")
+    if plot is not None:
+        from monitor.publishing.plots.thermal_plot import save_thermal_fit_plot
+
+        save_thermal_fit_plot(study, plot)
+    if Path("-") not in (json, out):
+        text.print_thermal_fit(study, Console())
+
+
+def thermal_predict(
+    recording: RecordingPath,
+    model: Annotated[Path, typer.Option(metavar="MODEL.json", help="Model file that thermal fit has written.")],
+    rate: options.Rate = None,
+    last: options.Last = None,
+    json: JsonPath = None,
+    plot: PlotPath = None,
+) -> None:
+    """Predict the bias of another recording with a model, and print the errors of the prediction."""
+    from rich.console import Console
+
+    from monitor.commands import thermal
+    from monitor.publishing.terminal import thermal_text as text
+
+    _check_thermal(json, plot)
+    outlook = thermal.predict_recording(
+        recording, thermal.read_model_file(model), rate, options.duration("--last", last)
+    )
+    if json is not None:
+        output.write("--json", json, text.encode_thermal_prediction(outlook) + b"\n")
+    if not outlook.judged:
+        raise NotReady("; ".join(f"{axis}: {why}" for axis, why in outlook.refused.items()))
+    if plot is not None:
+        from monitor.publishing.plots.thermal_plot import save_thermal_prediction_plot
+
+        save_thermal_prediction_plot(outlook, plot)
+    if json != Path("-"):
+        text.print_thermal_prediction(outlook, Console())
+
+
+def _check_thermal(json: Path | None, plot: Path | None) -> None:
+    """Check the output files of the ``thermal`` commands before the work begins.
+
+    Raises
+    ------
+    ConfigError
+        A file cannot be written, or the picture has another suffix than .png.
+    """
+    if plot is not None and plot.suffix != ".png":
+        raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
+    output.check_place("--json", json)
+    output.check_place("--plot", plot)

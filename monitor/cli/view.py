@@ -1,0 +1,22 @@
+"""Command ``view``: shows several daemons in one viewer."""
+
+from typing import Annotated
+
+import typer
+
+from monitor.cli import options, terminal_session
+
+
+def view(
+    keyexpr: options.KeyExpr = "imu/**",
+    connect: options.Connect = None,
+    zenoh: options.ZenohFile = None,
+    detail: Annotated[
+        list[str] | None,
+        typer.Option(metavar="DEVICE", help="Also show samples and Allan deviations of this device; repeatable."),
+    ] = None,
+    viewer: options.Viewer = None,
+    seconds: options.Seconds = None,
+) -> None:
+    """Show any number of daemons in one viewer: a table of all devices, and chosen devices in detail."""
+    terminal_session.view(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)

@@ -1,0 +1,21 @@
+"""Command ``watch``: shows a live table of several daemons."""
+
+import threading
+
+from monitor.cli import options, terminal_session
+
+
+def watch(
+    keyexpr: options.KeyExpr = "imu/**",
+    connect: options.Connect = None,
+    zenoh: options.ZenohFile = None,
+    seconds: options.Seconds = None,
+) -> None:
+    """Show a live table of any number of daemons, received over zenoh."""
+    from rich.console import Console
+
+    from monitor.publishing.terminal.watch import watch as show
+
+    stop = threading.Event()
+    terminal_session.on_signals(stop.set)
+    show(keyexpr, connect or (), stop, Console(), seconds, zenoh)
