@@ -277,10 +277,10 @@ class RecordingTrack:
         writer = self._writer or self._begin(begin_s)
         if self.origin.kind == "samples":
             blocks = [one for one in self._taken if isinstance(one, SampleBlock)]
-            writer.samples(blocks, state)
+            writer.write_samples(blocks, state)
             self._rows += sum(len(one) for one in blocks)
         else:
-            writer.chunks([one for one in self._taken if isinstance(one, Chunk)])
+            writer.write_chunks([one for one in self._taken if isinstance(one, Chunk)])
             self._rows += len(self._taken)
         self._unsynced = True
 
