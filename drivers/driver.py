@@ -147,7 +147,7 @@ class Driver:
             self._run()
         except Exception as error:
             # a bug: the thread ends with the exception, and the status shows the fault
-            self.state, self.text = "lost", f"reading ended by a fault of the program: {error!r}"
+            self.state, self.text = "lost", f"the reader ended because of a bug in the program: {error!r}"
             raise
 
     def _run(self) -> None:
@@ -297,7 +297,7 @@ def parse_axis_map(table: dict[str, str]) -> AxisMap:
     Raises
     ------
     ConfigError
-        An axis is not one of AXES, or an axis of a gyroscope is mapped to one of an accelerometer or the reverse.
+        If an axis is not one of AXES, or if a gyroscope axis is mapped to an accelerometer axis or the reverse.
     """
     source, sign = list(range(6)), [1.0] * 6
     wrong = []
@@ -305,7 +305,8 @@ def parse_axis_map(table: dict[str, str]) -> AxisMap:
         bare = word.lstrip("+-")
         if axis not in AXES or bare not in AXES or axis[0] != bare[0] or len(word) - len(bare) > 1:
             wrong.append(
-                f'{axis} = "{word}"; both are one of {" ".join(AXES)} and of one kind, the right one with or without -'
+                f'{axis} = "{word}": expected two axes of the same kind out of {" ".join(AXES)}, '
+                "the second with or without -"
             )
             continue
         source[AXES.index(axis)] = AXES.index(bare)

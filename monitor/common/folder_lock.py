@@ -60,7 +60,7 @@ class FolderLock:
         Raises
         ------
         OSError
-            The folder or the lock file cannot be created or opened.
+            If the folder or the lock file cannot be created or opened.
         """
         if self._descriptor is not None:
             if self._in_place(self._descriptor):
@@ -156,7 +156,7 @@ def _open_lock_file(path: Path) -> int:
     Raises
     ------
     OSError
-        The file cannot be opened, or it is not a regular file.
+        If the file cannot be opened, or if it is not a regular file.
     """
     # NFS locks only files that are open for writing. Without O_NONBLOCK, opening a FIFO would block.
     flags = os.O_RDWR | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOFOLLOW

@@ -49,14 +49,14 @@ def format_service_status(healths: Mapping[str, Health], outputs: Mapping[str, s
     Examples
     --------
     >>> format_service_status({}, {"zenoh": "ok", "viewer": "off"})
-    '0 devices; all well'
+    '0 devices; no problems'
     """
     states = Counter(one.state for one in healths.values())
     said = [f"{n} {state}" for state, n in states.items()]
     troubles = [f"{name}: {one.text}" for name, one in healths.items() if one.text]
-    troubles += [f"{name}: beyond its limit: {', '.join(one.crossed)}" for name, one in healths.items() if one.crossed]
-    troubles += [f"{name}: its reader is stuck" for name in stuck]
+    troubles += [f"{name}: crossed limits: {', '.join(one.crossed)}" for name, one in healths.items() if one.crossed]
+    troubles += [f"{name}: the reader is stuck" for name in stuck]
     troubles += [f"{name}: {state}" for name, state in outputs.items() if state not in ("ok", "off")]
     more = f"; and {len(troubles) - MAX_PROBLEMS} more" if len(troubles) > MAX_PROBLEMS else ""
     head = ", ".join([format_count(len(healths), "device"), *said])
-    return f"{head}; {'; '.join(troubles[:MAX_PROBLEMS]) or 'all well'}{more}"
+    return f"{head}; {'; '.join(troubles[:MAX_PROBLEMS]) or 'no problems'}{more}"

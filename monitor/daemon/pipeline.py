@@ -1,7 +1,7 @@
 """Processing pipeline of one device: motion detection, noise estimation, thermal model and drift compensation.
 
-Blocks of samples enter in order. The latest results are in ``estimator``, ``thermal``, ``compensation`` and ``watch``.
-Detections are taken as events.
+Blocks of samples enter in order. The latest results are in ``estimator``, ``thermal``, ``compensation`` and
+``signal_monitor``. Detections are taken as events.
 
 The pipeline publishes nothing and reads no clock. Its owner decides when it may advance and what is published. After a
 restart of the program, ``replay`` passes the end of the recording through the pipeline without events.
@@ -41,9 +41,9 @@ class DevicePipeline:
         Settings of the device.
     model : NoiseModel or None
         Model in force.
-    ready : Ready
+    ready : KernelReadiness
         Flags of the compiled kernels. ``advance`` compiles nothing, because that would delay all devices.
-    patient : bool
+    replayed : bool
         True if samples may wait while a thermal model is being selected, as the samples of a recording can.
     needs_all : bool
         True if processing begins only when all kernels can be called.
@@ -56,7 +56,7 @@ class DevicePipeline:
         device: Device,
         model: NoiseModel | None,
         ready: KernelReadiness,
-        patient: bool,
+        replayed: bool,
         needs_all: bool,
         live: bool,
     ) -> None:
@@ -73,17 +73,17 @@ class DevicePipeline:
         """Time in nanoseconds of the first sample in the window of an axis that was restarted, else None."""
         self.newest_ns = 0
         """Time of the newest sample that entered the pipeline, in nanoseconds; 0 before the first."""
-        self.arma_worker = ArmaWorker(f"drift of {device.name}", at_once=patient)
+        self.arma_worker = ArmaWorker(f"drift of {device.name}", at_once=replayed)
         self._device = device
         self._model = model
         self.ready = ready
-        self._patient = patient
+        self._replayed = replayed
         self._needs = ready.all if needs_all else ready.window
         self._live = live
         self._interprets = False
         self._temperatures: TemperatureRing | None = None  # of the samples in the window
-        self._looks: list[ThermalUpdate] = []  # thermal intervals that were not taken yet
-        self._handled = 0  # last seen value of ``watch.handled``
+        self._thermal_intervals: list[ThermalUpdate] = []  # thermal intervals that were not taken yet
+        self._handled = 0  # last seen value of ``signal_monitor.handled``
         self._pieces: deque[SampleBlock] = deque()  # samples of a recording that wait for the thermal model
         self._replaying = False
 
@@ -148,7 +148,7 @@ class DevicePipeline:
             for samples in blocks
             for at in range(0, len(samples), MAX_PIECE_SAMPLES)
         ]
-        while self._pieces and (drain or not self._patient or self.thermal is None or not self.thermal.choosing):
+        while self._pieces and (drain or not self._replayed or self.thermal is None or not self.thermal.choosing):
             piece = self._pieces.popleft()
             self._update_estimator(self.signal_monitor.update(piece) if self.signal_monitor is not None else [piece])
             self._restart_changed_axes()
@@ -225,8 +225,8 @@ class DevicePipeline:
 
     def take_thermal_intervals(self) -> list[ThermalUpdate]:
         """Return the thermal intervals that were completed since the last call."""
-        looks, self._looks = self._looks, []
-        return looks
+        intervals, self._thermal_intervals = self._thermal_intervals, []
+        return intervals
 
     # --- private methods
 
@@ -282,4 +282,4 @@ class DevicePipeline:
             self._handled = self.signal_monitor.handled
             self.thermal.learn_new_offset()
         for samples in self.signal_monitor.take_samples_at_rest():
-            self._looks += self.thermal.update(samples)
+            self._thermal_intervals += self.thermal.update(samples)

@@ -38,12 +38,12 @@ class ConfigChange:
         parts = {
             "added": sorted(new - set(self.removed)),
             "removed": sorted(set(self.removed) - new),
-            "begun anew": sorted(new & set(self.removed)),
+            "restarted": sorted(new & set(self.removed)),
             "new limits": [device.name for device in self.limited],
         }
         said = [f"{what}: {', '.join(names)}" for what, names in parts.items() if names]
         if self.restart:
-            said.append(f"{', '.join(self.restart)}: changed, and only a restart makes that hold")
+            said.append(f"{', '.join(self.restart)}: changed; restart imu-monitor to apply the change")
         return "; ".join(said) or "no device changed"
 
 
@@ -59,16 +59,16 @@ def compare_with_file(running: Config, models: Mapping[str, NoiseModel | None]) 
 
     Returns
     -------
-    Change
+    ConfigChange
         Changes to apply.
 
     Raises
     ------
     ConfigError
-        The file has a mistake, or the running configuration was not read from a file. Nothing is to be changed.
+        If the file has a mistake, or if the running configuration was not read from a file.
     """
     if running.path is None:
-        raise ConfigError("there is no file to read again")
+        raise ConfigError("the running configuration was not read from a file; there is no file to read again")
     new = loading.load(running.path)
     old_tables, new_tables = _by_name(running.table), _by_name(new.table)
     added, limited = [], []

@@ -1,9 +1,8 @@
-"""Unix time of samples, from the monotonic clock, slewed towards the host's clock.
+"""Unix time of samples, from the monotonic clock, slewed towards the host clock.
 
-NTP or an operator may set the host's clock. A recording must not get a gap from that. A difference is therefore removed
-at a rate of at most EASE. The offset between the two clocks is a continuous, piecewise linear function of the monotonic
-time with slopes of at most EASE. Unix times therefore increase from sample to sample, in whatever order they are
-computed.
+NTP or an operator may set the host clock. Such a step must not cause a gap in a recording. The difference is therefore
+removed at a rate of at most MAX_SLEW_RATE. The offset between the two clocks is a continuous, piecewise linear function
+of the monotonic time with slopes of at most MAX_SLEW_RATE. Unix times therefore increase from sample to sample.
 """
 
 from typing import Final
@@ -38,32 +37,32 @@ class SlewedClock:
     """
 
     def __init__(self, monotonic_ns: int, unix_ns: int) -> None:
-        self._host_ns = unix_ns - monotonic_ns  # offset of the host's clock at the last call of ``follow``
-        self._followed_ns = monotonic_ns
+        self._host_ns = unix_ns - monotonic_ns  # offset of the host clock at the last call of ``slew_to``
+        self._slewed_at_ns = monotonic_ns
         # [n, 3] start of each correction, offset at the start, and remaining correction. The array is replaced, never
         # changed in place, because the reader threads use it as well.
         self._knots: Ints = np.array([[monotonic_ns, self._host_ns, 0]], np.int64)
 
     @property
     def behind_ns(self) -> int:
-        """Lead of the host's clock over these times, in nanoseconds."""
-        return self._host_ns - self.offset_ns(self._followed_ns)
+        """Time by which the slewed Unix time is behind the host clock, in nanoseconds."""
+        return self._host_ns - self.offset_ns(self._slewed_at_ns)
 
     def slew_to(self, monotonic_ns: int, unix_ns: int) -> int:
-        """Start to slew towards the host's clock. Call this about once a second.
+        """Start to slew towards the host clock. Call this about once a second.
 
         Returns
         -------
         int
-            Step of the host's clock since the last call, in nanoseconds.
+            Step of the host clock since the last call, in nanoseconds.
         """
         before_ns, self._host_ns = self._host_ns, unix_ns - monotonic_ns
         begun_ns, offset_ns, correction_ns = self._knots[-1].tolist()
-        self._followed_ns = max(monotonic_ns, begun_ns)
+        self._slewed_at_ns = max(monotonic_ns, begun_ns)
         if offset_ns + correction_ns != self._host_ns:
-            now_ns = self.offset_ns(self._followed_ns)
-            knot = np.array([[self._followed_ns, now_ns, self._host_ns - now_ns]], np.int64)
-            kept = self._knots[:-1] if self._followed_ns == begun_ns else self._knots
+            now_ns = self.offset_ns(self._slewed_at_ns)
+            knot = np.array([[self._slewed_at_ns, now_ns, self._host_ns - now_ns]], np.int64)
+            kept = self._knots[:-1] if self._slewed_at_ns == begun_ns else self._knots
             self._knots = np.concatenate([kept[1 - MAX_KNOTS :], knot])
         return self._host_ns - before_ns
 

@@ -379,7 +379,7 @@ def test_axis_map_keeps_all_else():
 
 @pytest.mark.parametrize("table", [{"gq": "gx"}, {"gx": "mx"}, {"gx": "--gy"}, {"gx": ""}, {"gx": "-"}])
 def test_axes_that_are_none_are_refused(table):
-    with pytest.raises(ConfigError, match="both are one of gx gy gz ax ay az and of one kind"):
+    with pytest.raises(ConfigError, match="expected two axes of the same kind out of gx gy gz ax ay az"):
         parse_axis_map(table)
 
 

@@ -168,7 +168,10 @@ WRONG_FILES = {
     "tau below a sample": (VIRTUAL + "rate = 100.0\ntau = [0.001]\n", "tau: none of [0.001] s lies between"),
     "bad rate of fits": (VIRTUAL + 'refit = "10 hz"\n', '"10 hz" is no rate; write "10 Hz" or "every sample"'),
     "no rate of fits": (VIRTUAL + 'refit = "0 Hz"\n', '"0 Hz" is no rate; write "10 Hz" or "every sample"'),
-    "unknown axis": (VIRTUAL + 'axes = { gz = "-gw" }\n', 'gz = "-gw"; both are one of gx gy gz ax ay az'),
+    "unknown axis": (
+        VIRTUAL + 'axes = { gz = "-gw" }\n',
+        'gz = "-gw": expected two axes of the same kind out of gx gy gz ax ay az',
+    ),
     "bad viewer": (
         VIRTUAL + '[viewer]\nmode = "nativ"\n',
         'viewer.mode: "nativ"; possible are native, auto, none, web, or a file ending in .rrd',

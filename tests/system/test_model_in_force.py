@@ -122,7 +122,9 @@ def test_reconcile_is_asked_for_over_zenoh_and_holds_nothing_up(tmp_path: Path) 
             asked = client.get("imu/demo/command/reconcile", timeout=PATIENCE_S)
             wait_for(kept.exists, "the program")
             (again,) = wait_for(lambda: list(client.get("imu/demo/command/reconcile", timeout=PATIENCE_S)))
-            assert json.loads(bytes(again.err.payload)) == {"error": "busy: reconcile runs already for this device"}
+            assert json.loads(bytes(again.err.payload)) == {
+                "error": "busy: a reconciliation of this device is already running"
+            }
             (reset,) = wait_for(lambda: list(client.get("imu/demo/command/reset", timeout=PATIENCE_S)))
             assert reset.ok is not None  # another command is answered meanwhile
             before = caught.healths["demo"].received

@@ -8,8 +8,8 @@ arguments.
 A command that exceeds its time is killed together with its child processes. Only the end of its output is kept. A
 failure is logged, and stays in the status under ``hook`` until a hook succeeds again. The main loop never waits.
 
-For each kind of event and each device, a hook runs at most BURST times in a row and then once in EVERY_S. A faulty
-cable that reports losses every second therefore neither starts a thousand programs nor suppresses other alarms.
+For each kind of event and each device, a hook runs at most BURST times in a row and then once in RUN_INTERVAL_S. A
+faulty cable that reports losses every second therefore neither starts a thousand programs nor suppresses other alarms.
 Suppressed runs are counted and reported.
 """
 
@@ -93,7 +93,9 @@ class Hooks(Output):
     @property
     def state(self) -> str:
         """Status message: ``ok``, or the error of the newest run."""
-        held_back = f"{self._held_back} held back, too many at once" if self._held_back else ""
+        held_back = (
+            f"{self._held_back} runs suppressed, because too many events occurred at once" if self._held_back else ""
+        )
         if self._last_error:
             return "; ".join(filter(None, [f"{self._last_error} ({self._failed} failed since the start)", held_back]))
         return f"ok, but {held_back}" if held_back else "ok"
@@ -224,7 +226,7 @@ def _wait_for_end(
     while process.poll() is None:
         pipes.move()
         if ending():
-            return "killed, as the service ended"
+            return "killed because the service ended"
         if time.monotonic() > until_s:
             return f"killed after {timeout_s:g} s"
     if process.returncode == 0:

@@ -91,7 +91,7 @@ class LimitMonitor:
     Raises
     ------
     ConfigError
-        A limit is relative to a coefficient that the model does not have on that axis.
+        If a limit is relative to a coefficient that the model does not have on that axis.
     """
 
     def __init__(self, limits: Sequence[Limit], model: NoiseModel | None) -> None:
@@ -133,7 +133,7 @@ def read_model_in_force(device: Device) -> NoiseModel | None:
     Raises
     ------
     ConfigError
-        The model cannot be read, or a limit is relative to a coefficient that the model does not have.
+        If the model cannot be read, or if a limit is relative to a coefficient that the model does not have.
     """
     model = None if device.model is None else read_model(device.model)
     try:
@@ -156,7 +156,7 @@ def make_bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound
     Raises
     ------
     ConfigError
-        A limit is relative to a coefficient that the model does not have on that axis.
+        If a limit is relative to a coefficient that the model does not have on that axis.
     """
     known = {} if model is None else from_model(model).axes
     found, wrong = [], []

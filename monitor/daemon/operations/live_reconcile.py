@@ -108,7 +108,7 @@ class Reconciler:
         """
         before = self._running.get(job.device)
         if before is not None and before.is_alive():
-            command.refuse("busy: reconcile runs already for this device")
+            command.refuse("busy: a reconciliation of this device is already running")
             return
         name = f"reconcile of {job.device}"
         thread = threading.Thread(target=self._run, args=(job, command), name=name, daemon=True)
@@ -151,7 +151,7 @@ class Reconciler:
         Raises
         ------
         RuntimeError
-            The command gave no result.
+            If the command gave no result.
         """
         with tempfile.TemporaryDirectory(prefix="imu-monitor-") as temporary:
             path, folder = Path(temporary) / f"{job.device}.npz", Path(temporary) / "report"

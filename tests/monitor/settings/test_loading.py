@@ -207,7 +207,10 @@ CASES = {
     "no tau at all": (device("rate = 100\ntau = []"), ["device a: tau: "]),
     "refit": (device('refit = "often"'), ['device a: refit: "often" is no rate; write "10 Hz" or "every sample"']),
     "publish": (device('publish = "0 Hz"'), ['device a: publish: "0 Hz" is no rate; write "10 Hz" or "every block"']),
-    "axes": (device('axes = { gx = "up" }'), ['device a: axes: gx = "up"; both are one of gx gy gz ax ay az']),
+    "axes": (
+        device('axes = { gx = "up" }'),
+        ['device a: axes: gx = "up": expected two axes of the same kind out of gx gy gz ax ay az'],
+    ),
     "a model that is not there": (
         device('model = "models/none.toml"'),
         ['device a: model: no model "models/none.toml"'],

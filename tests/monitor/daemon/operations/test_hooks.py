@@ -147,7 +147,9 @@ def test_a_flood_is_held_back_and_does_not_drown_what_is_rare() -> None:
         running.happen()
         assert len(running.sent) == BURST + 1
         assert json.loads(running.sent[-1][1])["kind"] == "limit_crossed"
-        assert running.hooks.state == f"ok, but {1000 - BURST} held back, too many at once"
+        assert (
+            running.hooks.state == f"ok, but {1000 - BURST} runs suppressed, because too many events occurred at once"
+        )
         running.now_s = 2.5 * RUN_INTERVAL_S
         for _ in range(10):
             running.happen(Event("samples_lost", 0, "1 sample missing"))
@@ -162,4 +164,4 @@ def test_no_more_run_or_wait_than_there_is_room_for(tmp_path: Path) -> None:
         for i in range(MAX_QUEUED + THREADS + 50):
             running.happen(device=f"d{i}")  # returns at once, although no command ends
         wait_for(lambda: len(os.listdir(marks)) == THREADS)
-        assert "held back" in running.hooks.state
+        assert "suppressed" in running.hooks.state

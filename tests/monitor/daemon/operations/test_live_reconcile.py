@@ -190,7 +190,7 @@ def test_one_at_a_time_for_each_device(tmp_path: Path) -> None:
     reconciler.start(job(), first.command)
     reconciler.start(job(), second.command)
     reconciler.start(job("bench-2"), other.command)
-    assert second.wait().errors == ["busy: reconcile runs already for this device"]
+    assert second.wait().errors == ["busy: a reconciliation of this device is already running"]
     assert not first.done.is_set()
     go.touch()
     assert first.wait().answers[0]["device"] == "bench-1"

@@ -155,7 +155,7 @@ def test_a_frozen_reader_ends_the_signs_of_life_and_nothing_else(tmp_path: Path)
             wait_for(lambda: systemd.count("WATCHDOG=1") >= 3)
             assert any(line.startswith("STATUS=2 devices, 1 running, 1 waiting; ") for line in systemd.lines())
             link.frozen.set()
-            wait_for(lambda: any("frozen: its reader is stuck" in line for line in systemd.lines()))
+            wait_for(lambda: any("frozen: the reader is stuck" in line for line in systemd.lines()))
             signs = systemd.count("WATCHDOG=1")
             received = service.workers[0].driver.counts.received
             wait_for(lambda: service.workers[0].driver.counts.received > received + 200)
