@@ -13,7 +13,6 @@ import threading
 import traceback
 from collections.abc import MutableMapping, Sequence
 from functools import partial
-from importlib import metadata
 from typing import Annotated, NoReturn
 
 import typer
@@ -40,6 +39,8 @@ from monitor.cli.errors import DEBUG, INTERRUPTED, explain
 # Additional threads of the linear algebra libraries would only wait actively.
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_pool, "1")
+# pydantic would otherwise search all installed packages for plug-ins
+os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
 
 app = typer.Typer(
     add_completion=False,
@@ -51,6 +52,8 @@ app = typer.Typer(
 def _print_version(wanted: bool) -> None:
     """Print the version of the program and exit."""
     if wanted:
+        from importlib import metadata
+
         try:
             version = metadata.version("imu-monitor")
         except metadata.PackageNotFoundError:  # the program runs from a checkout that is not installed

@@ -81,27 +81,27 @@ class Finding:
 
 def examine(path: Path | None = None) -> list[Finding]:
     """Check the machine, and the configuration if a path is given."""
-    found = [*check_libraries(), *check_packages(sys.path), *check_kernels(), *check_clock(), *check_systemd_unit()]
+    found = [*check_libraries(), *check_packages(sys.path), *_check_kernels(), *check_clock(), *_check_systemd_unit()]
     if path is None:
         return found
     config, wrong = read(path)
     found = [*wrong, *found]
     if path.is_file():
-        found += check_permissions(path)
+        found += _check_permissions(path)
     if config is None:
         return found
     for one in config.table["device"]:
-        found += check_device(str(one["name"]), one["driver"])
+        found += _check_device(str(one["name"]), one["driver"])
     found += [
-        *check_zenoh(config),
-        *check_viewer(config),
-        *check_storage(config),
-        *check_metrics(config),
-        *check_reconcile(config),
+        *_check_zenoh(config),
+        *_check_viewer(config),
+        *_check_storage(config),
+        *_check_metrics(config),
+        *_check_reconcile(config),
     ]
     for hook in config.hooks:
         if hook.command:
-            found += check_permissions(Path(hook.command[0]), f"hook {Path(hook.command[0]).name}", secret=False)
+            found += _check_permissions(Path(hook.command[0]), f"hook {Path(hook.command[0]).name}", secret=False)
     return found
 
 
@@ -117,18 +117,8 @@ def read(path: Path) -> tuple[Config | None, list[Finding]]:
     return config, [Finding("well", "configuration", f"{path}: {count} device{'' if count == 1 else 's'}")]
 
 
-def check_permissions(path: Path, about: str = "permissions", secret: bool = True) -> list[Finding]:
-    """Check who may write a file that controls the service, and who may read a file that may contain a password.
-
-    Parameters
-    ----------
-    path : Path
-        File to check.
-    about : str, optional
-        Subject of the finding.
-    secret : bool, optional
-        True if the file may contain a password.
-    """
+def _check_permissions(path: Path, about: str = "permissions", secret: bool = True) -> list[Finding]:
+    """Check who may write a file that controls the service, and who may read a file that may contain a password."""
     try:
         seen = path.stat()
     except OSError as error:
@@ -152,41 +142,25 @@ def check_permissions(path: Path, about: str = "permissions", secret: bool = Tru
 # --- devices
 
 
-def check_device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
-    """Check the link of a device without opening it.
-
-    Parameters
-    ----------
-    name : str
-        Name of the device.
-    driver : mapping of str to any
-        Table of its driver in the configuration.
-    """
+def _check_device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
+    """Check the link of a device without opening it."""
     about = f"device {name}"
     match driver.get("link"):
         case "serial":
-            return check_serial_port(about, str(driver.get("port")))
+            return _check_serial_port(about, str(driver.get("port")))
         case "can":
             return check_can_interface(
                 about, str(driver.get("interface", "socketcan")), str(driver.get("channel", "can0"))
             )
         case "zenoh":
             endpoints = driver.get("connect", [])
-            return [one for endpoint in endpoints for one in reachable(about, str(endpoint))]
+            return [one for endpoint in endpoints for one in _reachable(about, str(endpoint))]
         case other:
             return [Finding("well", about, f"link {other}: nothing to check on this machine")]
 
 
-def check_serial_port(about: str, port: str) -> list[Finding]:
-    """Check that a serial port exists, is accessible and is not used by another program.
-
-    Parameters
-    ----------
-    about : str
-        Subject of the finding.
-    port : str
-        Path or URL of the port.
-    """
+def _check_serial_port(about: str, port: str) -> list[Finding]:
+    """Check that a serial port exists, is accessible and is not used by another program."""
     if "://" in port:
         return [Finding("well", about, f"{port}: network port or pattern, not checked")]
     path = Path(port)
@@ -203,7 +177,7 @@ def check_serial_port(about: str, port: str) -> list[Finding]:
         group = _group(seen.st_gid)
         text = f"{port}: {_user(os.geteuid())} cannot read and write it; members of group {group} can"
         return [Finding("wrong", about, text, f"sudo usermod -aG {group} {_user(os.geteuid())}, and log in again")]
-    holders = list(processes_using(path))
+    holders = list(_processes_using(path))
     if holders:
         text = f"{port}: in use by {', '.join(holders)}"
         return [
@@ -212,7 +186,7 @@ def check_serial_port(about: str, port: str) -> list[Finding]:
     return [Finding("well", about, f"{port}: exists, is readable, and no visible program uses it")]
 
 
-def processes_using(port: Path) -> Iterator[str]:
+def _processes_using(port: Path) -> Iterator[str]:
     """Yield the programs that have a port open, as far as this user can see them."""
     wanted = port.resolve()
     for process in Path("/proc").glob("[0-9]*"):
@@ -267,20 +241,20 @@ def check_can_interface(
 # --- outputs
 
 
-def check_zenoh(config: Config) -> list[Finding]:
+def _check_zenoh(config: Config) -> list[Finding]:
     """Check the ports to listen on, the routers to connect to, and the zenoh configuration file."""
     own = config.zenoh
     if own.mode == "none":
         return []
     found = [one for endpoint in own.listen or () if own.mode != "client" for one in port_is_free("zenoh", endpoint)]
-    found += [one for endpoint in own.connect for one in reachable("zenoh", endpoint)]
+    found += [one for endpoint in own.connect for one in _reachable("zenoh", endpoint)]
     for endpoint in own.listen or ():
         host = _host(endpoint)
         if host and not host.startswith(LOOPBACK) and own.config is None:
             text = f"{endpoint}: everyone who reaches this machine can read all data and send commands"
             found.append(Finding("doubt", "zenoh", text, "listen on 127.0.0.1, or use TLS and access control"))
     if own.config is not None:
-        found += check_permissions(own.config, "zenoh file")
+        found += _check_permissions(own.config, "zenoh file")
     return found
 
 
@@ -315,16 +289,8 @@ def port_is_free(about: str, endpoint: str) -> list[Finding]:
         return [Finding("wrong", about, f"{endpoint}: cannot listen: {why}")]
 
 
-def reachable(about: str, endpoint: str) -> list[Finding]:
-    """Check that a connection to an endpoint can be opened.
-
-    Parameters
-    ----------
-    about : str
-        Subject of the finding.
-    endpoint : str
-        Zenoh endpoint.
-    """
+def _reachable(about: str, endpoint: str) -> list[Finding]:
+    """Check that a connection to an endpoint can be opened."""
     match = TCP_ENDPOINT.fullmatch(endpoint)
     if match is None:
         return [Finding("well", about, f"{endpoint}: not checked, since only TCP endpoints can be checked")]
@@ -342,7 +308,7 @@ def reachable(about: str, endpoint: str) -> list[Finding]:
         ]
 
 
-def check_viewer(config: Config) -> list[Finding]:
+def _check_viewer(config: Config) -> list[Finding]:
     """Check that the viewer is installed, if the configuration uses it."""
     if config.viewer.mode == "none":
         return []
@@ -352,7 +318,7 @@ def check_viewer(config: Config) -> list[Finding]:
     return [Finding("well", "viewer", f"rerun-sdk is installed, mode {config.viewer.mode}")]
 
 
-def check_metrics(config: Config) -> list[Finding]:
+def _check_metrics(config: Config) -> list[Finding]:
     """Check the library and the port for Prometheus, and who can reach the port."""
     own = config.metrics
     if own is None:
@@ -368,7 +334,7 @@ def check_metrics(config: Config) -> list[Finding]:
     return found
 
 
-def check_reconcile(config: Config) -> list[Finding]:
+def _check_reconcile(config: Config) -> list[Finding]:
     """Check that ``command/reconcile`` can be answered, if a folder is configured for its reports."""
     missing = missing_packages("reconcile")
     if not missing or not any(one.reconcile_folder for one in config.devices):
@@ -379,7 +345,7 @@ def check_reconcile(config: Config) -> list[Finding]:
     return [Finding("doubt", "reconcile", text, 'pip install "imu-monitor[reconcile]"')]
 
 
-def check_storage(config: Config) -> list[Finding]:
+def _check_storage(config: Config) -> list[Finding]:
     """Check the library for recordings, the storage folder and the free disk space."""
     own = config.storage
     if own is None:
@@ -401,11 +367,11 @@ def check_storage(config: Config) -> list[Finding]:
     except OSError as error:
         text = f"{own.folder}: cannot be written: {error.strerror or error}"
         return [*found, Finding("wrong", "storage", text, f"create it, owned by {_user(os.geteuid())}")]
-    found += check_in_use(own)
+    found += _check_in_use(own)
     return [*found, *disk_space(own, bytes_a_day(config), usage.total, usage.free)]
 
 
-def check_in_use(own: Storage) -> list[Finding]:
+def _check_in_use(own: Storage) -> list[Finding]:
     """Check whether another process records into the storage folder or writes its history there."""
     wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
     holders = sorted({held for name, on in wanted.items() if on and (held := lock_holder(own.folder, name))})
@@ -557,7 +523,7 @@ def check_packages(module_path: Sequence[str]) -> list[Finding]:
     return found or [Finding("well", "packages", f"{' and '.join(PACKAGES)} are the program's own, in {own}")]
 
 
-def check_kernels() -> list[Finding]:
+def _check_kernels() -> list[Finding]:
     """Check that the kernels are compiled and cached on disk."""
     from monitor.common.compiled import cache_folder
     from monitor.daemon.kernel_compilation import is_warm
@@ -584,7 +550,7 @@ def check_clock() -> list[Finding]:
     return [Finding("well", "clock", "synchronised")]
 
 
-def check_systemd_unit() -> list[Finding]:
+def _check_systemd_unit() -> list[Finding]:
     """Check the service under systemd, if it is installed there."""
     if shutil.which("systemctl") is None or not Path("/run/systemd/system").is_dir():
         return []
