@@ -3,15 +3,17 @@
 If no cache folder can be written (a read-only system, a user without a home folder), kernels are compiled at every
 start.
 
-Before Numba loads cached code, it checks only whether the kernel's own file has changed. Functions that the kernel
-calls from other files, and their constants, are compiled into it as well. The stamp of the cache therefore covers all
-files that a file imports.
+Before Numba loads cached code, it checks only whether the file of the kernel has changed. A kernel also contains the
+functions and constants of other files that it uses. The stamp of the cache therefore covers all imported files.
 
-Numba by itself optimises each kernel, generates its machine code and makes it callable from Python before another
-kernel can call it. It then does the same again for the copy in the calling kernel. A function four calls below the
-kernel that Python calls goes through LLVM five times. ``Kernel`` avoids this. Functions that other kernels call remain
-intermediate code, which is optimised once, as a part of the kernel that Python calls. This saves more than a quarter of
-the time of a first start (``docs/benchmarks.md``). The machine code of the outer kernels is the same.
+Without further measures, Numba generates machine code for each kernel before another kernel can call it, and again for
+the copy in the calling kernel. A function four calls below the kernel that Python calls would go through LLVM five
+times. ``Kernel`` therefore keeps functions that other kernels call as intermediate code. This code is optimised once,
+as a part of the kernel that Python calls. This saves more than a quarter of the time of a first start
+(``docs/benchmarks.md``). The machine code of the outer kernels is the same.
+
+Kernels receive and return NamedTuples of arrays. In a loop, array fields are first copied to local names, because Numba
+counts a reference at each access to a field.
 
 Until the kernels are compiled, a thread can run them in the Python interpreter (``interpreted``).
 """
@@ -68,11 +70,9 @@ class IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
 class IntermediateCompiler(Compiler):  # type: ignore[misc]
     """Compiler that compiles a function to an ``IntermediateLibrary``."""
 
-    def __init__(  # type: ignore[no-untyped-def]
-        self, typing_context, target_context, library, args, return_type, flags, local_types
-    ) -> None:
+    def __init__(self, typing_context: Any, target_context: Any, library: Any, *more: Any) -> None:
         library = IntermediateLibrary(target_context.codegen(), "intermediate")
-        super().__init__(typing_context, target_context, library, args, return_type, flags, local_types)
+        super().__init__(typing_context, target_context, library, *more)
         self.state.targetctx.get_executable = _without_machine_code  # this context serves only this compilation
 
 

@@ -168,7 +168,7 @@ def _refined(a: Floats, x: Floats, probability: float) -> Floats:
 
 
 @compiled
-def _series(a, x):  # type: ignore[no-untyped-def]
+def _series(a: Floats, x: Floats) -> Floats:
     """Return Σ_n x^n / (a (a + 1) … (a + n)), which is P(a, x) divided by x^a e^−x / Γ(a). All terms are positive."""
     out = np.empty(a.size)
     for i in range(a.size):

@@ -1,14 +1,13 @@
-"""Analysis of a whole recording: Allan curve, confidence intervals and fitted coefficients.
+"""Analysis of a whole recording: Allan variance, confidence intervals and fitted coefficients.
 
 The results are the reference for the live estimator. The recording is first resampled to a regular grid by the clock
-that also stamps live samples. Missing samples become NaN. All findings about the time stamps are listed in
-``Analysis.notes``.
+that also stamps live samples. Missing samples become NaN. ``Analysis.notes`` lists all findings about the time stamps.
 
-``analyze`` computes the curve and the fit. ``detect_events`` looks for motion, noise changes, spectral lines and
-outliers in the same samples. It is a separate step because it takes longer than the curve.
+``analyze`` computes the Allan variance and the fit. ``detect_events`` searches the same samples for motion, noise
+changes, spectral lines and outliers. The search is a separate step because it takes longer than the fit.
 
-Samples in motion are removed from the curve only on request, since a rest that was wrongly detected as motion would be
-lost. ``detect_events`` always ignores them.
+Samples in motion are removed from the Allan variance only on request, because samples at rest that were wrongly
+detected as motion would be lost. ``detect_events`` always ignores samples in motion.
 """
 
 from collections.abc import Iterable, Sequence
@@ -40,7 +39,7 @@ from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.estimation.regular_grid import resample_to_grid
 
 MIN_SAMPLES: Final = 50
-"""Minimum number of samples. With fewer samples, the command exits with status 3."""
+"""Minimum number of samples of a recording."""
 DETECTOR_CHUNK_ROWS: Final = 65_536
 """Number of rows passed to the change detector at a time."""
 

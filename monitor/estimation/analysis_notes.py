@@ -1,8 +1,8 @@
 """Notes of an analysis for users: sentences about the fit, motion, noise changes, spectral lines and outliers.
 
-Each function returns a list of notes, which is empty if there is nothing to report. At most ``MAX_NOTES`` notes of one
-kind are listed; the remaining ones are counted. Times are in seconds since the first sample. The functions only format
-results and estimate nothing.
+Each function returns a list of notes, which is empty if there is nothing to report. A list has at most ``MAX_NOTES``
+notes of one kind and the number of omitted notes. Times are in seconds since the first sample. The functions only
+format results and estimate nothing.
 """
 
 from collections.abc import Collection, Mapping, Sequence

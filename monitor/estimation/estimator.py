@@ -5,10 +5,10 @@
 
 Optionally, the coefficients are also updated after every sample, by the linear map of ``continuous_refit``.
 
-A cluster is a number of samples. The sample rate only sets the labels of the τ axis and the units of the coefficients.
+Cluster sizes are numbers of samples. The sample rate only determines τ in seconds and the units of the coefficients.
 
-The fit uses one fixed window. For display, each τ has a second, shorter span (``Estimate.display_curve``), which shows
-a change of N within half a minute.
+The fit uses the same window for all τ. The displayed deviation of short τ uses fewer samples
+(``Estimate.display_curve``), so that it shows a change of N within half a minute.
 """
 
 from collections import deque
@@ -27,8 +27,7 @@ from monitor.estimation.allan.live_total_hadamard import LiveTotalHadamard
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.allan.uncertainty import AxisCovarianceTables, CovarianceTable, SpanDegreesOfFreedom, intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, display_spans
-from monitor.estimation.estimate import CoefficientHistory, Estimate
-from monitor.estimation.estimate import concatenate_histories as joined_courses
+from monitor.estimation.estimate import CoefficientHistory, Estimate, concatenate_histories
 from monitor.estimation.fit.bandwidth import LowPass, is_contradicted, power_spectrum, search_low_pass, with_bandwidth
 from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, concatenate_fits, design, empty_fit, fit
 from monitor.estimation.fit.continuous_refit import ContinuousRefit
@@ -40,7 +39,7 @@ MIN_SAMPLES: Final = 8
 """Minimum number of samples for an estimate. It gives three τ with a few terms each."""
 SPECTRUM_SAMPLES: Final = 65_536
 """Number of newest samples whose spectrum is tested for a low-pass filter."""
-COURSE_SAMPLES: Final = 65_536
+MAX_HISTORY_SAMPLES: Final = 65_536
 """Maximum number of samples for which the per-sample coefficients are kept between two calls of ``Estimator.get``."""
 
 
@@ -81,8 +80,8 @@ class Estimator:
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
         self._lengths = np.zeros(6, np.int64)  # samples of each axis since its last restart, limited to the window
         self._refit = ContinuousRefit(self._window, self._m, self._tables) if every_sample else None
-        self._course: deque[CoefficientHistory] = deque()
-        self._course_samples = 0  # total number of samples in ``_course``
+        self._history: deque[CoefficientHistory] = deque()
+        self._history_samples = 0  # total number of samples in ``_history``
         self._total_hadamard = LiveTotalHadamard(self._window)
         self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
         self._contradicting: list[tuple[CovarianceTable, MeasuredCurve] | None] = [
@@ -125,12 +124,12 @@ class Estimator:
             self._window.update(samples.values)
             self._lengths += len(samples)
         else:
-            self._course.append(
+            self._history.append(
                 CoefficientHistory(samples.t_ns, self._refit.update(self._design, samples.values, self._lengths))
             )
-            self._course_samples += len(samples)
-            while self._course_samples - len(self._course[0].t_ns) >= COURSE_SAMPLES:
-                self._course_samples -= len(self._course.popleft().t_ns)
+            self._history_samples += len(samples)
+            while self._history_samples - len(self._history[0].t_ns) >= MAX_HISTORY_SAMPLES:
+                self._history_samples -= len(self._history.popleft().t_ns)
         self._samples += len(samples)
         self._newest_ns = int(samples.t_ns[-1])
 
@@ -211,12 +210,12 @@ class Estimator:
         curve = self._curve(avar[own], terms[own], result.edf, n)
         quick_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent])
         quick = self._curve(avar[recent], terms[recent], quick_edf, n)
-        course = joined_courses(self._course)
-        self._course.clear()
-        self._course_samples = 0
+        history = concatenate_histories(self._history)
+        self._history.clear()
+        self._history_samples = 0
         return Estimate(
             self._newest_ns, self.rate_hz, self.window_s, self._samples, curve, result.fitted, result.coefficients,
-            result.k_or_r, quick, course,
+            result.k_or_r, quick, history,
         )  # fmt: skip
 
     def step_slow_statistics(self) -> tuple[TotalCurve, HadamardCurve] | None:
@@ -242,7 +241,7 @@ class Estimator:
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
         """Fit all axes that fill the window together. Fit each restarted axis with covariances of its own length."""
         lengths = np.minimum(self._lengths, self._window.n)
-        slope, slopes = self._window.slope(lengths), self._window.slopes(lengths)[: self._m]
+        slope, slopes = self._window.slopes(lengths)
         before = self._entered if self._refit is None else self._refit.entered
         shorter = [axis for axis in range(len(lengths)) if lengths[axis] < self._window.n]
         groups = [np.flatnonzero(lengths == self._window.n), *(np.array([axis]) for axis in shorter)]
@@ -252,7 +251,7 @@ class Estimator:
             n = int(lengths[axes[0]])
             table = self._tables.of(int(axes[0]), n, self._window.n).at(n)
             measured = MeasuredCurve(
-                avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[:, axes] * self.rate_hz,
+                avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[: self._m, axes] * self.rate_hz,
                 before[:, axes],
             )  # fmt: skip
             one = fit(
@@ -283,10 +282,12 @@ class Estimator:
             return
         for _ in range(len(self._contradicting)):
             self._search_axis = (self._search_axis + 1) % len(self._contradicting)
-            odd = self._contradicting[self._search_axis]
-            if odd is not None:
+            contradicting = self._contradicting[self._search_axis]
+            if contradicting is not None:
                 self._search = search_low_pass(
-                    self._design, *odd, power_spectrum(self._window.newest(self._search_axis, SPECTRUM_SAMPLES))
+                    self._design,
+                    *contradicting,
+                    power_spectrum(self._window.newest(self._search_axis, SPECTRUM_SAMPLES)),
                 )
                 return
             self._low_passes[self._search_axis] = None

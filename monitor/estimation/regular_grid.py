@@ -1,11 +1,10 @@
 """Resampling of a recording to a regular grid by the clock that stamps live samples. Missing samples become NaN.
 
-The live clock takes a step of two periods for a gap, because it must place the next sample at once. With the whole
-recording, each gap is checked again for samples that were only late (``late_rows``).
+The live clock treats a time step of two periods as a gap, because it must place the next sample at once. In a complete
+recording, each gap is checked again for samples that were only late (``missing_samples``).
 
-Rows that repeat an earlier row with its time stamp are dropped. Rows that repeat the previous values at a later time
-are kept, since they are what the register of the sensor held. A stated rate is used even if the time stamps contradict
-it.
+Rows with the values and the time stamp of an earlier row are removed. Rows that repeat the previous values at a later
+time are kept, because the sensor returned these values. A stated rate is used even if the time stamps contradict it.
 
 All findings are returned as notes, at most ``MAX_CLOCK_NOTES`` from the clock. A resolution as coarse as the noise is
 noted as well.
@@ -26,7 +25,7 @@ from drivers.timing.sender_times import FORWARD_JUMP_S
 from monitor.common.units import format_rate, format_two_digits
 from monitor.estimation.detection.repeated_samples import repeated_share
 from monitor.estimation.detection.resolution import QuantizationStep, find_coarse_axes
-from monitor.estimation.late_rows import count_missing_samples
+from monitor.estimation.missing_samples import count_missing_samples
 
 MIN_RATE_DEVIATION: Final = 0.002
 """Relative deviation of the stated rate from the time stamps that is reported if the time stamps are that accurate."""

@@ -1,11 +1,11 @@
 """Copy of the samples in a live window, for work that needs a recording, and a ring of temperatures.
 
-The window stores phase instead of samples, so that an hour of samples is not held twice. A sample is the difference of
-two phases. It is exact except for the rounding to one unit of phase, which is 1e-11 rad/s and m/s² for an hour at 100
-Hz. The rounding error is carried from sample to sample.
+The window stores phase instead of samples, so that an hour of samples is not stored twice. A sample is the difference
+of two phases. The difference is exact except for rounding to one unit of phase, which is 1e-11 rad/s and m/s² for an
+hour at 100 Hz. The rounding error of a sample is added to the next sample.
 
-Analyses of quantization levels and repeated values must see the steps of the sensor, which are a million times larger,
-and not this rounding. The following rules restore the values:
+Analyses of quantization steps and repeated values need the original values of the sensor without this rounding. The
+following rules restore them:
 
 - If all samples may have been float32 numbers, they are rounded to float32.
 - If the values of an axis form groups narrower than ``MAX_GROUP_UNITS`` and further apart than

@@ -1,11 +1,11 @@
 """Overlapping Allan variance of a whole recording in floating point, the reference for the sliding window.
 
-It shares no arithmetic with ``window``, which uses integers. Three measures keep the precision for 10⁷ samples and
-more, even with 9.81 m/s² under 1e-4 of noise:
+The module shares no arithmetic with ``window``, which uses integers. Three measures keep the precision for 10⁷ samples
+and more, even for noise of 1e-4 m/s² on a mean of 9.81 m/s²:
 
-- A term never reaches across a missing sample, so each unbroken run is treated as a recording of its own. Its mean is
-  subtracted first. The subtraction is exact if the noise is small beside the mean (Sterbenz), and second differences do
-  not depend on the constant.
+- A term never contains a missing sample, so each run of samples without a gap is treated as a separate recording. The
+  mean of the run is subtracted first. The subtraction is exact if the noise is small compared with the mean (Sterbenz),
+  and second differences do not depend on the mean.
 - Phase is the running sum of the remainder. The rounding errors of all steps are summed separately and added back
   (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005). Phase is therefore correct to
   its last digit.
@@ -18,9 +18,9 @@ through 20 000 times its noise.
 One float64 per sample and axis is allocated in addition to the samples. The kernel releases the GIL and computes one
 axis per call, so a thread pool can compute the axes in parallel: ``overlapping(values, factors, each=pool.map)``.
 
-A run is processed in blocks, with all τ per block. For τ shorter than a block, phase is then read from memory once for
-all of them. For longer octaves, two of the three points of a term are still in the cache from the octave before. One τ
-at a time would be limited by the memory bandwidth.
+A run is processed in blocks, with all τ per block. Phase is then read from memory only once for all τ shorter than a
+block. For longer octaves, two of the three points of a term are still in the cache from the previous octave. Processing
+one τ at a time would be limited by the memory bandwidth.
 """
 
 from collections.abc import Callable, Iterable

@@ -1,16 +1,16 @@
 """Mean and covariance of squared phase differences, for the bias and the degrees of freedom of a variance.
 
-A variance of the Allan family is an average over k of squares d_k². Here d_k = Σ_p w_p x(k_p) is a weighted sum of a
-few phase points. It does not depend on a constant rate, because Σ w_p = Σ w_p k_p = 0.
+A variance of the Allan family is a mean of squared differences d_k². Each difference d_k = Σ_p w_p x(k_p) is a weighted
+sum of a few phase points. The differences do not depend on a constant rate, because Σ w_p = Σ w_p k_p = 0.
 
 The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q). G is the generalised autocovariance of
-phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12). This also holds where points were reflected at the ends of a
+phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12). This formula also holds for points reflected at the ends of a
 record. For Gaussian noise (Isserlis), Cov(d_j², d_k²) = 2 Cov(d_j, d_k)².
 
 ``Moments`` holds the mean of the variance and of the Allan variance for unit coefficients at one cluster size. It also
-holds the quadratic form that gives the variance of the estimate. A ramp shifts a second difference by a known amount.
-The square of this amount adds to the mean, and its product with the noise adds to the variance. The ramp alone adds no
-variance.
+holds the quadratic form of the variance of the estimate. A ramp shifts a second difference by a known amount. The
+square of this amount adds to the mean, and the product of this amount with the noise adds to the variance. A ramp
+without noise adds no variance.
 
 All quantities are in units of one sample: τ0 = 1, and θ = Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
 """
@@ -18,9 +18,10 @@ All quantities are in units of one sample: τ0 = 1, and θ = Q²/τ0², N²/τ0,
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.estimation.allan.uncertainty import intervals
@@ -43,6 +44,54 @@ class Moments:
     mean: Floats  # [5] expectation of the variance for each unit coefficient
     allan: Floats  # [5] Allan variance for the same coefficients, which a corrected variance estimates
     covariance: Floats  # [5, 5] C of the quadratic form Var = Σ_ab θ_a θ_b C_ab
+
+
+class PhaseRing(NamedTuple):
+    """Phase of a record of n samples, as a ring of n + 1 or more points."""
+
+    phase: Floats | Ints  # [places, at least k] phase, or wrapping integer phase
+    missing: NDArray[np.int32]  # [places, at least k] running count of missing samples
+    first: int  # row of the oldest point
+    n: int  # number of samples
+
+
+def octaves(longest: int) -> Ints:
+    """Return the powers of two 1, 2, 4, … up to ``longest``."""
+    return 2 ** np.arange(max(longest, 1).bit_length(), dtype=np.int64)
+
+
+def integrate_to_phase(values: Floats) -> PhaseRing:
+    """Return the phase of the mean-free rates [n, k], in C order."""
+    phase = np.zeros((len(values) + 1, values.shape[1]))
+    missing = np.zeros(phase.shape, np.int32)
+    rate = phase[1:]
+    rate[:] = values
+    absent = ~np.isfinite(rate)
+    rate[absent] = 0.0
+    # the phase of the mean-free rate stays small, which keeps its precision
+    rate -= rate.sum(axis=0) / np.maximum((~absent).sum(axis=0), 1)
+    rate[absent] = 0.0
+    np.cumsum(rate, axis=0, out=rate)
+    np.cumsum(absent, axis=0, out=missing[1:])
+    return PhaseRing(phase, missing, 0, len(values))
+
+
+def variance_of_sums(sums: Floats, terms: Ints, factors: Ints, squared_weights: float) -> Floats:
+    """Convert sums of squared differences of phase to variances.
+
+    Parameters
+    ----------
+    sums : ndarray of float64, shape (m, k)
+        Sums of squared differences.
+    terms : ndarray of int64, shape (m, k)
+        Number of terms in each sum.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    squared_weights : float
+        Factor of the variance definition: 2 for second differences, 6 for third differences.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(terms > 0, sums / (squared_weights * factors[:, None] ** 2 * terms), np.nan))
 
 
 def per_sample(theta: Floats, rate_hz: float) -> Floats:

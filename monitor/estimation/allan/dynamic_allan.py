@@ -2,14 +2,13 @@
 
 A window slides along the recording in steps. At each step, the overlapping Allan variance of the window is computed and
 fitted, as in the live ``Estimator``. The variance is updated sample by sample, and a least-squares fit follows
-("Dynamic extraction of random drift error coefficients of MEMS gyroscopes"). Changes become visible that a curve of the
-whole recording averages out. The terms use the hysteresis of a repeated fit, so each fit receives the terms of the fit
-before.
+("Dynamic extraction of random drift error coefficients of MEMS gyroscopes"). The result shows changes that are averaged
+out in the Allan variance of the whole recording. The terms use the hysteresis of a repeated fit, so each fit receives
+the terms of the previous fit.
 
-Only full windows are reported, so that all time steps are equally certain. The number of steps is limited to
-``MAX_STEPS``, so the memory does not grow with the length of the recording. Every sample enters all windows that
-contain it. A change is fully visible one window length after it happened; until then the window mixes old and new
-noise.
+Only full windows are reported, so that all time steps have the same uncertainty. The number of steps is limited to
+``MAX_STEPS``, so the memory does not grow with the length of the recording. A change is fully visible one window length
+after it happened. Until then, the window contains old and new noise.
 """
 
 from collections.abc import Callable
@@ -105,9 +104,8 @@ def compute_dynamic_allan(
     for row, end in enumerate(ends.tolist()):
         window.update(values[start:end])
         start = end
-        avar = window.avar()
-        slope, slopes = window.slope() * rate_hz, window.slopes() * rate_hz
-        found = fit(columns, covariances, avar, window.terms(), entered, slope, slopes)
+        avar, (slope, slopes) = window.avar(), window.slopes()
+        found = fit(columns, covariances, avar, window.terms(), entered, slope * rate_hz, slopes * rate_hz)
         entered = found.entered
         deviation[row] = np.sqrt(avar)
         lo[row], hi[row] = intervals(avar, found.edf)

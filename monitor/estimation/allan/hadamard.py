@@ -1,9 +1,10 @@
 """Overlapping Hadamard variance: mean square of third phase differences, insensitive to a linear drift of the rate.
 
 NIST SP 1065 eq. 20 on rates: σ²(m) = mean of (x_{i+3m} − 3 x_{i+2m} + 3 x_{i+m} − x_i)² / 6m² over every i, m ≤ n/3.
-With the divisor 6, white noise reads as in the Allan variance. Other noises do not: beyond the first few samples,
-quantization reads 10/9 of the Allan variance, flicker 0.811 and random walk 0.5. The curve is therefore shown beside
-the Allan curve and is not corrected to it. It shows the noise below a ramp or slow heating.
+With the divisor 6, white noise has the same value as in the Allan variance. Beyond the first few samples, the Hadamard
+variance is 10/9 of the Allan variance for quantization, 0.811 for flicker and 0.5 for random walk. The Hadamard
+deviation is therefore shown beside the Allan deviation and is not corrected. It shows the noise without a ramp or slow
+heating.
 
 The degrees of freedom are 2 E²/Var of the fitted mixture, from the exact covariance of the terms. The formula of
 Greenhall & Riley (PTTI 2003, d = 3) holds only for one power law at a time. Terms that touch a missing sample are left
@@ -21,12 +22,18 @@ from monitor.common.compiled import compiled
 from monitor.estimation.allan.difference_moments import (
     NUM_COEFFICIENTS,
     Moments,
+    PhaseRing,
     autocovariance,
     correct_bias,
+    integrate_to_phase,
+    octaves,
     per_sample,
     quadrature_nodes,
+    variance_of_sums,
 )
-from monitor.estimation.allan.total import integrate_to_phase, octaves
+
+SQUARED_WEIGHTS: Final = 6.0
+"""Factor in the definition of the Hadamard variance, σ² = mean of d² / (6 m²)."""
 
 MAX_LAG_CLUSTERS: Final = 16
 """Distance in clusters beyond which terms count as uncorrelated.
@@ -69,12 +76,12 @@ def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     >>> hadamard_variance(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
     [0.166666666667, 0.0]
     """
-    phase, missing = integrate_to_phase(values)
+    ring = integrate_to_phase(values)
     sums = np.zeros((factors.size, values.shape[1]))
     terms = np.zeros(sums.shape, np.int64)
     for i, m in enumerate(factors):
-        add_hadamard(phase, missing, 0, len(values), int(m), sums[i], terms[i])
-    return variance(sums, terms, factors), terms
+        add_hadamard(ring, int(m), sums[i], terms[i])
+    return variance_of_sums(sums, terms, factors, SQUARED_WEIGHTS), terms
 
 
 def hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> HadamardCurve:
@@ -119,22 +126,6 @@ def make_curve(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Flo
     return HadamardCurve(factors / rate_hz, factors, raw, terms, edf, lo, hi)
 
 
-def variance(sums: Floats, terms: Ints, factors: Ints) -> Floats:
-    """Convert sums of squared third differences to variances.
-
-    Parameters
-    ----------
-    sums : ndarray of float64, shape (m, k)
-        Sums of squared third differences of phase.
-    terms : ndarray of int64, shape (m, k)
-        Number of terms in each sum.
-    factors : ndarray of int64, shape (m,)
-        Cluster sizes in samples.
-    """
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(terms > 0, sums / (6.0 * factors[:, None] ** 2 * terms), np.nan))
-
-
 def moments(n: int, factor: int) -> Moments:
     """Return mean and covariance of the Hadamard variance. The computation takes a millisecond.
 
@@ -165,19 +156,13 @@ def moments(n: int, factor: int) -> Moments:
 
 
 @compiled
-def add_hadamard(phase, missing, first, n, m, sums, terms):  # type: ignore[no-untyped-def]
-    """Add the squares of all terms of the n + 1 phase points that start at row ``first`` of a ring.
+def add_hadamard(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
+    """Add the squares of all terms of the Hadamard variance.
 
     Parameters
     ----------
-    phase : ndarray of float64 or wrapping int64, shape (places, at least k)
-        Ring of phase.
-    missing : ndarray of int32, shape (places, at least k)
-        Running count of missing samples.
-    first : int
-        Row of the oldest point.
-    n : int
-        Number of samples.
+    ring : PhaseRing
+        Phase of the record.
     m : int
         Cluster size in samples.
     sums : ndarray of float64, shape (k,)
@@ -185,6 +170,7 @@ def add_hadamard(phase, missing, first, n, m, sums, terms):  # type: ignore[no-u
     terms : ndarray of int64, shape (k,)
         Number of terms, updated in place.
     """
+    phase, missing, first, n = ring.phase, ring.missing, ring.first, ring.n
     places = phase.shape[0]
     last = (first + n) % places
     whole = True

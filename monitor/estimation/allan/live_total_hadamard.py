@@ -1,17 +1,17 @@
 """Total and Hadamard variance of the live window, computed one τ at a time.
 
-Computing both for every refit would take too long. Each call of ``step`` computes one τ of one of the two variances,
-and the caller makes one call per pass of its loop. A round covers all τ of both variances, by default octaves of the
-window. Its results are returned together when the last τ is complete. Nothing is copied: the sums run over the ring of
-integer phase of the window, between two updates by the same caller.
+Computing both variances for every refit would take too long. Each call of ``step`` computes one τ of one of the two
+variances. A round covers all τ of both variances, by default octaves of the window. The results of a round are returned
+together when the last τ is complete. The samples are not copied, because the sums use the ring of phase of the window
+between two updates by the same thread.
 
 The results lag behind the window. A window of 3.6 million samples has 22 τ of the total and 21 of the Hadamard
-variance. With ten steps per second, a round takes 4.3 s, and the oldest number returned by ``get`` is between 4.3 and
-8.6 s old. This is 0.24 % of the hour that the window spans at 1 kHz. Each number is exact for the window at the time of
-its own step.
+variance. With ten steps per second, a round takes 4.3 s, and the oldest value returned by ``get`` is between 4.3 and
+8.6 s old. This is 0.24 % of the length of the window, which is an hour at 1 kHz. Each value is exact for the window at
+the time of the step that computed the value.
 
-Inside the record, a term of the total variance is a term of the Allan variance. If the window already has this τ over
-its full length, the sum is taken from there, and only the reflected ends are added.
+Inside the record, the terms of the total variance are terms of the Allan variance. If the window already computes this
+τ over its full length, the sum of the window is used, and only the reflected ends are added.
 
 Integer phase can represent the difference of two means over τ up to half of full scale. τ that could exceed 2⁶³ are
 left out. Rounding moves the phase of a constant axis by one or two units; such sums are set to zero.
@@ -26,7 +26,7 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.sample import Floats, Ints
 from monitor.estimation.allan import hadamard, total
-from monitor.estimation.allan.difference_moments import Moments
+from monitor.estimation.allan.difference_moments import Moments, PhaseRing, octaves, variance_of_sums
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.allan.window import FULL_SCALE, AllanWindow
@@ -78,8 +78,8 @@ class LiveTotalHadamard:
         unit = window.view_ring()[3]
         longest = int((2.0**63 * unit / (0.5 * np.array(FULL_SCALE[:AXES]))).min())
         limits = (min(window.length - 1, longest), min(window.length // 3, longest // 2))
-        given = [total.octaves(limits[0]) if totals is None else totals]
-        given.append(total.octaves(limits[1]) if hadamards is None else hadamards)
+        given = [octaves(limits[0]) if totals is None else totals]
+        given.append(octaves(limits[1]) if hadamards is None else hadamards)
         for factors, limit in zip(given, limits, strict=True):
             if factors.size == 0 or factors.min() < 1 or factors.max() > limit:
                 raise ConfigError(f"cluster sizes {factors.tolist()} must lie within 1 and {limit}")
@@ -142,31 +142,39 @@ class LiveTotalHadamard:
 
     def _total(self, m: int) -> _Result:
         """Compute the total variance at one cluster size."""
-        phase, missing, first, unit = self._window.view_ring()
-        n = self._window.n
+        ring, unit = self._ring()
+        n = ring.n
         sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
         inner = np.flatnonzero((self._window.factors == m) & (self._window.spans == self._window.length))
         if inner.size and 2 * m <= n:
             row = inner[0]
             terms += self._window.terms()[row]
             sums += np.nan_to_num(self._window.avar()[row]) * terms * 2.0 * (m / unit) ** 2
-            total.add_total(phase, missing, first, n, m, 1, m, sums, terms)
-            total.add_total(phase, missing, first, n, m, n - m + 1, n, sums, terms)
+            total.add_total(ring, m, 1, m, sums, terms)
+            total.add_total(ring, m, n - m + 1, n, sums, terms)
         else:
-            total.add_total(phase, missing, first, n, m, 1, n, sums, terms)
-        sums[sums <= MAX_ROUNDING_SQUARE[TOTAL] * terms] = 0.0
-        variance = total.variance((sums * unit**2)[None], terms[None], np.array([m]))[0]
-        return _Result(variance, terms, self._cached_moments(TOTAL, n, m))
+            total.add_total(ring, m, 1, n, sums, terms)
+        return self._result(TOTAL, n, m, sums, terms)
 
     def _hadamard(self, m: int) -> _Result:
         """Compute the Hadamard variance at one cluster size."""
-        phase, missing, first, unit = self._window.view_ring()
-        n = self._window.n
+        ring, _ = self._ring()
         sums, terms = np.zeros(AXES), np.zeros(AXES, np.int64)
-        hadamard.add_hadamard(phase, missing, first, n, m, sums, terms)
-        sums[sums <= MAX_ROUNDING_SQUARE[HADAMARD] * terms] = 0.0
-        variance = hadamard.variance((sums * unit**2)[None], terms[None], np.array([m]))[0]
-        return _Result(variance, terms, self._cached_moments(HADAMARD, n, m))
+        hadamard.add_hadamard(ring, m, sums, terms)
+        return self._result(HADAMARD, ring.n, m, sums, terms)
+
+    def _ring(self) -> tuple[PhaseRing, Floats]:
+        """Return the phase of the window, and the size of one unit of phase [6]."""
+        phase, missing, first, unit = self._window.view_ring()
+        return PhaseRing(phase, missing, first, self._window.n), unit
+
+    def _result(self, statistic: int, n: int, m: int, sums: Floats, terms: Ints) -> _Result:
+        """Convert the sums of one statistic at one cluster size to variances."""
+        _, unit = self._ring()
+        sums[sums <= MAX_ROUNDING_SQUARE[statistic] * terms] = 0.0
+        weights = (total, hadamard)[statistic].SQUARED_WEIGHTS
+        variance = variance_of_sums((sums * unit**2)[None], terms[None], np.array([m]), weights)[0]
+        return _Result(variance, terms, self._cached_moments(statistic, n, m))
 
     def _cached_moments(self, statistic: int, n: int, m: int) -> Moments:
         """Return moments for about n samples, or for exactly n once the window is full."""

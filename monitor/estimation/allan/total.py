@@ -1,22 +1,22 @@
 """Total variance of a rate: Allan variance of a record reflected at both ends, for τ up to the record length.
 
 "Applications of total variance method in random error analysis of the fiber optic gyro signal" shows that a rate must
-be reflected as a rate (y*_{-j} = y_{j-1}) and not as a phase. It differences cluster sums, D_k(m) = (1/m) Σ_{i≤m}
-(y*_{k+i+m} − y*_{k+i}), with σ² = mean of D²/2. Here the mean is taken over every k, which is Howe's TOTVAR on the
-integrated rate (NIST SP 1065 eq. 25). In phase: d_i = x*_{i-m} − 2 x*_i + x*_{i+m} at every inner point i, with x*_{-j}
-= 2 x_0 − x_j at the front and likewise at the back. For m ≤ i ≤ n − m these are the terms of the overlapping Allan
-variance.
+be reflected as a rate (y*_{-j} = y_{j-1}) and not as a phase. That paper uses differences of cluster sums, D_k(m) =
+(1/m) Σ_{i≤m} (y*_{k+i+m} − y*_{k+i}), with σ² = mean of D²/2. Here the mean is taken over every k, which is Howe's
+TOTVAR on the integrated rate (NIST SP 1065 eq. 25). The terms are second differences of phase, d_i = x*_{i-m} − 2 x*_i
++ x*_{i+m}, at every inner point i. The reflected phase is x*_{-j} = 2 x_0 − x_j at the front, and likewise at the back.
+For m ≤ i ≤ n − m the terms are those of the overlapping Allan variance.
 
 ``total_variance`` returns the uncorrected variances. ``total_curve`` corrects them to the Allan variance of the same
 noise. E[TOTVAR] is computed exactly for any mixture of noises. For τ ≤ T/2 it is AVAR (1 − a τ/T), with a = 0, 0.481
 and 0.750 for white, flicker and random walk noise (SP 1065 table 7) and −4/3 for quantization. The degrees of freedom
-are exact as well. Formulas for a single power law hold for neither.
+are exact as well. For mixed noise, formulas for a single power law are inaccurate.
 
-The intervals are χ² and end at T/2. With known noise they would hold up to T, but the correction relies on the noise
-fitted to the same record. Beyond T/2, nominal 95 % intervals contain the true value in only 67 to 92 of 100 records.
-There the value is given without an interval. A ramp R has a known part in every term. Its square is included in the
-mean exactly (R²τ²/2 where nothing is reflected, less at the ends). Its product with the noise is included in the
-degrees of freedom.
+The intervals are χ² intervals and end at T/2. If the noise is known, they are correct up to T, but the correction
+relies on the noise fitted to the same record. Beyond T/2, nominal 95 % intervals contain the true value in only 67 to
+92 of 100 records, so the value is given without an interval. A ramp R adds a known amount to every term. The square of
+this amount is included in the mean exactly (R²τ²/2 where nothing is reflected, less at the ends). The product of this
+amount with the noise is included in the degrees of freedom.
 
 Terms that touch a missing sample are left out. Bias and degrees of freedom per term are those of a record without gaps.
 If fewer than ``MIN_SHARE`` of the terms remain, neither correction nor interval is given.
@@ -27,29 +27,34 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.difference_moments import (
     NUM_COEFFICIENTS,
     Moments,
+    PhaseRing,
     autocovariance,
     correct_bias,
+    integrate_to_phase,
+    octaves,
     per_sample,
     quadrature_nodes,
+    variance_of_sums,
 )
 
 MIN_SHARE: Final = 0.5
 """Minimum share of terms for a correction.
 
-With fewer terms, the reflected ones have more weight than the correction assumes. One gap in the middle that leaves
-half of the terms makes random walk read 18 % low in variance and quantization 21 % high (3000 records).
+With fewer terms, the reflected terms have more weight than the correction assumes. If a gap in the middle leaves half
+of the terms, the variance of random walk is 18 % too low and that of quantization 21 % too high (3000 records).
 """
 MAX_EXACT_TERMS: Final = 256
 """Maximum number of terms whose covariances are summed one by one. A longer record is sampled on a grid this coarse."""
 MIN_CLUSTER_POINTS: Final = 32
 """Minimum number of grid points in a cluster if the record is much longer than the cluster."""
+SQUARED_WEIGHTS: Final = 2.0
+"""Factor in the definition of the Allan variance, σ² = mean of d² / (2 m²)."""
 _RAMP: Final = NUM_COEFFICIENTS - 1
 """Row of the ramp R in θ."""
 
@@ -87,14 +92,13 @@ def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     >>> total_variance(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().round(9).tolist()
     [0.5, 0.002525253]
     """
-    phase, missing = integrate_to_phase(values)
-    n = len(values)
+    ring, n = integrate_to_phase(values), len(values)
     sums = np.zeros((factors.size, values.shape[1]))
     terms = np.zeros(sums.shape, np.int64)
     for i, m in enumerate(factors):
         if m < n:
-            add_total(phase, missing, 0, n, int(m), 1, n, sums[i], terms[i])
-    return variance(sums, terms, factors), terms
+            add_total(ring, int(m), 1, n, sums[i], terms[i])
+    return variance_of_sums(sums, terms, factors, SQUARED_WEIGHTS), terms
 
 
 def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> TotalCurve:
@@ -140,43 +144,6 @@ def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Float
     unsure = 2 * factors > np.array([one.n for one in each])
     lo[unsure] = hi[unsure] = np.nan
     return TotalCurve(factors / rate_hz, factors, tvar, terms, edf, lo, hi)
-
-
-def octaves(longest: int) -> Ints:
-    """Return the powers of two 1, 2, 4, … up to ``longest``."""
-    return 2 ** np.arange(max(longest, 1).bit_length(), dtype=np.int64)
-
-
-def integrate_to_phase(values: Floats) -> tuple[Floats, NDArray[np.int32]]:
-    """Return the phase of the mean-free rate and the running count of missing samples, both [n + 1, k] in C order."""
-    phase = np.zeros((len(values) + 1, values.shape[1]))
-    missing = np.zeros(phase.shape, np.int32)
-    rate = phase[1:]
-    rate[:] = values
-    absent = ~np.isfinite(rate)
-    rate[absent] = 0.0
-    # the phase of the mean-free rate stays small, which keeps its precision
-    rate -= rate.sum(axis=0) / np.maximum((~absent).sum(axis=0), 1)
-    rate[absent] = 0.0
-    np.cumsum(rate, axis=0, out=rate)
-    np.cumsum(absent, axis=0, out=missing[1:])
-    return phase, missing
-
-
-def variance(sums: Floats, terms: Ints, factors: Ints) -> Floats:
-    """Convert sums of squared second differences to variances.
-
-    Parameters
-    ----------
-    sums : ndarray of float64, shape (m, k)
-        Sums of squared second differences of phase.
-    terms : ndarray of int64, shape (m, k)
-        Number of terms in each sum.
-    factors : ndarray of int64, shape (m,)
-        Cluster sizes in samples.
-    """
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.where(terms > 0, sums / (2.0 * factors[:, None] ** 2 * terms), np.nan))
 
 
 def moments(n: int, factor: int) -> Moments:
@@ -273,21 +240,13 @@ def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
 
 
 @compiled
-def add_total(phase, missing, first, n, m, begin, end, sums, terms):  # type: ignore[no-untyped-def]
-    """Add the squares of the terms begin ≤ i < end of the n + 1 phase points that start at row ``first`` of a ring.
-
-    The reflected neighbour of a term enters with the opposite sign, together with twice the phase at the end.
+def add_total(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
+    """Add the squares of the terms begin ≤ i < end of the total variance.
 
     Parameters
     ----------
-    phase : ndarray of float64 or wrapping int64, shape (places, at least k)
-        Ring of phase.
-    missing : ndarray of int32, shape (places, at least k)
-        Running count of missing samples.
-    first : int
-        Row of the oldest point.
-    n : int
-        Number of samples.
+    ring : PhaseRing
+        Phase of the record.
     m : int
         Cluster size in samples.
     begin, end : int
@@ -297,38 +256,33 @@ def add_total(phase, missing, first, n, m, begin, end, sums, terms):  # type: ig
     terms : ndarray of int64, shape (k,)
         Number of terms, updated in place.
     """
-    places = phase.shape[0]
-    last = (first + n) % places
-    mirror = np.empty(sums.size, phase.dtype)
     i = begin
     while i < end:
-        stop = end
-        before, behind = 1, 1
-        if i < m:
-            before = -1
-            stop = min(stop, m)
-        if i > n - m:
-            behind = -1
-        else:
-            stop = min(stop, n - m + 1)
-        for lane in range(sums.size):
-            mirror[lane] = (1 - before) * phase[first, lane] + (1 - behind) * phase[last, lane]
-        left, right = (first + abs(i - m)) % places, (first + min(i + m, 2 * n - m - i)) % places
-        _add_run(phase, missing, left, (first + i) % places, right, before, behind, first, last, mirror,
-                 stop - i, sums, terms)  # fmt: skip
+        stop = min(end, m) if i < m else end
+        if i <= ring.n - m:
+            stop = min(stop, ring.n - m + 1)
+        _add_run(ring, m, i, stop, sums, terms)
         i = stop
 
 
 @compiled
-def _add_run(phase, missing, left, at, right, before, behind, first, last, mirror, rows, sums, terms):  # type: ignore[no-untyped-def]
+def _add_run(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
     """Add a run of terms of one kind, except those with a missing sample between their first and last point.
 
-    A term reflected at the front begins with the record, and a term reflected at the back ends with it.
+    A term reflected at the front begins with the record, and a term reflected at the back ends with it. The reflected
+    neighbour of a term enters with the opposite sign, together with twice the phase at the end.
     """
-    whole = True
+    phase, missing, first, n = ring.phase, ring.missing, ring.first, ring.n
+    places = phase.shape[0]
+    last = (first + n) % places
+    before, behind = -1 if begin < m else 1, -1 if begin > n - m else 1
+    mirror, whole = np.empty(sums.size, phase.dtype), True
     for lane in range(sums.size):
+        mirror[lane] = (1 - before) * phase[first, lane] + (1 - behind) * phase[last, lane]
         whole = whole and missing[first, lane] == missing[last, lane]
-    for _ in range(rows):
+    left, at = (first + abs(begin - m)) % places, (first + begin) % places
+    right = (first + min(begin + m, 2 * n - m - begin)) % places
+    for _ in range(end - begin):
         x, y, z = np.uintp(left), np.uintp(at), np.uintp(right)
         old, new = x if before > 0 else np.uintp(first), z if behind > 0 else np.uintp(last)
         for lane in range(np.uintp(sums.size)):
@@ -338,12 +292,12 @@ def _add_run(phase, missing, left, at, right, before, behind, first, last, mirro
                 terms[lane] += 1
         left, at, right = left + before, at + 1, right + behind
         if left < 0:
-            left += phase.shape[0]
-        elif left == phase.shape[0]:
+            left += places
+        elif left == places:
             left = 0
-        if at == phase.shape[0]:
+        if at == places:
             at = 0
         if right < 0:
-            right += phase.shape[0]
-        elif right == phase.shape[0]:
+            right += places
+        elif right == places:
             right = 0

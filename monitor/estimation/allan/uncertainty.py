@@ -5,10 +5,10 @@ B², K²) of its terms (Isserlis: Cov(d², e²) = 2 Cov(d, e)²),
 
     Cov(σ²_i, σ²_j) = Σ_ab θ_a θ_b C^ab_ij,   C^ab_ij = 1/(2 M_i M_j) Σ_c w(c) r^a_ij(c) r^b_ij(c).
 
-Here r denotes the second differences, over clusters of m_i and of m_j samples, of the generalised autocovariance of
-phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12: discrete sums of white noise). w(c) is the number of pairs of
-terms that are c samples apart, and M is the number of terms. ``covariance_table`` computes C once for a window length
-and a list of cluster sizes. A fit then only needs products.
+Here r denotes the second differences of the generalised autocovariance of phase, over clusters of m_i and m_j samples.
+The autocovariances are those of discrete sums of white noise (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12). w(c)
+is the number of pairs of terms that are c samples apart, and M is the number of terms. ``covariance_table`` computes C
+once for a window length and a list of cluster sizes, so that a fit needs only products.
 
 The result is the exact number of degrees of freedom of mixed noise, edf = 2 σ⁴ / Cov_ii. The usual formulas (Greenhall
 & Riley, PTTI 2003) hold for one power law at a time and are 15–25 % off near m = 1. They are not used, because the
@@ -47,12 +47,15 @@ UNLIMITED_SAMPLES: Final = 1 << 62
 """Number of samples that stands for an unlimited time."""
 
 TABLE_STEP: Final = 1.1
-"""Ratio of window lengths at which the table of a growing window is recomputed. In between, terms scale it."""
+"""Ratio of window lengths at which the table of a growing window is recomputed.
+
+In between, the covariances are scaled by the number of terms.
+"""
 
 
 @dataclass(frozen=True, slots=True)
 class CovarianceTable:
-    """Covariance coefficients C for one window length. The arrays are read-only."""
+    """Covariances of the Allan variances of unit noise for one window length. The arrays are read-only."""
 
     n: int  # samples in the window
     factors: Ints  # [m] cluster sizes in samples
@@ -165,8 +168,8 @@ def _sampled_flicker(m: int) -> float:
 def _slope_variance(n: int) -> Floats:
     """Return the variance of ``batch.slope_of_recording`` for unit Q² N² B² K², τ0 = 1.
 
-    It follows from the autocovariances of phase. With τ = n/3 the sums over the four points are 4, 2τ, (9 ln 3 − 8 ln
-    2) τ²/π and 5τ³/3, divided by (2τ²)².
+    The variance follows from the autocovariances of phase. With τ = n/3, the sums over the four points are 4, 2τ,
+    (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3, divided by (2τ²)².
     """
     if n < 3:
         return np.full(NOISES, np.nan)
@@ -269,7 +272,7 @@ def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Flo
 
 
 @compiled
-def _fill(n, factors, covariance):  # type: ignore[no-untyped-def]
+def _fill(n: int, factors: Ints, covariance: Floats) -> None:
     """Fill the covariance table [m, m, 10] for a window of n samples."""
     sums = np.empty(10)
     for i in range(factors.size):
@@ -285,7 +288,7 @@ def _fill(n, factors, covariance):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _sum_lags(n, small, large, sums):  # type: ignore[no-untyped-def]
+def _sum_lags(n: int, small: int, large: int, sums: Floats) -> None:
     """Sum w(c) r^a(c) r^b(c) over all lags c of the centres of the terms: kinks one by one, and blocks between them."""
     for pair in range(10):
         sums[pair] = 0.0
@@ -308,7 +311,7 @@ def _sum_lags(n, small, large, sums):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add_blocks(kink, count, side, n, small, large, sums):  # type: ignore[no-untyped-def]
+def _add_blocks(kink: int, count: int, side: float, n: int, small: int, large: int, sums: Floats) -> None:
     """Add ``count`` lags beside a kink in growing blocks, each by the three-point Gauss rule of a block.
 
     Nodes and weights integrate polynomials of degree 5 exactly over L equally spaced points. The second and fourth
@@ -331,7 +334,7 @@ def _add_blocks(kink, count, side, n, small, large, sums):  # type: ignore[no-un
 
 
 @compiled
-def _add(lag, weight, n, small, large, sums):  # type: ignore[no-untyped-def]
+def _add(lag: float, weight: float, n: int, small: int, large: int, sums: Floats) -> None:
     """Add one lag: the products of the differences of every two noises, times the number of pairs at this lag."""
     weight *= min(n + 1.0 - 2 * large, n + 1.0 - small - large - lag)
     if lag > TAIL * (small + large):

@@ -1,15 +1,15 @@
 """Sliding window with the overlapping Allan variance of the last L samples, updated with every sample.
 
-The window holds, for every cluster size m and axis, the sum S_m of squared second differences of phase and their count
-C_m. They give the Allan variance of the rate, σ²(m) = S_m / (2 m² C_m) ("Dynamic extraction of random drift error
-coefficients of MEMS gyroscopes", eq. 12-15). Missing samples are NaN in the input and keep their places in time. Each
-sample adds one term and evicts one term per τ and axis, so the cost does not depend on the window length.
+For every cluster size m and axis, the window holds the sum S_m of the squared second differences of phase and their
+number C_m. The Allan variance of the rate is σ²(m) = S_m / (2 m² C_m) ("Dynamic extraction of random drift error
+coefficients of MEMS gyroscopes", eq. 12-15). Missing samples are NaN in the input and keep their positions in time.
+Each sample adds one term and evicts one term per τ and axis, so the cost does not depend on the window length.
 
 The sums stay exact for years for three reasons:
 
-- Phase is an integer, the running sum of y · 2^s modulo 2⁶⁴. The rounding error of each sample is carried to the next.
-  A second difference x_k - 2x_{k-m} + x_{k-2m} is therefore exact to one unit of 2^-s. This holds even if phase has
-  wandered or wrapped, with or without 9.81 m/s² on the axis. The exponent s is chosen so that full-scale input cannot
+- Phase is an integer, the running sum of y · 2^s modulo 2⁶⁴. The rounding error of each sample is added to the next
+  sample. A second difference x_k - 2x_{k-m} + x_{k-2m} is therefore exact to one unit of 2^-s, even if phase has
+  wrapped around. A constant such as 9.81 m/s² has no effect. The exponent s is chosen so that full-scale input cannot
   overflow at the longest τ.
 - The same integers give the same squares when a term is added and when it is evicted. S_m is stored as a double
   together with the exact sum of its rounding errors (Knuth's TwoSum). The contribution of a transient is therefore
@@ -17,8 +17,7 @@ The sums stay exact for years for three reasons:
 - A running count of missing samples per axis shows for every term whether all of its 2m samples are present. Only such
   terms are added, and the same count decides whether they are evicted.
 
-A row can use fewer samples than the window holds (``spans``). All rows share one ring of phase, and each row evicts at
-its own distance.
+A row can use fewer samples than the window holds (``spans``). All rows share one ring of phase.
 
 The rounding is white phase noise of variance 2^-2s/12. It changes σ²(m) by a relative amount of about 2·2^-s/(σ √L) at
 every m, where σ is the noise of one sample. For an hour at 100 Hz (s = 38, 36) and σ = 1e-4, this is 1e-10.
@@ -41,13 +40,11 @@ from monitor.estimation.allan.window_kernel import (
     STAGE_SAMPLES,
     TOTAL,
     WIDTH,
-    Parts,
+    WindowBuffers,
     advance,
-    forget,
-    mean_second_differences,
-    slope_of_thirds,
-    view_floats,
-    view_ints,
+    discard,
+    slopes_of_axes,
+    view_arrays,
 )
 
 MIN_LENGTH: Final = 100
@@ -146,17 +143,17 @@ class AllanWindow:
         self.spans = spans.astype(np.int64)
         self._taus = int(factors.size)
         self._scale = phase_scale(int(factors.max()))
-        # only a few arrays, because passing one to the kernel takes 50 ns; see view_ints and view_floats
+        # only a few arrays, because passing one to the kernel takes 50 ns; see view_arrays
         taus, places = self._taus, length + 1 + RUN_SAMPLES
         self._ints = _aligned(LANES + -(-2 * taus // LINE) * LINE + taus * LANES + places * LANES, np.int64)
         self._floats = _aligned((2 + 2 * RUN_SAMPLES + 2 * taus + STAGE_SAMPLES) * LANES, np.float64)
         self._missing = np.zeros(places * LANES, np.int32)
-        self._state, rows_m, rows_span, terms, self._phase = view_ints(self._ints, taus)
-        rows_m[:], rows_span[:] = self.factors, self.spans
-        self._scaling, _, sums, rest, stage = view_floats(self._floats, taus)
-        self._terms = terms.reshape(taus, LANES)
-        self._sums, self._rest = sums.reshape(taus, LANES), rest.reshape(taus, LANES)
-        self._stage = stage[: STAGE_SAMPLES * AXES].reshape(STAGE_SAMPLES, AXES)
+        arrays = view_arrays(self._ints, self._floats, self._missing, taus)
+        self._state, self._phase, self._scaling = arrays.state, arrays.phase, arrays.scaling
+        arrays.factors[:], arrays.spans[:] = self.factors, self.spans
+        self._terms = arrays.terms.reshape(taus, LANES)
+        self._sums, self._rest = arrays.sums.reshape(taus, LANES), arrays.rest.reshape(taus, LANES)
+        self._stage = arrays.stage[: STAGE_SAMPLES * AXES].reshape(STAGE_SAMPLES, AXES)
         self.resets = -1  # number of times the window has been emptied; the call below makes it 0
         self.reset()
 
@@ -207,13 +204,13 @@ class AllanWindow:
         advance(self._ints, self._floats, self._missing, self._taus, 0, n)
 
     def stage(self, values: Floats) -> None:
-        """Copy up to ``STAGE_SAMPLES`` samples [n, 6] to the input buffer of compiled code (``parts``)."""
+        """Copy up to ``STAGE_SAMPLES`` samples [n, 6] to the input buffer of compiled code (``buffers``)."""
         # copied, because each new memory layout or access flag of an array triggers a compilation of seconds
         self._stage[: len(values)] = values
 
-    def kernel_arrays(self) -> Parts:
-        """Return the arrays with which compiled code advances the window."""
-        return Parts(self._ints, self._floats, self._missing, self._taus, self.length)
+    def buffers(self) -> WindowBuffers:
+        """Return the memory with which compiled code advances the window."""
+        return WindowBuffers(self._ints, self._floats, self._missing, self._taus, self.length)
 
     def skip(self, n: int) -> None:
         """Advance by n missing samples. If n exceeds the window length, the window is emptied."""
@@ -238,7 +235,7 @@ class AllanWindow:
             Number of newest samples to keep.
         """
         if n < self.n:
-            forget(self._ints, self._floats, self._missing, self._taus, axis, n)
+            discard(self._ints, self._floats, self._missing, self._taus, axis, n)
 
     def avar(self) -> Floats:
         """Return the Allan variance [m, 6] in squared units of the axis; NaN where no term is complete."""
@@ -250,31 +247,12 @@ class AllanWindow:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(terms > 0, sums / (2.0 * m * m * terms), np.nan)
 
-    def slope(self, lengths: Ints | None = None) -> Floats:
-        """Return the slope of the rate of each axis over its newest samples.
+    def slopes(self, lengths: Ints | None = None) -> tuple[Floats, Floats]:
+        """Return the slope of the rate of each axis over its newest samples, and the slope that each τ sees.
 
-        The slope is the mean of the last third minus the mean of the first third, divided by two thirds of the duration
-        (``batch.slope_of_recording``).
-
-        Parameters
-        ----------
-        lengths : ndarray of int64, shape (6,), or None
-            Number of newest samples of each axis. None means all samples in the window.
-
-        Returns
-        -------
-        ndarray of float64, shape (6,)
-            Slope in units of the axis per sample; NaN if too many samples are missing.
-        """
-        newest = int(self._state[NEWEST])
-        lengths = np.full(AXES, self.n) if lengths is None else lengths
-        result = np.array(
-            [slope_of_thirds(self._phase, self._missing, newest, n, axis) for axis, n in enumerate(lengths)]
-        )
-        return result / self._scale[:AXES]
-
-    def slopes(self, lengths: Ints | None = None) -> Floats:
-        """Return the slope of the rate as seen by each τ: the mean second difference of phase divided by m².
+        The slope of an axis is the mean of the last third minus the mean of the first third, divided by two thirds of
+        the duration (``batch.slope_of_recording``). The slope that τ sees is the mean second difference of phase
+        divided by m² (``batch.slope_per_tau``).
 
         Parameters
         ----------
@@ -283,13 +261,15 @@ class AllanWindow:
 
         Returns
         -------
-        ndarray of float64, shape (m, 6)
+        slope : ndarray of float64, shape (6,)
             Slope in units of the axis per sample; NaN if too many samples are missing.
+        slopes : ndarray of float64, shape (m, 6)
+            Slope that each τ sees, in the same unit.
         """
-        result = np.empty((self._taus, AXES))
+        slope, slopes = np.empty(AXES), np.empty((self._taus, AXES))
         lengths = np.full(AXES, self.n) if lengths is None else lengths
-        mean_second_differences(self._phase, self._missing, int(self._state[NEWEST]), lengths, self.factors, result)
-        return result / self._scale[:AXES]
+        slopes_of_axes(self._ints, self._floats, self._missing, self._taus, lengths, slope, slopes)
+        return slope / self._scale[:AXES], slopes / self._scale[:AXES]
 
     def terms(self) -> Ints:
         """Return the number of second differences averaged, shape (m, 6)."""

@@ -1,7 +1,7 @@
 """Compiled kernels of ``AllanWindow``: they append phase to the ring and update the sums of all cluster sizes.
 
-The arithmetic is described in ``window``. All data of a window lie in three arrays (``Parts``), because the interpreter
-takes 50 ns to pass one array to compiled code.
+The arithmetic is described in ``window``. All data of a window are stored in three arrays (``WindowBuffers``), because
+passing one array from Python to compiled code takes 50 ns.
 """
 
 from typing import Final, NamedTuple
@@ -41,54 +41,52 @@ BEND_POINTS: Final = 64
 """Number of points that represent a block of phase. The sum of the block is exact to a percent of its scatter."""
 
 
-class Parts(NamedTuple):
-    """Arrays of a window, in the form that compiled code takes."""
+class WindowBuffers(NamedTuple):
+    """Memory of a window in three arrays, the form in which compiled code receives it from Python."""
 
-    ints: Ints  # see view_ints
-    floats: Floats  # see view_floats
+    ints: Ints  # see ``view_arrays``
+    floats: Floats  # see ``view_arrays``
     missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
     taus: int  # number of cluster sizes
     length: int  # samples in the full window
 
 
-def view_ints(ints: Ints, taus: int) -> tuple[Ints, Ints, Ints, Ints, Ints]:
-    """Return views of the integer array: state, factors [m], spans [m], terms [m · LANES] and phase [places · LANES].
+class WindowArrays(NamedTuple):
+    """Views of the memory of a window with m cluster sizes."""
+
+    state: Ints  # [LANES] see ``TOTAL``
+    factors: Ints  # [m] cluster sizes in samples
+    spans: Ints  # [m] number of newest samples that each row uses
+    terms: Ints  # [m · LANES] number of second differences in each sum
+    phase: Ints  # [places · LANES] ring of integer phase
+    scaling: Floats  # [2 · LANES] units of phase per unit of the axis, and the rounding not yet in phase
+    scratch: Floats  # [2 · RUN_SAMPLES · LANES] squares of a run that are added and evicted
+    sums: Floats  # [m · LANES] sums of squared second differences
+    rest: Floats  # [m · LANES] rounding errors of the sums
+    stage: Floats  # [at least STAGE_SAMPLES · AXES] input buffer
+    missing: NDArray[np.int32]  # [places · LANES] running count of missing samples
+
+
+def view_arrays(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int) -> WindowArrays:
+    """Return views of the memory of a window.
 
     Parameters
     ----------
-    ints : ndarray of int64
-        Integer array of a window.
-    taus : int
-        Number of cluster sizes m.
+    ints, floats, missing, taus
+        Fields of ``WindowBuffers``.
     """
     spans, terms = LANES + taus, LANES + (2 * taus + LINE - 1) // LINE * LINE
     phase = terms + taus * LANES
-    return ints[:LANES], ints[LANES:spans], ints[spans : spans + taus], ints[terms:phase], ints[phase:]
-
-
-def view_floats(floats: Floats, taus: int) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """Return views of the float array.
-
-    Parameters
-    ----------
-    floats : ndarray of float64
-        Float array of a window.
-    taus : int
-        Number of cluster sizes m.
-
-    Returns
-    -------
-    tuple of ndarray of float64
-        Scale and rounding not yet in phase [2 · LANES], two scratch arrays of a run, sums [m · LANES], the rounding
-        errors of the sums [m · LANES], and the input buffer [at least STAGE · AXES].
-    """
     scratch, sums = 2 * LANES, (2 + 2 * RUN_SAMPLES) * LANES
     rest, stage = sums + taus * LANES, sums + 2 * taus * LANES
-    return floats[:scratch], floats[scratch:sums], floats[sums:rest], floats[rest:stage], floats[stage:]
+    return WindowArrays(
+        ints[:LANES], ints[LANES:spans], ints[spans : spans + taus], ints[terms:phase], ints[phase:],
+        floats[:scratch], floats[scratch:sums], floats[sums:rest], floats[rest:stage], floats[stage:], missing,
+    )  # fmt: skip
 
 
-cut_ints, cut_floats = compiled(view_ints), compiled(view_floats)
-"""Compiled versions of ``view_ints`` and ``view_floats`` for kernels."""
+cut_arrays = compiled(view_arrays)
+"""Compiled version of ``view_arrays`` for kernels."""
 
 
 @compiled
@@ -101,80 +99,59 @@ def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, s
 
     Parameters
     ----------
-    ints, floats, missing : ndarray
-        Arrays of the window, see ``Parts``.
-    taus : int
-        Number of cluster sizes.
+    ints, floats, missing, taus
+        Fields of ``WindowBuffers``.
     start : int
         First row of the input buffer.
     n : int
         Number of rows.
     """
-    state, factors, spans, terms, phase = cut_ints(ints, taus)
-    scaling, scratch, sums, rest, stage = cut_floats(floats, taus)
-    places = phase.size // LANES
+    w = cut_arrays(ints, floats, missing, taus)
+    places = w.phase.size // LANES
     length = places - 1 - RUN_SAMPLES
     done, end = start, start + n
     while done < end:
         run = min(RUN_SAMPLES, end - done)
-        first = state[NEWEST] + 1 if state[NEWEST] + 1 < places else 0
+        first = w.state[NEWEST] + 1 if w.state[NEWEST] + 1 < places else 0
         for row in range(done, done + run):
-            _append(stage[row * AXES : (row + 1) * AXES], scaling, phase, missing, state)
+            _append(w, row)
         done += run
-        count = state[TOTAL] - run  # number of samples before this run
-        whole = count - state[LAST_MISSING] > length
+        count = w.state[TOTAL] - run  # number of samples before this run
+        whole = count - w.state[LAST_MISSING] > length
         if run == 1 and whole and count >= length:
             for row in range(0, taus, RUN_SAMPLES):
-                some, lanes = slice(row, row + RUN_SAMPLES), slice(row * LANES, (row + RUN_SAMPLES) * LANES)
-                _swap(first, factors[some], spans[some], phase, scratch, sums[lanes], rest[lanes])
+                _replace_terms(w, first, row, min(RUN_SAMPLES, taus - row))
         else:
-            _take(first, run, count, whole, factors, spans, phase, missing, scratch, terms, sums, rest, state[WIDTH])
+            _add_run(w, first, run, count, whole)
 
 
 @compiled
-def _take(
-    first: int,
-    run: int,
-    count: int,
-    whole: bool,
-    factors: Ints,
-    spans: Ints,
-    phase: Ints,
-    missing: NDArray[np.int32],
-    scratch: Floats,
-    terms: Ints,
-    sums: Floats,
-    rest: Floats,
-    lanes: int,
-) -> None:
+def _add_run(w: WindowArrays, first: int, run: int, count: int, whole: bool) -> None:
     """Update the sums of each τ by ``run`` samples whose phase begins at row ``first``.
 
-    ``count`` is the number of earlier samples.
+    ``count`` is the number of earlier samples. ``whole`` is True if no sample of the window is missing.
     """
-    places = phase.size // LANES
-    for i in range(factors.size):
-        row = max(0, 2 * factors[i] - 1 - count)  # first row with a complete term
-        own = slice(i * LANES, (i + 1) * LANES)
+    places = w.phase.size // LANES
+    for i in range(w.factors.size):
+        row = max(0, 2 * w.factors[i] - 1 - count)  # first row with a complete term
         while row < run:
             # up to the row at which a stream reaches the end of the ring or the span becomes full
             now = first + row if first + row < places else first + row - places
-            leaving = count + row >= spans[i]
-            end = run if leaving else min(run, spans[i] - count)
-            row += _slide(
-                now, end - row, factors[i], spans[i], leaving, whole,
-                phase, missing, scratch, terms[own], sums[own], rest[own], lanes,
-            )  # fmt: skip
+            leaving = count + row >= w.spans[i]
+            end = run if leaving else min(run, w.spans[i] - count)
+            row += _slide(w, i, now, end - row, leaving, whole)
 
 
 @compiled
-def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.int32], state: Ints) -> None:
-    """Write one phase point and the running count of missing samples."""
+def _append(w: WindowArrays, row: int) -> None:
+    """Write the phase point and the running count of missing samples for one row of the input buffer."""
+    stage, scaling, phase, missing, state = w.stage, w.scaling, w.phase, w.missing, w.state
     before = LANES * state[NEWEST]
     now = before + LANES if before + LANES < phase.size else 0
     state[TOTAL] += 1
     state[NEWEST] = now // LANES
-    for lane in range(sample.size):
-        y = sample[lane] * scaling[lane] + scaling[LANES + lane]
+    for lane in range(AXES):
+        y = stage[row * AXES + lane] * scaling[lane] + scaling[LANES + lane]
         if abs(y) < 4.0e18:  # false for NaN too
             step = np.rint(y)
             scaling[LANES + lane] = y - step
@@ -189,44 +166,32 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
 
 
 @compiled
-def _slide(
-    now: int,
-    rows: int,
-    m: int,
-    span: int,
-    leaving: bool,
-    whole: bool,
-    phase: Ints,
-    missing: NDArray[np.int32],
-    scratch: Floats,
-    terms: Ints,
-    sums: Floats,
-    rest: Floats,
-    lanes: int,
-) -> int:
-    """Add the terms that end at up to ``rows`` phase points from row ``now`` on, and evict as many if ``leaving``.
+def _slide(w: WindowArrays, i: int, now: int, rows: int, leaving: bool, whole: bool) -> int:
+    """Add the terms of row i that end at up to ``rows`` phase points from ``now`` on, and evict as many if ``leaving``.
 
-    Return the number of rows processed. It is smaller than ``rows`` if a stream reaches the end of the ring.
+    Return the number of points processed. It is smaller than ``rows`` if a stream reaches the end of the ring.
     """
-    places = phase.size // LANES
-    old = now - span - 1
+    m, places = w.factors[i], w.phase.size // LANES
+    own = slice(i * LANES, (i + 1) * LANES)
+    terms, sums, rest = w.terms[own], w.sums[own], w.rest[own]
+    old = now - w.spans[i] - 1
     new1, new2 = place(now - m, places), place(now - 2 * m, places)
     old0, old1, old2 = place(old + 2 * m, places), place(old + m, places), place(old, places)
     run = min(rows, places - max(now, new1, new2, old0, old1, old2))
     n = run * LANES
-    added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
-    _square(phase, now, new1, new2, n, added)
+    added, evicted = w.scratch[: RUN_SAMPLES * LANES], w.scratch[RUN_SAMPLES * LANES :]
+    _square(w.phase, now, new1, new2, n, added)
     if leaving:
-        _square(phase, old0, old1, old2, n, evicted)
+        _square(w.phase, old0, old1, old2, n, evicted)
     else:
         evicted[:n] = 0.0
     if not whole:
-        _strike(missing, now, new2, 1, n, added, terms)
+        _remove_incomplete(w.missing, now, new2, 1, n, added, terms)
         if leaving:
-            _strike(missing, old0, old2, -1, n, evicted, terms)
+            _remove_incomplete(w.missing, old0, old2, -1, n, evicted, terms)
     elif not leaving:
         terms += run
-    _exchange(added, evicted, n, sums, rest, lanes)
+    _exchange(added, evicted, n, sums, rest, w.state[WIDTH])
     return run
 
 
@@ -254,7 +219,9 @@ def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> N
 
 
 @compiled
-def _strike(missing: NDArray[np.int32], at0: int, at2: int, step: int, n: int, squares: Floats, terms: Ints) -> None:
+def _remove_incomplete(
+    missing: NDArray[np.int32], at0: int, at2: int, step: int, n: int, squares: Floats, terms: Ints
+) -> None:
     """Set to zero the squares that touch a missing sample, and count the others."""
     for i in range(n):
         if missing[at0 * LANES + i] == missing[at2 * LANES + i]:
@@ -283,17 +250,17 @@ def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats
 
 
 @compiled
-def _swap(now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, sums: Floats, rest: Floats) -> None:
-    """Update all τ at once for a single sample of a full window without gaps.
+def _replace_terms(w: WindowArrays, now: int, begin: int, taus: int) -> None:
+    """Update ``taus`` rows from row ``begin`` at once for a single sample of a full window without gaps.
 
     Setting up a vector loop for each τ would cost more than the work itself. The differences are therefore collected
     one by one, and a single loop updates all sums.
     """
-    places = phase.size // LANES
-    added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
+    phase, factors, spans, places = w.phase, w.factors, w.spans, w.phase.size // LANES
+    added, evicted = w.scratch[: RUN_SAMPLES * LANES], w.scratch[RUN_SAMPLES * LANES :]
     at0 = np.uintp(now * LANES)
-    for i in range(factors.size):
-        m, old = factors[i], now - spans[i] - 1
+    for i in range(taus):
+        m, old = factors[begin + i], now - spans[begin + i] - 1
         at1, at2 = np.uintp(place(now - m, places) * LANES), np.uintp(place(now - 2 * m, places) * LANES)
         old0, old1 = np.uintp(place(old + 2 * m, places) * LANES), np.uintp(place(old + m, places) * LANES)
         old2 = np.uintp(place(old, places) * LANES)
@@ -303,94 +270,75 @@ def _swap(now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, su
             e = float(phase[old0 + lane] - 2 * phase[old1 + lane] + phase[old2 + lane])
             added[out + lane] = d * d
             evicted[out + lane] = e * e
-    n = factors.size * LANES
-    _exchange(added, evicted, n, sums, rest, n)
+    n = taus * LANES
+    _exchange(added, evicted, n, w.sums[begin * LANES :], w.rest[begin * LANES :], n)
 
 
 @compiled
-def forget(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, axis: int, n: int) -> None:
+def discard(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, axis: int, n: int) -> None:
     """Mark all but the newest n samples of one axis as missing, and recompute the sums from those n.
 
     Parameters
     ----------
-    ints, floats, missing : ndarray
-        Arrays of the window, see ``Parts``.
-    taus : int
-        Number of cluster sizes.
+    ints, floats, missing, taus
+        Fields of ``WindowBuffers``.
     axis : int
         Index of the axis.
     n : int
         Number of newest samples to keep.
     """
-    state, factors, spans, terms, phase = cut_ints(ints, taus)
-    _, _, sums, rest, _ = cut_floats(floats, taus)
-    places = phase.size // LANES
+    w = cut_arrays(ints, floats, missing, taus)
+    state, places = w.state, w.phase.size // LANES
     # the count differs from point to point, so no term can begin and end with the same count
     oldest = place(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
         missing[place(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
     state[LAST_MISSING] = max(state[LAST_MISSING], state[TOTAL] - n)
     for i in range(taus):
-        m, own = factors[i], i * LANES + axis
-        total, left, count = 0.0, 0.0, 0
-        for back in range(min(n, spans[i]) - 2 * m, -1, -1):
-            at = state[NEWEST] - back
-            at0, at1 = place(at, places) * LANES + axis, place(at - m, places) * LANES + axis
-            at2 = place(at - 2 * m, places) * LANES + axis
-            if missing[at0] == missing[at2]:
-                d = float(phase[at0] - 2 * phase[at1] + phase[at2])
-                s = total + d * d
-                z = s - total
-                left += (total - (s - z)) + (d * d - z)
-                total = s
-                count += 1
-        sums[own], rest[own], terms[own] = total, left, count
+        _recompute_sum(w, i, axis, n)
+
+
+@compiled
+def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
+    """Recompute the sum of row i for one axis from the newest n samples."""
+    phase, missing, m, own, places = w.phase, w.missing, w.factors[i], i * LANES + axis, w.phase.size // LANES
+    total, left, count = 0.0, 0.0, 0
+    for back in range(min(n, w.spans[i]) - 2 * m, -1, -1):
+        at = w.state[NEWEST] - back
+        at0, at1 = place(at, places) * LANES + axis, place(at - m, places) * LANES + axis
+        at2 = place(at - 2 * m, places) * LANES + axis
+        if missing[at0] == missing[at2]:
+            d = float(phase[at0] - 2 * phase[at1] + phase[at2])
+            s = total + d * d
+            z = s - total
+            left += (total - (s - z)) + (d * d - z)
+            total = s
+            count += 1
+    w.sums[own], w.rest[own], w.terms[own] = total, left, count
 
 
 @inlined
-def reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> int:
-    """Return the mean of the newest samples of an axis in integer units, as a reference level.
+def _reference_level(w: WindowArrays, n: int, axis: int) -> int:
+    """Return the mean of the newest samples of an axis in integer units, or ``NEVER`` if all of them are missing.
 
     The level is close enough to the mean of the axis for differences to fit 64 bits.
-
-    Parameters
-    ----------
-    phase : ndarray of int64, shape (places · LANES,)
-        Integer phase.
-    missing : ndarray of int32, shape (places · LANES,)
-        Running count of missing samples.
-    newest : int
-        Row of the newest phase point.
-    n : int
-        Number of samples in use.
-    axis : int
-        Index of the axis.
-
-    Returns
-    -------
-    int
-        Level, or ``NEVER`` if none of the samples is present.
     """
-    places = phase.size // LANES
-    last, first = newest * LANES + axis, place(newest - min(n, LEVEL), places) * LANES + axis
+    phase, missing, newest = w.phase, w.missing, w.state[NEWEST]
+    last, first = newest * LANES + axis, place(newest - min(n, LEVEL), phase.size // LANES) * LANES + axis
     present = min(n, LEVEL) - (missing[last] - missing[first])
     return (phase[last] - phase[first]) // present if present > 0 else NEVER
 
 
 @inlined
-def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
+def slope_of_thirds(w: WindowArrays, n: int, axis: int) -> float:
     """Return the slope of the last n samples from the means of the first and the last third.
 
     Parameters
     ----------
-    phase : ndarray of int64, shape (places · LANES,)
-        Integer phase.
-    missing : ndarray of int32, shape (places · LANES,)
-        Running count of missing samples.
-    newest : int
-        Row of the newest phase point.
+    w : WindowArrays
+        Arrays of the window.
     n : int
-        Number of samples in use.
+        Number of newest samples in use.
     axis : int
         Index of the axis.
 
@@ -399,8 +347,9 @@ def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
     float
         Slope in integer units per sample; NaN if too many samples are missing.
     """
+    phase, missing, newest = w.phase, w.missing, w.state[NEWEST]
     third, places = n // 3, phase.size // LANES
-    middle = reference_level(phase, missing, newest, n, axis)
+    middle = _reference_level(w, n, axis)
     if third == 0 or middle == NEVER:
         return np.nan
     at0, at1 = newest * LANES + axis, place(newest - third, places) * LANES + axis
@@ -418,47 +367,41 @@ def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
 
 
 @compiled
-def mean_second_differences(
-    phase: Ints, missing: NDArray[np.int32], newest: int, lengths: Ints, factors: Ints, out: Floats
+def slopes_of_axes(
+    ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, lengths: Ints, slope: Floats, slopes: Floats
 ) -> None:
-    """Compute ``mean_second_difference`` of all τ and axes.
+    """Compute the slope of each axis over its newest samples, and the slope that each τ sees.
 
     Parameters
     ----------
-    phase : ndarray of int64, shape (places · LANES,)
-        Integer phase.
-    missing : ndarray of int32, shape (places · LANES,)
-        Running count of missing samples.
-    newest : int
-        Row of the newest phase point.
+    ints, floats, missing, taus
+        Fields of ``WindowBuffers``.
     lengths : ndarray of int64, shape (6,)
         Number of newest samples of each axis.
-    factors : ndarray of int64, shape (m,)
-        Cluster sizes in samples.
-    out : ndarray of float64, shape (m, 6)
-        Result in integer units per sample.
+    slope : ndarray of float64, shape (6,)
+        Result of ``slope_of_thirds`` for each axis.
+    slopes : ndarray of float64, shape (m, 6)
+        Result of ``mean_second_difference`` for each τ and axis.
     """
-    for i in range(factors.size):
-        for axis in range(AXES):
-            out[i, axis] = mean_second_difference(phase, missing, newest, lengths[axis], factors[i], axis)
+    w = cut_arrays(ints, floats, missing, taus)
+    for axis in range(AXES):
+        slope[axis] = slope_of_thirds(w, lengths[axis], axis)
+        for i in range(w.factors.size):
+            slopes[i, axis] = mean_second_difference(w, lengths[axis], w.factors[i], axis)
 
 
 @compiled
-def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: int, axis: int) -> float:
+def mean_second_difference(w: WindowArrays, n: int, m: int, axis: int) -> float:
     """Return the mean second difference of phase over clusters of m samples, divided by m².
 
     The sum of all second differences telescopes to four blocks of m points at the ends. Only ``BEND_POINTS`` points of
-    a long block are used, because phase is smooth enough for them to represent the block. A missing sample counts as
-    one of the level.
+    a long block are used, because phase is smooth enough for these points to represent the block. Missing samples are
+    replaced by the reference level.
 
     Parameters
     ----------
-    phase : ndarray of int64, shape (places · LANES,)
-        Integer phase.
-    missing : ndarray of int32, shape (places · LANES,)
-        Running count of missing samples.
-    newest : int
-        Row of the newest phase point.
+    w : WindowArrays
+        Arrays of the window.
     n : int
         Number of newest samples in use.
     m : int
@@ -471,9 +414,10 @@ def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int,
     float
         Slope of the rate in integer units per sample; NaN if too many samples are missing.
     """
+    phase, missing, newest = w.phase, w.missing, w.state[NEWEST]
     places = phase.size // LANES
     last, first = newest * LANES + axis, place(newest - n, places) * LANES + axis
-    middle = reference_level(phase, missing, newest, n, axis)
+    middle = _reference_level(w, n, axis)
     if n < 2 * m or middle == NEVER or n - (missing[last] - missing[first]) < MIN_PRESENT_SHARE * n:
         return np.nan
     stride = max(1, m // BEND_POINTS)

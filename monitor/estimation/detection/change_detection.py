@@ -10,19 +10,22 @@ its last change. The detector returns a ``Change`` of one of three kinds:
 ``change_kernel`` computes the statistics, ``change_size`` the coefficients.
 
 - **False alarms.** ``alarms_per_day`` of six axes with constant noise is divided among noise changes (eight tenths),
-  steps and bursts. The threshold for noise changes is h = ln(looks per day · RATE_AT_ZERO / alarms per day). Its one
+  steps and bursts. The threshold for noise changes is h = ln(looks per day · RATE_AT_ZERO / alarms per day). The
   constant was measured at thresholds of 8 to 12, where alarms are frequent, and is used at 13 to 20
   (``tests/experiments/benchmarks/changes.py``).
 - **Learning.** A band can raise an alarm when its reference has ``MIN_REFERENCE_TERMS`` terms and ``LEARN_S`` have
-  passed. This takes
-  a minute for the shortest octaves and 128 clusters for the longer ones, and longer for correlated terms. A change
-  within this time is not detected. A reference is kept while nothing is detected, so it becomes more accurate. A slow
-  drift of the noise is compared with all the past, so it is eventually reported as a change. The disadvantage is that
-  noise that fluctuates more slowly than the learning time is reported as well.
+  passed. This takes a minute for the shortest octaves and 128 clusters for the longer ones, and longer for correlated
+  terms. A change within this time is not detected. The reference is kept while nothing is detected, so it becomes more
+  accurate. A slow drift of the noise is eventually reported as a change, because it is compared with all earlier
+  samples. Noise that fluctuates more slowly than the learning time is reported as well.
 - **After a change**, the samples since the onset are the new reference. Octaves too long for these samples start
   without a reference.
-- **A burst** raises the share of extremes while the bulk of the differences stays the same. After its end, it is
+- **A burst** raises the share of extreme differences while the median stays the same. After its end, the burst is
   removed from the reference.
+
+``analyze`` and the live service share this detector. ``reconcile`` tests steps of level and noise by the likelihood
+ratio of its own model of the axis (``diagnostics.step_gains``, ``single_steps``, ``variance_history``), because the
+gain of a step must be comparable with the gain of every other effect.
 """
 
 from collections.abc import Mapping
@@ -74,7 +77,7 @@ from monitor.estimation.detection.change_size import Octaves, identify_noise_cha
 MAX_CLUSTER_S: Final = 300.0
 """Longest cluster in seconds. Longer ones would learn for days and show temperature rather than noise."""
 LEARN_S: Final = 60.0
-"""Minimum learning time in seconds. By then, a spectral line of width 1/``LEARN_S`` is known as dependent noise."""
+"""Minimum learning time in seconds. It suffices to resolve spectral lines of width 1/``LEARN_S``."""
 MIN_DWELL_SAMPLES: Final = 256
 """Minimum number of samples between an alarm and its decision."""
 MAX_DWELL_S: Final = 60.0

@@ -1,4 +1,4 @@
-"""Size of a noise change: which of the coefficients Q N B K changed, from the variances of octaves before and after.
+"""Identification of the coefficients Q, N, B and K that changed, from the variances of octaves before and after.
 
 The change of the Haar variances, δ_j = after − before, is linear in the changes of Q², N², B², K². The columns are the
 sampled Allan variances of the terms (IEEE Std 952 annex C). The variance of δ_j is 2F(after²/n_after +

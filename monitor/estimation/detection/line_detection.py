@@ -1,14 +1,14 @@
 """Detection of spectral lines, resonances and outliers, which no sum of the five Gaussian noise terms explains.
 
-The input is a recording on a regular grid and its Allan curve. The results are a ``Line`` for each relevant peak, and
-the share of outliers of each axis. Both use at most ``MAX_STRETCHES`` stretches of ``ROWS`` samples, spread over the
-recording, so that the longest recording takes no more than a second. Stretches with more than ``MAX_MISSING_SHARE``
-missing samples are skipped.
+The input is a recording on a regular grid and its Allan deviation. The results are a ``Line`` for each relevant peak,
+and the share of outliers of each axis. Both use at most ``MAX_STRETCHES`` stretches of ``ROWS`` samples, spread over
+the recording, so that the longest recording takes no more than a second. Stretches with more than
+``MAX_MISSING_SHARE`` missing samples are skipped.
 
 - **Lines.** The periodograms (Hann) of the stretches are averaged (Welch 1967). A peak exceeds the medians of the bins
   on both sides by ``MIN_PEAK_SIGMA`` and by the factor ``MIN_PEAK_RATIO``. The search uses single bins for lines and
-  bins ``WIDE_BINS`` times wider for resonances. The power of a peak is the part above the level on both sides of its
-  feet. A peak is reported if it adds ``MIN_LINE_SHARE`` or more of the Allan variance at some τ. A line of amplitude A
+  bins ``WIDE_BINS`` times wider for resonances. The power of a peak is the part above the level on both sides of the
+  peak. A peak is reported if it adds ``MIN_LINE_SHARE`` or more of the Allan variance at some τ. A line of amplitude A
   adds A² sin⁴(πfτ) / (m sin(πf/rate))² (the sine of IEEE Std 952, annex C, averaged over m samples instead of
   continuously). A resonance is treated as a line of the same power.
 - **Outliers** deviate by more than ``OUTLIER_SIGMA`` σ of their stretch from the median of the ``BLOCK`` samples around
@@ -17,6 +17,10 @@ missing samples are skipped.
   sample in ten is an outlier. It is at least one step of the resolution.
 
 Lines below ``FIRST_BIN`` bins of a stretch and short-lived lines are not detected.
+
+``reconcile`` tests lines and outliers with other statistics. It compares hypotheses by their log-likelihood, so it
+needs the gain of a line or of a second Gaussian in a series that is whitened by the current model. Such a gain exists
+neither for an averaged spectrum nor for the distance from a median.
 """
 
 from collections.abc import Iterator
@@ -43,7 +47,7 @@ MAX_STRETCHES: Final = 128
 MAX_OUTLIER_STRETCHES: Final = 32
 """Maximum number of stretches searched for outliers.
 
-They hold 131 072 samples, of which a share of a thousandth is measured to a tenth.
+In 131 072 samples, a share of a thousandth is known to a tenth of its value.
 """
 MAX_MISSING_SHARE: Final = 0.05
 """Maximum share of missing samples in a stretch."""
@@ -54,19 +58,22 @@ A thousand recordings each of white, flicker, quantized, random-walk, low-passed
 with this value, with 2048 samples or 20 000.
 """
 MIN_PEAK_RATIO: Final = 1.6
-"""Minimum factor by which a peak exceeds both sides. Slopes and the edge of a filter rise by less within a side."""
+"""Minimum factor by which a peak exceeds both sides.
+
+Within a side, a slope or the edge of a filter rises by a smaller factor.
+"""
 WIDE_BINS: Final = 16
 """Width in bins of the wider bins in which resonances are searched."""
 FIRST_BIN: Final = 6
 """First bin in which peaks are searched."""
 MIN_BINS: Final = 64
-"""Minimum number of bins in a spectrum. With fewer bins, quantization noise rises within a side."""
+"""Minimum number of bins in a spectrum. With fewer bins, quantization noise could be mistaken for a peak."""
 NEAR_BINS: Final = 3
-"""Number of bins on each side that the Hann window may fill with a line. They belong to no side."""
+"""Number of bins on each side of a line into which the Hann window spreads the power of the line."""
 SIDE_BINS: Final = 16
-"""Number of bins in a side; a quarter of it for the wider bins."""
+"""Number of bins on each side of a peak for the median; a quarter of this number for the wider bins."""
 FOOT_SIGMA: Final = 2.0
-"""Distance in σ by which ``NEAR_BINS`` bins together are below the previous ones while a peak falls to its foot."""
+"""Minimum decrease in σ from ``NEAR_BINS`` bins to the next ones within the flank of a peak."""
 MIN_LINE_SHARE: Final = 0.002
 """Minimum share of the Allan variance for a reported line."""
 MAX_LINES: Final = 3
@@ -95,7 +102,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class _Peak:
-    """Peak of one spectrum."""
+    """Peak in the spectrum of one axis."""
 
     middle: float  # centre in bins
     power: float  # mean square above the level of its sides, squared unit of the axis
@@ -188,7 +195,7 @@ def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[F
 
 
 def _filled(part: Floats) -> Floats:
-    """Return a stretch minus its mean, with 0 for missing samples."""
+    """Return a stretch without its mean, with 0 for missing samples."""
     there = np.isfinite(part)
     return np.where(there, part - part[there].mean(), 0.0)
 
@@ -202,7 +209,7 @@ def _spectrum(parts: Floats) -> Floats:
 
 
 def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
-    """Return lines, then resonances in bins without a line."""
+    """Return the lines of a spectrum, then the resonances in bins without a line."""
     taken = np.zeros(spectrum.size, np.bool_)
     found = []
     for width, side in ((1, SIDE_BINS), (WIDE_BINS, SIDE_BINS // 4)):
@@ -210,7 +217,8 @@ def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
         if power.size < MIN_BINS:
             continue
         runs = _find_runs(_significant_bins(power, parts * width, side))
-        for first, last in sorted(runs, key=lambda run: -power[slice(*run)].max()):  # the highest peak takes its flanks
+        # in the order of height, so that the highest peak takes the bins of its flanks
+        for first, last in sorted(runs, key=lambda run: -power[slice(*run)].max()):
             if first * width < FIRST_BIN or taken[first * width : last * width].any():
                 continue
             begin, end = _find_feet(power, first, last, parts * width)
@@ -242,9 +250,9 @@ def _significant_bins(power: Floats, averaged: int, side: int) -> Mask:
 
 
 def _find_feet(power: Floats, first: int, last: int, averaged: int) -> tuple[int, int]:
-    """Return the first bin of a peak and the one after the last.
+    """Return the first bin of a peak and the bin after the last.
 
-    The feet begin ``NEAR_BINS`` beyond the significant bins and extend while the spectrum still falls.
+    A peak extends ``NEAR_BINS`` beyond the significant bins, and further while the spectrum decreases.
     """
     falls, step = 1.0 - FOOT_SIGMA / (NEAR_BINS * averaged) ** 0.5, NEAR_BINS
     first, last = max(first - step, 0), min(last + step, power.size)
@@ -256,7 +264,7 @@ def _find_feet(power: Floats, first: int, last: int, averaged: int) -> tuple[int
 
 
 def _find_runs(marks: Mask) -> list[tuple[int, int]]:
-    """Return the start of each run of marks, and the index after its end."""
+    """Return the first index of each run of True, and the index after its end."""
     edges = np.flatnonzero(np.diff(marks.astype(np.int8), prepend=0, append=0)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 

@@ -1,14 +1,14 @@
 """Decision whether a sensor agrees with its noise model, and events when this decision changes.
 
 The window is compared with the model ten times per second, and successive results are nearly the same. A second result
-above the threshold is therefore no independent evidence, and some of many windows exceed the threshold by chance. The
-decision changes only if the gap exceeded the stricter limit ``AxisGap.alarm`` in every comparison while an eighth of
-the window was renewed, and at least ``FEWEST`` samples. Above twice the threshold, where chance is excluded, ``FEWEST``
-samples suffice. For the opposite decision, the gap must stay below ``null95`` for as long. Between these limits, the
-decision does not change. In a simulation of 1600 windows of six axes with 128 comparisons each, a true model was
-rejected three times.
+above the threshold is therefore no independent evidence. Some of many windows also exceed the threshold by chance. A
+model is rejected only if the gap exceeded the stricter limit ``AxisGap.alarm`` in every comparison while an eighth of
+the window was replaced, and at least ``MIN_SAMPLES`` samples. Above twice the threshold, where chance is excluded,
+``MIN_SAMPLES`` samples suffice. A rejected model is accepted again if the gap stays below ``null95`` for as long.
+Between these limits, the decision does not change. In a simulation of 1600 windows of six axes with 128 comparisons
+each, a true model was rejected three times.
 
-Both changes are reported as a ``model_disagrees`` event. Its field ``agrees`` gives the decision.
+Both changes are reported as a ``model_disagrees`` event. The field ``agrees`` of the event is the new decision.
 """
 
 from collections.abc import Mapping
@@ -20,8 +20,8 @@ from monitor.estimation.detection.model_gap import MIN_SAMPLES, AxisGap, ModelGa
 
 KIND: Final = "model_disagrees"
 """Kind of the events."""
-RENEWED: Final = 0.125
-"""Share of the window that must be renewed while a gap persists."""
+RENEWED_SHARE: Final = 0.125
+"""Share of the window that must be replaced while a gap persists."""
 CLEAR_FACTOR: Final = 2.0
 """Multiple of the threshold above which chance is excluded."""
 
@@ -45,12 +45,12 @@ class ModelAgreement:
         """Current decision for each axis that has one: True if it agrees with its model."""
         return {axis: one.agrees for axis, one in self._axes.items() if one.agrees is not None}
 
-    def update(self, look: ModelGap) -> list[Event]:
-        """Process one comparison and return the events that it causes."""
-        found = (self._look(self._axes[axis], gap, look) for axis, gap in look.axes.items())
+    def update(self, comparison: ModelGap) -> list[Event]:
+        """Process one comparison, and return an event for each axis whose decision changes."""
+        found = (self._update_axis(self._axes[axis], gap, comparison) for axis, gap in comparison.axes.items())
         return [event for event in found if event is not None]
 
-    def _look(self, axis: _Axis, gap: AxisGap, look: ModelGap) -> Event | None:
+    def _update_axis(self, axis: _Axis, gap: AxisGap, comparison: ModelGap) -> Event | None:
         """Update the decision for one axis, and return an event if it changed."""
         if axis.agrees is None and gap.gap <= gap.alarm:
             axis.agrees = True  # a first decision for agreement is not reported
@@ -59,13 +59,13 @@ class ModelAgreement:
             axis.since = None
             return None
         if axis.since is None:
-            axis.since = look.samples, look.t_ns
+            axis.since = comparison.samples, comparison.t_ns
         samples, since_ns = axis.since
         clear = axis.agrees is not False and gap.gap > CLEAR_FACTOR * gap.threshold
-        if look.samples - samples < max(MIN_SAMPLES, 0 if clear else round(RENEWED * gap.samples)):
+        if comparison.samples - samples < max(MIN_SAMPLES, 0 if clear else round(RENEWED_SHARE * gap.samples)):
             return None
         axis.agrees, axis.since = axis.agrees is False, None
-        return _event(gap, axis.agrees, look.t_ns, since_ns)
+        return _event(gap, axis.agrees, comparison.t_ns, since_ns)
 
 
 def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:

@@ -1,8 +1,8 @@
-"""Comparison of the Allan curve of the live window with the curve of the noise model of the sensor, for each axis.
+"""Comparison of the Allan variance of the live window with the Allan variance of the noise model, for each axis.
 
-For each axis of the model, the comparison gives the difference at each τ in standard deviations, the largest difference
-(the gap), its τ, and the limits for chance. ``model_agreement.ModelAgreement`` converts successive comparisons into
-events. It keeps a decision until new samples have confirmed another one.
+The comparison of an axis gives the difference at each τ in standard deviations, the largest difference (the gap) and
+the limits that a true model exceeds only by chance. ``model_agreement.ModelAgreement`` converts successive comparisons
+into events.
 
 If the model is true, ν σ²(τ)/σ²_model(τ) is approximately χ² with ν degrees of freedom. The cube root of χ² is
 approximately normal (Wilson & Hilferty, PNAS 17, 1931), which gives
@@ -10,10 +10,10 @@ approximately normal (Wilson & Hilferty, PNAS 17, 1931), which gives
     z(τ) = ((σ²/σ²_model)^(1/3) − 1 + 2/(9ν)) / √(2/(9ν)).
 
 ν = 2 σ⁴_model/Var is computed from the model and not from the fit. For Q N B K of the model, Var is the exact
-covariance of ``uncertainty``. For its other effects (resonance, low-pass, correlated noise), Var is the integral 4/M ∫
-(S G)² df of M terms with the kernel G of the variance. The integral is accurate if the window is long compared with the
-memory of the noise. τ with fewer than ``MIN_EDF`` degrees of freedom are not compared, because a sum of squares then
-differs too much from χ².
+covariance of ``uncertainty``. For other effects (resonance, low-pass, correlated noise), Var is the integral 4/M ∫ (S
+G)² df of M terms with the spectral kernel G of the Allan variance. The integral is accurate if the window is long
+compared with the memory of the noise. τ with fewer than ``MIN_EDF`` degrees of freedom are not compared, because a sum
+of squares then differs too much from χ².
 
 For normal z_i with any correlation, P(all |z_i| < c) ≥ ∏ P(|z_i| < c) (Šidák, J. Am. Stat. Assoc. 62, 1967). The limits
 therefore account for the number of τ and axes. Of 100 independent windows of a true model, at most one exceeds

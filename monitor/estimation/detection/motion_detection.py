@@ -1,14 +1,14 @@
-"""Motion detector: finds motion, knocks and handling of the sensor, and removes these samples from the stream.
+"""Detection of motion, knocks and handling of the sensor, and removal of these samples from the stream.
 
-The detector returns the same samples with NaN in place of those in motion, so that all later statistics treat them as
-missing. It also returns a ``Motion`` for each episode. No noise level has to be configured. The level at rest is
-learned from the samples of each axis and updated (method: ``motion_kernel``). An episode is removed from one block
-before its first moving block to two blocks after its last.
+The detector replaces samples in motion by NaN, so that all later statistics treat them as missing. It also returns a
+``Motion`` for each episode. No noise level has to be configured. The noise at rest is learned from the samples of each
+axis and updated (method: ``motion_kernel``). An episode is removed from one block before its first moving block to two
+blocks after its last moving block.
 
-Samples are delayed until the next block is decided. The delay is two blocks: 0.5 s, or 16 samples of a sensor slower
-than 32 Hz. A disturbance that persists steadily for 60 s counts as rest from then on and is left to the change
-detector. A first reference takes eight blocks. Until then, only signals that no MEMS sensor shows at rest count as
-motion.
+Samples are delayed until the next block is decided. The delay is two blocks, which is 0.5 s, or 16 samples for sensors
+sampled below 32 Hz. A constant disturbance that lasts for 60 s counts as rest from then on and is left to the change
+detector. Learning a first reference takes eight blocks. Until then, only signals that no MEMS sensor shows at rest
+count as motion.
 
 Rotation at a constant rate below 2 °/s, and motion below the noise, are not detected.
 """

@@ -1,14 +1,14 @@
 """Compiled kernel of the motion detector: blocks of samples, the reference at rest, and the decision for each block.
 
-A block is described by two numbers per axis: the logarithm of its variance and its mean. Both exclude the sample
-furthest from the mean, because an outlier is isolated while a knock rings. The reference is the median and the
-half-width between the quartiles of both numbers over the last ``REFERENCE_BLOCKS`` blocks at rest. It is computed
-exactly by insertion into a sorted ring. Up to a quarter of unusual blocks does not affect it, and drift within the ring
-widens the accepted band.
+Two numbers describe each axis of a block: the logarithm of the variance, and the mean. Both exclude the sample furthest
+from the mean, because an outlier is a single sample and a knock lasts longer. The reference is the median and the
+half-width between the quartiles of both numbers over the last ``REFERENCE_BLOCKS`` blocks at rest. The quartiles are
+exact, because the blocks are inserted into a sorted ring. Up to a quarter of unusual blocks does not affect the
+reference. Drift of the sensor widens the accepted band.
 
-A block is moving if the variance of any axis is too large or its mean is off. If all axes are still at a new mean, this
-is a new orientation, and the reference is shifted. A disturbance that persists steadily replaces the reference. Blocks
-far quieter than all learned ones replace it as well, because the reference was then learned in motion.
+A block is moving if the variance of any axis is too large or the mean is off. If all axes are still at a new mean, the
+sensor has a new orientation, and the reference is shifted. A disturbance that remains constant replaces the reference.
+Blocks far quieter than the reference replace it as well, because the reference was then learned in motion.
 
 Samples must be passed in order. Their index alone determines the block of a row, so the decisions do not depend on how
 the stream is divided.
@@ -26,21 +26,24 @@ from monitor.common.distributions import NORMAL_QUARTILE
 AXES: Final = 6
 GYROS: Final = 3
 REFERENCE_BLOCKS: Final = 240
-"""Number of blocks at rest in the reference, and of steady moving blocks that make a new one: 60 s of 0.25 s."""
+"""Number of blocks in the reference.
+
+It is 60 s of blocks of 0.25 s. A disturbance becomes rest after as many blocks.
+"""
 MIN_REFERENCE_BLOCKS: Final = 8
-"""Minimum number of blocks at rest for a first reference. Its bands are twice as wide as later."""
+"""Minimum number of blocks at rest for a first reference. The accepted bands are then twice as wide as later."""
 BAND: Final = 8.0
-"""Deviation of the mean or the log variance of a block that is still rest, in standard deviations (from quartiles)."""
+"""Largest deviation of the mean or the log variance of a block at rest, in standard deviations (from quartiles)."""
 LOUDER: Final = log(4.0)
 """Minimum rise of the log variance for motion. Smaller changes are left to the change detector."""
 LOUDEST: Final = log(100.0)
-"""Rise of the log variance that is always motion, even if the reference scatters more because it contained motion."""
+"""Rise of the log variance that always counts as motion, even if the reference contains motion and scatters more."""
 TOGETHER: Final = log(2.5)
-"""Minimum mean rise over all axes, for motion that no single axis shows."""
+"""Minimum mean rise of the log variance over all axes, for motion that no single axis shows."""
 TOGGLE: Final = 0.25
 """Variance of toggling between two neighbouring levels, in squared steps."""
 DRIFT: Final = 100.0
-"""Maximum deviation of a mean at rest, as a multiple of what the noise within blocks explains."""
+"""Maximum deviation of a mean at rest, relative to the deviation expected from the noise within blocks."""
 QUIETER: Final = log(9.0)
 """Distance of the log variance below the lower quartile that replaces the reference.
 
@@ -56,7 +59,7 @@ SETTLED: Final = 4
 NEW_BIAS: Final = 0.035
 """Deviation of the mean of a gyroscope that is accepted after handling: 0.035 rad/s, 2 °/s.
 
-It covers g-sensitivity and bias steps. A larger deviation is rotation, with the exception of ``SPUN``.
+This limit allows for g-sensitivity and bias steps. A larger deviation counts as rotation, except after ``SPUN`` blocks.
 """
 SPUN: Final = 40
 """Number of blocks (10 s) after which a larger mean without other signs of motion is accepted.
@@ -64,13 +67,13 @@ SPUN: Final = 40
 The reference was then learned in rotation.
 """
 REMOVED_AFTER: Final = 2
-"""Number of blocks removed after a moving block. One block before it is removed as well."""
+"""Number of blocks removed after a moving block. The block before a moving block is removed as well."""
 EPISODE_GAP_BLOCKS: Final = 4
 """Number of blocks at rest that end an episode."""
 LOOK_EVERY: Final = 20
 """Number of blocks between two tests whether an episode has become steady."""
 WANDER: Final = 4.0
-"""Largest ratio of the scatter of means to what the scatter within blocks explains. Above it, the means move."""
+"""Largest ratio of the scatter of means at rest to the scatter expected from the noise within blocks."""
 MIN_VARIANCE: Final = 1e-30
 """Variance assigned to a constant."""
 MIN_BLOCK_SAMPLES: Final = 4

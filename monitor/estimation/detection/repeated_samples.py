@@ -1,9 +1,13 @@
 """Share of rows in a recording that repeat the previous row because the sensor had no new measurement.
 
-Rows also repeat because of coarse resolution, but then the axes repeat independently of each other. A repeated
-measurement repeats all axes at once, which distinguishes the two. The noise may change during a recording. The share is
-therefore computed in up to ``MAX_STRETCHES`` stretches of ``ROWS`` rows, spread over the recording, and the median is
-returned. At least two axes with data are needed; otherwise the share is 0.
+With a coarse resolution, values also repeat by chance, but then the axes repeat independently of each other. A repeated
+measurement repeats all axes at once. The noise may change during a recording, so the share is computed in up to
+``MAX_STRETCHES`` stretches of ``ROWS`` rows, spread over the recording, and the median is returned. With fewer than two
+axes of data, the share is 0.
+
+``reconcile`` tests the repeats of a single axis instead (``value_statistics.detect_repeats``). It adds effects to one
+axis at a time and needs the log-likelihood gain of the repeats and their positions, which a share of all axes does not
+give.
 """
 
 from typing import Final
@@ -25,9 +29,10 @@ BISECTIONS: Final = 40
 def repeated_share(values: Floats) -> float:
     """Return the share of rows [n, 6] that repeat the previous one because the sensor had no new measurement.
 
-    Let s be the share of repeated rows. Axis a repeats in p_a = s + (1 - s) q_a of the rows, where q_a is due to its
-    resolution. All axes repeat at once in s + (1 - s) Π q_a, because the noises of the axes are independent. This is
-    one equation for s. NaN means missing.
+    Let s be the share of repeated rows, and q_a the share of the other rows in which axis a repeats because of its
+    resolution. Axis a then repeats in a share s + (1 - s) q_a of the rows. All axes repeat at once in a share
+    s + (1 - s) Π q_a, because the noises of the axes are independent. The function solves these equations for s. NaN
+    means missing.
 
     >>> noise = np.random.default_rng(0).normal(size=(5000, 6)).round()
     >>> repeated_share(noise), round(repeated_share(noise.repeat(2, axis=0)), 1)
@@ -37,18 +42,18 @@ def repeated_share(values: Floats) -> float:
     if there.sum() < 2 or len(values) < 2:
         return 0.0
     begins = np.linspace(0, max(len(values) - ROWS, 0), min(-(-len(values) // ROWS), MAX_STRETCHES)).astype(np.int64)
-    asked, whole = np.zeros(begins.size, np.int64), np.zeros(begins.size, np.int64)
+    pairs, whole = np.zeros(begins.size, np.int64), np.zeros(begins.size, np.int64)
     repeats = np.zeros((begins.size, values.shape[1]), np.int64)
-    _count(values, there, begins, asked, repeats, whole)
-    some = asked > 0
+    _count(values, there, begins, pairs, repeats, whole)
+    some = pairs > 0
     if not some.any():
         return 0.0
-    return float(np.median(_solve_share(repeats[some][:, there] / asked[some, None], whole[some] / asked[some])))
+    return float(np.median(_solve_share(repeats[some][:, there] / pairs[some, None], whole[some] / pairs[some])))
 
 
 @compiled
-def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, asked: Ints, repeats: Ints, whole: Ints) -> None:
-    """Count the complete pairs of rows of each stretch, those in which each axis repeats, and those in which all do."""
+def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, pairs: Ints, repeats: Ints, whole: Ints) -> None:
+    """Count the complete pairs of rows of each stretch, the pairs in which each axis repeats, and in which all do."""
     for stretch in range(begins.size):
         begin = begins[stretch]
         for i in range(begin + 1, min(begin + ROWS, len(values))):
@@ -61,7 +66,7 @@ def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, asked: Ints, 
                     any_same |= one == before
             if lacks:
                 continue
-            asked[stretch] += 1
+            pairs[stretch] += 1
             whole[stretch] += all_same
             if any_same:
                 for a in range(values.shape[1]):

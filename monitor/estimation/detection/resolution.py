@@ -1,9 +1,12 @@
-"""Detection of coarse resolution: quantization steps as large as the noise, which distort its measurement.
+"""Detection of quantization steps that are as large as the noise and therefore distort the measured noise.
 
-For each axis, the step of the grid of all values and the noise from sample to sample are determined. Both use at most
-``MAX_STRETCHES`` stretches of ``ROWS`` samples, spread over the recording. The step is the distance of neighbouring
-values that occur. The noise is computed from the mean distance of successive samples. Coarse steps do not change this
-mean, and a few outliers or a slow drift change it little.
+For each axis, the quantization step and the noise from sample to sample are estimated from at most ``MAX_STRETCHES``
+stretches of ``ROWS`` samples, spread over the recording. The step is the smallest distance of two different values. The
+noise is computed from the mean absolute difference of successive samples. Coarse steps do not change this mean, and a
+few outliers or a slow drift have little effect on it.
+
+``reconcile`` also detects steps far finer than the noise (``value_statistics.detect_quantization``). This takes a
+search for the common divisor of all differences, and a comparison with the resolution of the number format.
 """
 
 from dataclasses import dataclass
@@ -14,7 +17,7 @@ import numpy as np
 from drivers.sample import AXES, Floats
 
 MIN_STEP_TO_NOISE: Final = 0.5
-"""Minimum step as a share of the noise. Smaller steps add at most two percent to the variance of the noise."""
+"""Minimum step relative to the noise. Smaller steps add at most two percent to the variance of the noise."""
 ROWS: Final = 4096
 """Maximum number of samples in a stretch."""
 MAX_STRETCHES: Final = 16

@@ -1,8 +1,8 @@
 """Motion and change detection on the samples of one device, before they reach the estimator.
 
-The monitor receives blocks in order and returns the blocks for the estimator. On request, samples in motion are removed
-from them. The findings are events with the times of the samples. A noise change names the axis whose estimate must
-restart, and the number of samples to keep. The change detector never receives samples in motion.
+The monitor receives blocks in order and returns the blocks for the estimator. If requested, it replaces samples in
+motion by missing samples. Each finding is an event with the times of the samples. A noise change also requests a
+restart of the estimate of one axis. The change detector never receives samples in motion.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from monitor.estimation.detection.change_detection import Change, ChangeDetector
 from monitor.estimation.detection.motion_detection import Motion, MotionDetector
 
 MAX_RATE_CHANGE: Final = 0.02
-"""Relative change of the sample rate below which the detectors continue. Blocks of a quarter of a second stay valid."""
+"""Relative change of the sample rate up to which the detectors continue with the same block length."""
 MAX_SKIPPED_SAMPLES: Final = 10_000_000
 """Largest gap that the change detector processes as missing samples, which takes 1.6 s.
 

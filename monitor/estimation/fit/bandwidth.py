@@ -1,14 +1,15 @@
-"""Bandwidth of the sensor: the low-pass that explains the shortest τ of an Allan curve, and the fit with it.
+"""Search for the low-pass of the sensor that explains the Allan variance at the shortest τ, and the fit with it.
 
-A sensor with a bandwidth below half the sample rate has less noise at the shortest τ than N²/τ. The curve of a day is
-known there to 0.04 %, so a model that is 1 % off biases N. Here, the column of N is white noise behind a Butterworth
-low-pass of order 1 to 4, either digital at the sample rate or analogue and then sampled. Cutoff and order are those
-with the smallest misfit. The uncertainty of the cutoff is projected out of the fit, so that it does not make any
-interval too narrow. If no such filter explains the curve, the result of ``fit`` without the shortest τ is kept.
+A sensor with a bandwidth below half the sample rate has less noise at the shortest τ than N²/τ. In a recording of a
+day, the Allan variance at the shortest τ is known to 0.04 %, so a model error of 1 % biases N. In this module, the
+column of N is white noise behind a Butterworth low-pass of order 1 to 4, either digital at the sample rate or analogue
+before sampling. The cutoff and the order with the smallest misfit are used. The uncertainty of the cutoff is projected
+out of the fit, so that no interval becomes too narrow. If no low-pass explains the Allan variance, the result of
+``fit`` without the shortest τ is kept.
 
-All these filters have a flat passband, so N is the level of the white noise in the passband. Q is not estimated and
-only bounded, because almost any filter together with Q explains almost any curve. A filter must also be visible in the
-spectrum. If the spectrum does not fall beyond the cutoff, the curve has another cause.
+All these filters have a flat passband, so N is the level of the white noise in the passband. Q is only bounded, because
+almost any filter together with Q explains almost any Allan variance. A filter must also be visible in the spectrum. If
+the spectrum does not fall beyond the cutoff, the deviation from N²/τ has another cause.
 """
 
 from collections.abc import Generator, Sequence

@@ -1,24 +1,26 @@
 """Weighted non-negative least-squares fit of the coefficients Q N B K R to an Allan curve of several axes.
 
-The curve is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares. The weights are the
-inverse covariance of the τ under the fitted model, or its diagonal alone where time is short. They are recomputed a few
-times (such weights come within a few percent of the Cramér–Rao limit).
+The Allan variance is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares. The weights
+are the inverse covariance of the τ under the fitted model, or the inverse variances alone if the fit must be fast. The
+weights are recomputed a few times. The errors of the coefficients are then within a few percent of the Cramér–Rao
+limit.
 
 The unconstrained solution û determines the status of each coefficient. Its variance is v(t) = c0 + c1 t + c2 t² if the
 true θ_a is t, from the covariances of ``uncertainty``. A term is included if û_a/√c0, computed with the variance for an
-absent term, exceeds a threshold. Its interval is the set of t that û does not contradict. A term that is not included
-has a one-sided bound, which is never tighter than the bound from an estimate of zero.
+absent term, exceeds a threshold. The interval of the term is the set of t that û does not contradict. A term that is
+not included has a one-sided bound, which is never tighter than the bound from an estimate of zero.
 
-The curve alone cannot distinguish a ramp from a random walk. Given the slope s of the window, the fit uses the curve of
-the samples without this line, so that K is unbiased with and without a ramp. R is included if s is larger than noise
-explains with K at the upper end of its interval. Otherwise K or R may cause the slope, and both are bounded. Without a
-slope, R is only bounded, and a ramp is estimated as K.
+The Allan variance alone cannot distinguish a ramp from a random walk. If the slope s of the window is known, the fit
+uses the Allan variance of the samples without this slope, so that K is unbiased with and without a ramp. R is included
+if s is larger than expected from the noise with K at the upper end of the interval of K. Otherwise K or R may cause the
+slope, and both are bounded. If the slope is unknown, R is only bounded, and a ramp is estimated as K.
 
-The bandwidth of real sensors ends below half the sample rate. White noise behind a low-pass looks like N²/τ − c/τ²
-beyond the memory of the filter, which is the column of Q with a negative sign. If the shortest τ contradict the fit, Q²
-may therefore become negative. It then stands for the band limit, and Q is only bounded by the first point of the curve.
-While the shortest τ still contradict the fit, the shortest one is left out. If no filter explains the curve, for
-example because of a spectral line or motion, no τ is left out, and the misfit is reported.
+The bandwidth of real sensors ends below half the sample rate. White noise behind a low-pass has the Allan variance N²/τ
+− c/τ² beyond the memory of the filter. The second term is the column of Q with a negative sign. If the shortest τ
+contradict the fit, Q² may therefore become negative. A negative Q² represents the band limit, and Q is only bounded by
+the Allan variance at the shortest τ. While the shortest τ still contradict the fit, the shortest τ is left out. If no
+filter explains the Allan variance, for example because of a spectral line or motion, no τ is left out, and the misfit
+is reported.
 
 The fit accepts any curve. An axis with too few τ, or without noise, is UNESTIMATED.
 """
@@ -33,9 +35,9 @@ from numpy.typing import NDArray
 from drivers.sample import Floats, Ints
 from monitor.estimation.allan.uncertainty import NOISES, CovarianceTable
 from monitor.estimation.fit.coefficients import Coefficients, Status
+from monitor.estimation.fit.fit_arrays import AxisCurves, FitOptions, SharedInputs, empty_fit_output, empty_gains
 from monitor.estimation.fit.fit_kernel import WHITE, fit_axes
 from monitor.estimation.fit.least_squares import N, R
-from monitor.estimation.fit.term_selection import SharedInputs, empty_fit_output, empty_gains
 from monitor.noise.standard_terms import unit_allan_variances
 
 TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
@@ -217,8 +219,8 @@ def _fit(
         found.theta[:] = start.T / design.rate_hz ** (2.0 * TO_SI)
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
     slope, slopes = measured.slope / design.rate_hz, np.ascontiguousarray(measured.slopes.T) / design.rate_hz
-    thresholds, warm = THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED, start is not None
-    fit_axes(0, axes, shared, curves, counts, slope, slopes, thresholds, full, warm, found, frozen)
+    options = FitOptions(*(THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED), full, start is not None)
+    fit_axes(0, axes, shared, AxisCurves(curves, counts, slope, slopes), options, found, frozen)
     to_si = design.rate_hz**TO_SI
     value = np.where(found.status == Status.ESTIMATED, np.sqrt(np.maximum(found.theta, 0.0)), np.nan)
     coefficients = Coefficients((value * to_si).T, (found.lo * to_si).T, (found.hi * to_si).T, found.status.T)

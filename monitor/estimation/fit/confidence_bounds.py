@@ -4,8 +4,10 @@ from typing import Final
 
 import numpy as np
 
+from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
+from monitor.estimation.fit.fit_arrays import TermResults
 from monitor.estimation.fit.least_squares import N, Q
 
 UPPER_BOUND_Z: Final = Z95
@@ -14,19 +16,17 @@ UPPER_BOUND_Z: Final = Z95
 It gives 97.5 % for a single fit. It still gives 95 % of the reported bounds when large terms are estimated instead and
 their intervals miss as well.
 """
-
 EXCLUSION_SIGMA: Final = 3.3
 """Distance in σ by which a curve lies below a term that it does not contain.
 
 With 20 τ, none is that far off by chance in 99 of 100 cases.
 """
-
 MIN_CUBE_ROOT_FACTOR: Final = 0.05
 """Minimum factor of the cube root of χ². Below it (under two degrees of freedom) a measured variance gives no bound."""
 
 
 @compiled
-def quantile(z, skewness):  # type: ignore[no-untyped-def]
+def quantile(z: float, skewness: float) -> float:
     """Return the quantile of probability Φ(z) of the standardized Pearson III distribution.
 
     The distribution is a χ² with 8/skewness² degrees of freedom, in the approximation of Wilson & Hilferty (1931).
@@ -43,11 +43,11 @@ def quantile(z, skewness):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped-def]
-    """Return √t at which the estimate lies k √v(t) above t.
+def interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> float:
+    """Return √t at which the estimate û lies k √v(t) above t.
 
-    k is the quantile of Φ(z) with the skewness 2 √c2 of the estimate alone. t solves (1 − k²c2) t² − (2û + k²c1) t + û²
-    − k²c0 = 0. The end is clipped at zero.
+    Here k is the quantile of Φ(z) with the skewness 2 √c2 of the estimate alone, and t solves the equation
+    (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0. The end is clipped at zero.
 
     Parameters
     ----------
@@ -55,25 +55,21 @@ def interval_end(estimate, c0, c1, c2, skewness, z):  # type: ignore[no-untyped-
         Unconstrained estimate û of the squared coefficient.
     c0, c1, c2 : float
         Coefficients of its variance v(t) = c0 + c1 t + c2 t².
-    skewness : float
-        Skewness 2 √c2 of the estimate.
     z : float
         Normal quantile, positive for the lower end and negative for the upper end.
     """
-    k = quantile(z, skewness)
+    k = quantile(z, 2.0 * np.sqrt(c2))
     a = 1.0 - k * k * c2
     b = estimate + 0.5 * k * k * c1
     root = b * b - a * (estimate * estimate - k * k * c0)
     if root < 0.0 or a <= 1e-9:
         return 0.0 if z > 0.0 else np.inf
     t = (b - np.sqrt(root)) / a if z > 0.0 else (b + np.sqrt(root)) / a
-    return np.sqrt(max(t, 0.0))
+    return float(np.sqrt(max(t, 0.0)))
 
 
 @compiled
-def limit_by_curve(  # type: ignore[no-untyped-def]
-    curve, edf, rows, columns, memory, entered, theta, lo, hi, status
-):
+def limit_by_curve(curve: Floats, edf: Floats, rows: Ints, columns: Floats, memory: int, terms: TermResults) -> None:
     """Limit the coefficients of a curve that the five terms do not describe: none may exceed the whole curve at any τ.
 
     N is only limited beyond ``memory`` samples. Below, the filter of the sensor may have removed white noise.
@@ -88,7 +84,7 @@ def limit_by_curve(  # type: ignore[no-untyped-def]
         Allan variance of unit coefficients.
     memory : int
         Memory of the filter in samples.
-    entered, theta, lo, hi, status : ndarray, shape (5,)
+    terms : TermResults
         Results of the fit, updated in place.
     """
     for a in range(5):
@@ -97,16 +93,18 @@ def limit_by_curve(  # type: ignore[no-untyped-def]
             if columns[i, a] > 0.0 and (a != N or columns[i, N] * memory < 1.0):
                 most = min(most, upper_limit(curve[i], edf[i], EXCLUSION_SIGMA) / columns[i, a])
         most = np.sqrt(most)
-        if status[a] == 0 or hi[a] <= most:
+        if terms.status[a] == 0 or terms.hi[a] <= most:
             continue
-        hi[a] = most
-        if status[a] == 2 and not lo[a] < np.sqrt(theta[a]) < most:
-            entered[a], status[a], lo[a] = False, 1, 0.0
+        terms.hi[a] = most
+        if terms.status[a] == 2 and not terms.lo[a] < np.sqrt(terms.theta[a]) < most:
+            terms.entered[a], terms.status[a], terms.lo[a] = False, 1, 0.0
 
 
 @compiled
-def upper_limit(avar, edf, z):  # type: ignore[no-untyped-def]
-    """Return the upper limit of the true variance at z σ (Wilson & Hilferty); infinite with too few degrees of freedom.
+def upper_limit(avar: float, edf: float, z: float) -> float:
+    """Return the upper limit of the true variance at z σ (Wilson & Hilferty).
+
+    The limit is infinite with too few degrees of freedom.
 
     Parameters
     ----------
@@ -119,12 +117,12 @@ def upper_limit(avar, edf, z):  # type: ignore[no-untyped-def]
     """
     spread = 2.0 / (9.0 * max(edf, 1.0))
     shrunk = 1.0 - spread - z * np.sqrt(spread)
-    return avar / shrunk**3 if shrunk > MIN_CUBE_ROOT_FACTOR else np.inf
+    return float(avar / shrunk**3 if shrunk > MIN_CUBE_ROOT_FACTOR else np.inf)
 
 
 @compiled
-def bound_by_first_point(avar, edf, column, entered, lo, hi, status):  # type: ignore[no-untyped-def]
-    """Bound Q by the whole first point of the curve, because the band limit of the sensor hides it.
+def bound_by_first_point(avar: float, edf: float, column: float, terms: TermResults) -> None:
+    """Bound Q by the whole first point of the curve, because the band limit of the sensor hides Q.
 
     Parameters
     ----------
@@ -132,10 +130,8 @@ def bound_by_first_point(avar, edf, column, entered, lo, hi, status):  # type: i
         First point of the curve and its degrees of freedom.
     column : float
         Allan variance of unit Q at this point.
-    entered, lo, hi, status : ndarray, shape (5,)
+    terms : TermResults
         Results of the fit, updated in place.
     """
-    entered[Q] = False
-    status[Q] = 1
-    lo[Q] = 0.0
-    hi[Q] = np.sqrt(upper_limit(avar, edf, UPPER_BOUND_Z) / column)
+    terms.entered[Q], terms.status[Q] = False, 1
+    terms.lo[Q], terms.hi[Q] = 0.0, np.sqrt(upper_limit(avar, edf, UPPER_BOUND_Z) / column)

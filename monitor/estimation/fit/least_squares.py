@@ -1,36 +1,42 @@
 """Small weighted least-squares problems in compiled loops: five columns, non-negative, correlated observations.
 
-The caller provides all arrays. ``columns`` and ``weighted`` = V⁻¹ columns hold all τ, and ``rows`` lists the τ in use.
-The code uses loops because they compile several times faster than array expressions.
+``fit_arrays.LeastSquares`` holds a problem of all τ, and ``rows`` lists the τ in use. The code uses loops because they
+compile several times faster than array expressions.
 """
 
 from typing import Final
 
 import numpy as np
 
+from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES
+from monitor.estimation.fit.fit_arrays import LeastSquares
 
-SINGULAR: Final = 1e-9
-"""Pivots of the correlation matrix below this value are rounding errors."""
+SINGULAR_COVARIANCE: Final = 1e-9
+"""Pivots of the correlation matrix of the observations below this value are rounding errors."""
+SINGULAR_NORMAL: Final = 1e-12
+"""Pivots of the correlation matrix of the coefficients below this value are rounding errors."""
 
 Q, N, B, K, R = range(5)
 """Rows of the coefficients in θ."""
 
 
 @compiled
-def variance_form(theta, c):  # type: ignore[no-untyped-def]
-    """Return Σ_ab θ_a θ_b C^ab for one entry of the table. A negative Q² stands for a band limit and adds nothing.
+def variance_form(theta: Floats, c: Floats) -> float:
+    """Return the covariance of two Allan variances, Σ_ab θ_a θ_b C^ab.
+
+    A negative Q² stands for a band limit and adds nothing.
 
     Parameters
     ----------
     theta : ndarray of float64, shape (5,)
         Squared coefficients in units of one sample.
     c : ndarray of float64, shape (10,)
-        Entry of ``Table.covariance``.
+        Entry C of ``CovarianceTable.covariance``.
     """
     q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
-    return (
+    return float(
         q * (q * c[0] + 2.0 * (n * c[1] + b * c[2] + k * c[3]))
         + n * (n * c[4] + 2.0 * (b * c[5] + k * c[6]))
         + b * (b * c[7] + 2.0 * k * c[8])
@@ -39,125 +45,83 @@ def variance_form(theta, c):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def variances(rows, theta, covariance, stretch, variance):  # type: ignore[no-untyped-def]
-    """Compute the variances of σ²_i under the model.
+def compute_variances(problem: LeastSquares, rows: Ints, theta: Floats) -> None:
+    """Compute the variances of the observations under a model.
 
     Parameters
     ----------
+    problem : LeastSquares
+        Problem. Its ``variance`` is overwritten.
     rows : ndarray of int64
         Rows in use.
     theta : ndarray of float64, shape (5,)
         Squared coefficients of the model.
-    covariance : ndarray of float64, shape (m, m, 10)
-        See ``Table.covariance``.
-    stretch : ndarray of float64, shape (m,)
-        Square root of the terms in a window without gaps over the terms present.
-    variance : ndarray of float64, shape (m,)
-        Result.
     """
     for i in rows:
-        variance[i] = variance_form(theta, covariance[i, i]) * stretch[i] * stretch[i]
+        stretch = problem.stretch[i]
+        problem.variance[i] = variance_form(theta, problem.covariance[i, i]) * stretch * stretch
 
 
 @compiled
-def whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted):  # type: ignore[no-untyped-def]
-    """Compute V⁻¹ columns by Cholesky decomposition of the correlations.
+def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full: bool) -> None:
+    """Compute V⁻¹ X with the covariance V of the observations under a model, or with its diagonal.
 
     Parameters
     ----------
-    rows, theta, covariance, stretch, columns, blind, variance
-        See ``weight_columns``.
-    weighted : ndarray of float64, shape (m, 5)
-        Result.
-
-    Returns
-    -------
-    bool
-        False if the correlation matrix is not positive definite.
-    """
-    m = rows.size
-    factor = np.empty((m, m))
-    for k in range(m):
-        for j in range(k + 1):
-            i, h = rows[k], rows[j]
-            x = variance_form(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
-            x /= np.sqrt(variance[i] * variance[h])
-            for c in range(j):
-                x -= factor[k, c] * factor[j, c]
-            if j < k:
-                factor[k, j] = x / factor[j, j]
-            elif x < SINGULAR:
-                return False
-            else:
-                factor[k, k] = np.sqrt(x)
-    for a in range(5):
-        for k in range(m):
-            x = columns[rows[k], a] / np.sqrt(variance[rows[k]])
-            for c in range(k):
-                x -= factor[k, c] * weighted[rows[c], a]
-            weighted[rows[k], a] = x / factor[k, k]
-        for k in range(m - 1, -1, -1):
-            x = weighted[rows[k], a]
-            for c in range(k + 1, m):
-                x -= factor[c, k] * weighted[rows[c], a]
-            weighted[rows[k], a] = x / factor[k, k]
-        for k in range(m):
-            weighted[rows[k], a] /= np.sqrt(variance[rows[k]])
-    return True
-
-
-@compiled
-def weight_columns(rows, theta, covariance, stretch, columns, blind, full, variance, weighted):  # type: ignore[no-untyped-def]
-    """Compute ``weighted`` = V⁻¹ columns with the covariance V of the τ under the model, or with its diagonal.
-
-    Parameters
-    ----------
+    problem : LeastSquares
+        Problem. Its ``variance`` and ``weighted`` are overwritten.
     rows : ndarray of int64
         Rows in use.
     theta : ndarray of float64, shape (5,)
         Squared coefficients of the model.
-    covariance : ndarray of float64, shape (m, m, 10)
-        See ``Table.covariance``.
-    stretch : ndarray of float64, shape (m,)
-        Square root of the terms in a window without gaps over the terms present.
-    columns : ndarray of float64, shape (m, 5)
-        Columns of the fit.
-    blind : ndarray of float64, shape (m,)
-        Direction that the fit ignores. ``blind`` blindᵀ is added to V.
     full : bool
         True to use the covariances, False to use the variances alone.
-    variance : ndarray of float64, shape (m,)
-        Variances under the model, overwritten.
-    weighted : ndarray of float64, shape (m, 5)
-        Result.
     """
-    variances(rows, theta, covariance, stretch, variance)
-    if full and whiten(rows, theta, covariance, stretch, columns, blind, variance, weighted):
+    compute_variances(problem, rows, theta)
+    if full and _whiten(problem, rows, theta):
         return
+    weighted, columns, variance = problem.weighted, problem.columns, problem.variance
     for i in rows:
         for a in range(5):
             weighted[i, a] = columns[i, a] / variance[i]
 
 
 @compiled
-def normal_equations(level, rows, columns, weighted, normal, right):  # type: ignore[no-untyped-def]
-    """Compute Xᵀ V⁻¹ X and Xᵀ V⁻¹ y. A column of zeros is a term that is not fitted; its solution is zero.
+def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
+    """Compute V⁻¹ X by Cholesky decomposition; return False if the correlations are not positive definite."""
+    # local names, because each access to a field in a loop counts a reference
+    m, variance, stretch, blind = rows.size, problem.variance, problem.stretch, problem.blind
+    covariance, columns, weighted = problem.covariance, problem.columns, problem.weighted
+    factor, column = np.empty((m, m)), np.empty(m)
+    for k in range(m):
+        for j in range(k + 1):
+            i, h = rows[k], rows[j]
+            x = variance_form(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
+            factor[k, j] = x / np.sqrt(variance[i] * variance[h])
+    if not _factorize(factor, m, SINGULAR_COVARIANCE):
+        return False
+    for a in range(5):
+        for k in range(m):
+            column[k] = columns[rows[k], a] / np.sqrt(variance[rows[k]])
+        _substitute(factor, m, column)
+        for k in range(m):
+            weighted[rows[k], a] = column[k] / np.sqrt(variance[rows[k]])
+    return True
+
+
+@compiled
+def compute_normal_equations(problem: LeastSquares, rows: Ints) -> None:
+    """Compute Xᵀ V⁻¹ X and Xᵀ V⁻¹ y. A column of zeros is a term that is not fitted, and its solution is zero.
 
     Parameters
     ----------
-    level : ndarray of float64, shape (m,)
-        Observations y.
+    problem : LeastSquares
+        Problem with its weights. Its ``normal`` and ``right`` are overwritten.
     rows : ndarray of int64
         Rows in use.
-    columns : ndarray of float64, shape (m, 5)
-        Columns X of the fit.
-    weighted : ndarray of float64, shape (m, 5)
-        V⁻¹ X.
-    normal : ndarray of float64, shape (5, 5)
-        Result Xᵀ V⁻¹ X.
-    right : ndarray of float64, shape (5,)
-        Result Xᵀ V⁻¹ y.
     """
+    normal, right, weighted = problem.normal, problem.right, problem.weighted
+    level, columns = problem.level, problem.columns
     for a in range(5):
         right[a] = 0.0
         for b in range(a + 1):
@@ -175,10 +139,10 @@ def normal_equations(level, rows, columns, weighted, normal, right):  # type: ig
 
 
 @compiled
-def solve_nonnegative(normal, right, free, theta):  # type: ignore[no-untyped-def]
+def solve_nonnegative(normal: Floats, right: Floats, free: bool, theta: Floats) -> None:
     """Solve least squares with non-negative Q N B K by finding the subset that meets the Kuhn–Tucker conditions.
 
-    Terms in the subset are positive, and the error would not decrease if one of the others grew.
+    The terms in the subset are positive, and the error would not decrease if another term grew.
 
     Parameters
     ----------
@@ -211,7 +175,7 @@ def solve_nonnegative(normal, right, free, theta):  # type: ignore[no-untyped-de
 
 
 @compiled
-def solve(normal, right, subset, solution):  # type: ignore[no-untyped-def]
+def solve(normal: Floats, right: Floats, subset: int, solution: Floats) -> bool:
     """Solve the normal equations on a subset of the columns by Cholesky decomposition, each column scaled to one.
 
     Parameters
@@ -230,43 +194,60 @@ def solve(normal, right, subset, solution):  # type: ignore[no-untyped-def]
     bool
         False if the columns cannot be distinguished.
     """
-    factor = np.zeros((5, 5))
+    terms, factor, scaled, n = np.empty(5, np.int64), np.empty((5, 5)), np.empty(5), 0
     for a in range(5):
         solution[a] = 0.0
-    for a in range(5):
-        if not subset >> a & 1:
-            continue
-        y = right[a] / np.sqrt(normal[a, a])
-        for b in range(a + 1):
-            if not subset >> b & 1:
-                continue
-            x = normal[a, b] / np.sqrt(normal[a, a] * normal[b, b])
-            for c in range(b):
-                x -= factor[a, c] * factor[b, c]
-            if b < a:
-                factor[a, b] = x / factor[b, b]
-            elif x < 1e-12:
-                return False
-            else:
-                factor[a, a] = np.sqrt(x)
-        for c in range(a):
-            y -= factor[a, c] * solution[c]
-        solution[a] = y / factor[a, a]
-    for a in range(4, -1, -1):
-        if not subset >> a & 1:
-            continue
-        x = solution[a]
-        for c in range(a + 1, 5):
-            x -= factor[c, a] * solution[c]
-        solution[a] = x / factor[a, a]
-    for a in range(5):
         if subset >> a & 1:
-            solution[a] /= np.sqrt(normal[a, a])
+            terms[n] = a
+            n += 1
+    for k in range(n):
+        a = terms[k]
+        scaled[k] = right[a] / np.sqrt(normal[a, a])
+        for j in range(k + 1):
+            b = terms[j]
+            factor[k, j] = normal[a, b] / np.sqrt(normal[a, a] * normal[b, b])
+    if not _factorize(factor, n, SINGULAR_NORMAL):
+        return False
+    _substitute(factor, n, scaled)
+    for k in range(n):
+        solution[terms[k]] = scaled[k] / np.sqrt(normal[terms[k], terms[k]])
     return True
 
 
 @compiled
-def nonzero_terms(theta):  # type: ignore[no-untyped-def]
+def _factorize(matrix: Floats, n: int, singular: float) -> bool:
+    """Replace the lower triangle of a correlation matrix [n, n] by its Cholesky factor; return False if singular."""
+    for k in range(n):
+        for j in range(k + 1):
+            x = matrix[k, j]
+            for c in range(j):
+                x -= matrix[k, c] * matrix[j, c]
+            if j < k:
+                matrix[k, j] = x / matrix[j, j]
+            elif x < singular:
+                return False
+            else:
+                matrix[k, k] = np.sqrt(x)
+    return True
+
+
+@compiled
+def _substitute(factor: Floats, n: int, x: Floats) -> None:
+    """Replace the right-hand side x [n] by the solution, with the Cholesky factor of the matrix."""
+    for k in range(n):
+        y = x[k]
+        for c in range(k):
+            y -= factor[k, c] * x[c]
+        x[k] = y / factor[k, k]
+    for k in range(n - 1, -1, -1):
+        y = x[k]
+        for c in range(k + 1, n):
+            y -= factor[c, k] * x[c]
+        x[k] = y / factor[k, k]
+
+
+@compiled
+def nonzero_terms(theta: Floats) -> int:
     """Return the bit set of the terms that are not zero."""
     subset = 0
     for a in range(NOISES):
@@ -276,8 +257,8 @@ def nonzero_terms(theta):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def invert(normal, subset, inverse):  # type: ignore[no-untyped-def]
-    """Compute the inverse [NOISES, NOISES] on the terms of a subset, zero elsewhere.
+def invert(normal: Floats, subset: int, inverse: Floats) -> bool:
+    """Compute the inverse of the normal matrix on the terms of a subset.
 
     Parameters
     ----------
@@ -286,7 +267,7 @@ def invert(normal, subset, inverse):  # type: ignore[no-untyped-def]
     subset : int
         Bit set of the terms.
     inverse : ndarray of float64, shape (4, 4)
-        Result.
+        Result, zero outside the subset.
 
     Returns
     -------

@@ -219,7 +219,7 @@ def each_sample(length: int, taus: int, rounds: int) -> tuple[str, ...]:
         fitting.update(samples)
     parts = [make_block(np.arange(100), noise(100)) for _ in range(n // 100)]
     model, table_ = design(sizes, 1.0), covariances(length, sizes)
-    avar, terms, slope = window.avar(), window.terms(), window.slope()
+    avar, terms, slope = window.avar(), window.terms(), window.slopes()[0]
     took = alternate(
         {
             "kernel": for_each(window.update, [one.values for one in parts]),

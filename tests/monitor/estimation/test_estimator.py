@@ -6,7 +6,7 @@ import pytest
 from drivers.errors import ConfigError, NotReady
 from drivers.sample import AXES, make_block
 from monitor.estimation.allan.batch import overlapping_avar
-from monitor.estimation.estimator import COURSE_SAMPLES, MIN_SAMPLES, Estimator
+from monitor.estimation.estimator import MAX_HISTORY_SAMPLES, MIN_SAMPLES, Estimator
 from monitor.estimation.fit.coefficients import Status
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
@@ -226,7 +226,7 @@ def test_the_course_is_bounded_until_someone_looks():
     for at in range(0, 70_000, 700):
         estimator.update(made(at, 700))
     t_ns = estimator.get().history.t_ns
-    assert COURSE_SAMPLES <= t_ns.size < COURSE_SAMPLES + 700
+    assert MAX_HISTORY_SAMPLES <= t_ns.size < MAX_HISTORY_SAMPLES + 700
     assert t_ns[-1] == 69_999 * 10_000_000
     assert (np.diff(t_ns) == 10_000_000).all()
 

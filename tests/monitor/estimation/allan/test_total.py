@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from monitor.estimation.allan import difference_moments as moments_module
 from monitor.estimation.allan.batch import overlapping_avar
-from monitor.estimation.allan.total import MIN_SHARE, moments, octaves, total_curve, total_variance
+from monitor.estimation.allan.difference_moments import octaves
+from monitor.estimation.allan.total import MIN_SHARE, moments, total_curve, total_variance
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from tests.support.allan_references import nist_1000
 

@@ -264,7 +264,7 @@ def test_slope_and_length_are_those_of_the_whole_window():
     for window in (plain, spanned):
         window.update(values)
     assert spanned.n == 300
-    assert np.array_equal(plain.slope(), spanned.slope())
+    assert np.array_equal(plain.slopes()[0], spanned.slopes()[0])
 
 
 def test_a_transient_leaves_each_row_after_its_own_span():
@@ -505,8 +505,8 @@ class Calls(RuleBasedStateMachine):
         assert self.window.n == len(self.held)
         check(self.window, self.held)
         if len(self.held) >= 3:
-            np.testing.assert_allclose(self.window.slope(), slope_of_recording(self.held), rtol=1e-6, atol=1e-12)
-            seen, true = self.window.slopes(), slope_per_tau(self.held, self.window.factors)
+            np.testing.assert_allclose(self.window.slopes()[0], slope_of_recording(self.held), rtol=1e-6, atol=1e-12)
+            seen, true = self.window.slopes()[1], slope_per_tau(self.held, self.window.factors)
             assert np.array_equal(np.isnan(seen), np.isnan(true))
             whole = np.isfinite(self.held).all(axis=0)  # with a gap, each puts another mean in its place
             np.testing.assert_allclose(seen[:, whole], true[:, whole], rtol=1e-5, atol=1e-12)
@@ -543,12 +543,12 @@ def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
     window.discard(4, 60)
     lengths = np.full(6, LENGTH)
     lengths[4] = 60
-    assert np.isnan(window.slope()[4])
-    assert window.slope(lengths)[4] == pytest.approx(slope_of_recording(values[-60:])[4], rel=1e-6)
-    assert window.slope(lengths)[[0, 5]] == pytest.approx(slope_of_recording(values)[[0, 5]], rel=1e-6)
+    assert np.isnan(window.slopes()[0][4])
+    assert window.slopes(lengths)[0][4] == pytest.approx(slope_of_recording(values[-60:])[4], rel=1e-6)
+    assert window.slopes(lengths)[0][[0, 5]] == pytest.approx(slope_of_recording(values)[[0, 5]], rel=1e-6)
     expected = slope_per_tau(values[-60:], FACTORS)[:, 4]
     there = np.isfinite(expected)
-    assert window.slopes(lengths)[there, 4] == pytest.approx(expected[there], rel=1e-6)
+    assert window.slopes(lengths)[1][there, 4] == pytest.approx(expected[there], rel=1e-6)
 
 
 # --- for ever
@@ -569,14 +569,14 @@ def test_a_small_gap_leaves_the_slope(gap):
     whole.update(values)
     values[at : at + missing] = np.nan
     window.update(values)
-    np.testing.assert_allclose(window.slope(), slope_of_recording(values), rtol=1e-9)
-    np.testing.assert_allclose(window.slope(), whole.slope(), rtol=0.01)
+    np.testing.assert_allclose(window.slopes()[0], slope_of_recording(values), rtol=1e-9)
+    np.testing.assert_allclose(window.slopes()[0], whole.slopes()[0], rtol=0.01)
     # a missing sample stands for the level, here up to the whole ramp away
-    np.testing.assert_allclose(window.slopes()[3:], whole.slopes()[3:], rtol=0.05)
-    np.testing.assert_allclose(slope_per_tau(values, factors)[3:], whole.slopes()[3:], rtol=0.05)
+    np.testing.assert_allclose(window.slopes()[1][3:], whole.slopes()[1][3:], rtol=0.05)
+    np.testing.assert_allclose(slope_per_tau(values, factors)[3:], whole.slopes()[1][3:], rtol=0.05)
     values[:100] = np.nan
     window.update(values)
-    assert np.isnan(window.slope()).all()
+    assert np.isnan(window.slopes()[0]).all()
     assert np.isnan(slope_of_recording(values)).all()
-    assert np.isnan(window.slopes()).all()
+    assert np.isnan(window.slopes()[1]).all()
     assert np.isnan(slope_per_tau(values, factors)).all()

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from drivers.sample import Event
-from monitor.estimation.detection.model_agreement import KIND, RENEWED, ModelAgreement
+from monitor.estimation.detection.model_agreement import KIND, RENEWED_SHARE, ModelAgreement
 from monitor.estimation.detection.model_gap import MIN_SAMPLES, AxisGap, ModelGap
 
 STEP = 100  # samples from look to look
 WINDOW = 40_000
-HOLD = int(RENEWED * WINDOW)
+HOLD = int(RENEWED_SHARE * WINDOW)
 ONE = np.ones(4)
 
 

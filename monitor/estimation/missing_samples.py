@@ -1,18 +1,18 @@
-"""Distinction of missing and late samples in a recording from its time stamps.
+"""Distinction of missing samples from late samples in a recording, by the time stamps.
 
-A missing sample shifts all later time stamps permanently; a late sample does not. The live clock takes a step of two
-periods for a gap, because it must place the next sample at once. In a recording, the time stamps after the gap are
-known as well.
+A missing sample shifts all later time stamps permanently, and a late sample does not. The live clock treats a time step
+of two periods as a gap, because it must place the next sample at once. In a recording, the time stamps after the gap
+are known as well.
 
-For each gap, the time stamps are compared with those of a constant rate, on both sides of the gap. The median of some
-tens of rows is used, which tolerates a few late rows. A late sender may need as many rows to catch up as seemed to be
-missing, so the range after the gap is longer by this number. Where gaps follow each other closely, the median of one
-may belong to a late sender. The lowest median within reach then counts, since no sample comes early. The shift of the
-time stamps is rounded to a whole number between zero and the number claimed by the clock. This is the number of missing
-samples.
+For each gap, the time stamps on both sides are compared with those of a constant rate. The median of some tens of rows
+tolerates a few late rows. A late sender may need as many rows to catch up as seemed to be missing, so the range after
+the gap is extended by this number. If gaps follow each other closely, the median after a gap may belong to a late
+sender. The lowest median in the range is then used, because no sample is early. The shift of the time stamps, rounded
+to a whole number between zero and the number claimed by the clock, is the number of missing samples.
 
-The rate is the median over stretches without a gap, so neither missing nor late samples bias it. A rate that wanders by
-half a percent shifts the time stamps by a quarter of a period within reach, which is not counted as a missing sample.
+The rate is the median over stretches without a gap, so neither missing nor late samples bias it. A rate that varies by
+half a percent shifts the time stamps by a quarter of a period within the range, which does not count as a missing
+sample.
 """
 
 from typing import Final
@@ -22,23 +22,28 @@ import numpy as np
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 
-AROUND: Final = 60
-"""Rows on each side of a gap. Most of them must be on time; bus adapters were seen to send twenty rows late at once."""
-FEWEST: Final = 2.0 / 3.0
-"""Minimum shift in periods that counts as missing samples. Wandering time stamps shift by half a period without loss.
+ROWS_BESIDE_GAP: Final = 60
+"""Number of rows on each side of a gap. Most of these rows must be on time.
+
+Some bus adapters send twenty rows late at once.
 """
-CATCH_UP: Final = 10_000
+MIN_SHIFT_PERIODS: Final = 2.0 / 3.0
+"""Minimum shift in periods that counts as missing samples. Time stamps may shift by half a period without any loss.
+"""
+MAX_CATCH_UP_ROWS: Final = 10_000
 """Maximum number of rows that a late sender may need to catch up."""
-WANDERS: Final = 0.01
-"""Maximum relative wander of the rate within reach. A smaller fall of the median is not a sender that catches up."""
+MAX_RATE_VARIATION: Final = 0.01
+"""Maximum relative variation of the rate after a gap. A smaller decrease of the median is no sign of a late sender."""
 STRETCH_ROWS: Final = (256, 128, 64, 32, 16, 8, 4, 2)
-"""Candidate distances in rows between two time stamps for the rate. The longest one with enough stretches is used."""
+"""Distances in rows between two time stamps for the rate. The longest distance with enough stretches is used."""
 MIN_STRETCH_RATIO: Final = 4
 """A distance is usable if at least one in this many rows begins a stretch without a gap."""
 
 
 def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -> Ints:
-    """Return the number of samples that are missing before each gap. The other samples claimed by the clock were late.
+    """Return the number of samples that are missing before each gap.
+
+    The other samples that the clock reported as missing were late.
 
     Parameters
     ----------
@@ -68,7 +73,7 @@ def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -
     # relative to the first time stamp, because absolute Unix time leaves no digits for fractions of a period
     late = (t_ns - t_ns[0]) / period_ns - np.arange(t_ns.size)
     ends = np.unique(np.concatenate([[0], rows, breaks, [t_ns.size]]))
-    return _decided(late, rows, claimed, ends, np.searchsorted(ends, rows))
+    return _count_missing(late, rows, claimed, ends, np.searchsorted(ends, rows))
 
 
 def _period_ns(t_ns: Ints, edges: Ints) -> float:
@@ -86,7 +91,7 @@ def _period_ns(t_ns: Ints, edges: Ints) -> float:
 
 
 @compiled
-def _decided(late: Floats, rows: Ints, claimed: Ints, ends: Ints, at: Ints) -> Ints:
+def _count_missing(late: Floats, rows: Ints, claimed: Ints, ends: Ints, at: Ints) -> Ints:
     """Count the missing samples before each gap from the delay ``late`` [n] of the rows in periods.
 
     Gap k begins at row ``ends[at[k]]``.
@@ -95,21 +100,24 @@ def _decided(late: Floats, rows: Ints, claimed: Ints, ends: Ints, at: Ints) -> I
     reach = np.empty(holes, np.int64)
     after = np.empty(holes)
     for k in range(holes):
-        reach[k] = rows[k] + AROUND + min(2 * claimed[k], CATCH_UP)
+        reach[k] = rows[k] + ROWS_BESIDE_GAP + min(2 * claimed[k], MAX_CATCH_UP_ROWS)
         end = ends[at[k] + 1]
-        near, far = np.median(late[rows[k] : min(rows[k] + AROUND, end)]), np.median(late[rows[k] : min(reach[k], end)])
-        after[k] = far if near - far > WANDERS * (reach[k] - rows[k]) else near
+        near, far = (
+            np.median(late[rows[k] : min(rows[k] + ROWS_BESIDE_GAP, end)]),
+            np.median(late[rows[k] : min(reach[k], end)]),
+        )
+        after[k] = far if near - far > MAX_RATE_VARIATION * (reach[k] - rows[k]) else near
     missing = np.zeros(holes, np.int64)
     level = 0.0
     for k in range(holes):
         if k == 0 or rows[k] >= reach[k - 1] or ends[at[k] - 1] != rows[k - 1]:
-            level = np.median(late[max(rows[k] - AROUND, ends[at[k] - 1]) : rows[k]])
+            level = np.median(late[max(rows[k] - ROWS_BESIDE_GAP, ends[at[k] - 1]) : rows[k]])
         on_time = after[k]
         j = k + 1
         while j < holes and rows[j] < reach[k] and ends[at[j] - 1] == rows[j - 1]:
             on_time = min(on_time, after[j])
             j += 1
-        if on_time - level > FEWEST:
+        if on_time - level > MIN_SHIFT_PERIODS:
             missing[k] = min(claimed[k], np.int64(np.rint(on_time - level)))
         level = on_time
     return missing
