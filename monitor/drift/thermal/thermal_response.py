@@ -37,8 +37,8 @@ class ThermalModelForm:
     def name(self) -> str:
         """Return the name of the form for display.
 
-        >>> ThermalModelForm(0, ()).name, ThermalModelForm(3, ()).name, ThermalModelForm(0, (3600.0,)).name, ThermalModelForm(1, (60.0, 600.0)).name
-        ('constant', 'polynomial 3', 'difference 1, 0', 'difference 2, 2')
+        >>> ThermalModelForm(0, ()).name, ThermalModelForm(3, ()).name, ThermalModelForm(1, (60.0, 600.0)).name
+        ('constant', 'polynomial 3', 'difference 2, 2')
         """
         if self.memory:
             return f"difference {self.memory}, {self.memory - 1 + min(self.powers, 1)}"
@@ -118,7 +118,7 @@ def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
 
 
 @compiled
-def first_order_lag(x, p):  # type: ignore[no-untyped-def]
+def first_order_lag(x: Floats, p: float) -> Floats:
     """Return a first-order lag of x, L_n = p L_{n−1} + (1 − p) x_n, settled at the first value.
 
     Parameters
