@@ -15,7 +15,7 @@ The coefficients are written as functions of partial autocorrelations, which kee
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from math import atanh, exp, log, pi, sqrt, tanh
+from math import atanh, exp, log, pi, tanh
 from typing import Final
 
 import numpy as np
@@ -81,11 +81,6 @@ class ArmaModel:
         return 1.0, self.phi[0] + self.theta
 
     @property
-    def stationary_std(self) -> float:
-        """Return the stationary standard deviation of x in rad/s; infinite for a random walk."""
-        return sqrt(self.variance * stationary_covariance(*self.phi, self.theta)[0])
-
-    @property
     def name(self) -> str:
         """Return the name of the model for display."""
         return f"ARMA({self.order[0]}, {self.order[1]})" if self.order != (0, 0) else "constant"
@@ -127,7 +122,9 @@ def fit_arma(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS, in
 
 
 @compiled
-def _propagate_covariance(p11, p12, p22, phi1, phi2, g1, variance):  # type: ignore[no-untyped-def]
+def _propagate_covariance(
+    p11: float, p12: float, p22: float, phi1: float, phi2: float, g1: float, variance: float
+) -> _Triple:
     """Return A P Aᵀ + variance B Bᵀ as its elements p11, p12, p22."""
     return (
         p22 + variance,
@@ -137,7 +134,7 @@ def _propagate_covariance(p11, p12, p22, phi1, phi2, g1, variance):  # type: ign
 
 
 @compiled
-def stationary_covariance(phi1, phi2, theta):  # type: ignore[no-untyped-def]
+def stationary_covariance(phi1: float, phi2: float, theta: float) -> _Triple:
     """Return the stationary covariance of the state for a of variance 1, as its elements p11, p12, p22.
 
     Parameters
@@ -154,7 +151,9 @@ def stationary_covariance(phi1, phi2, theta):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def run_kalman_filter(z, phi1, phi2, theta, variance, white):  # type: ignore[no-untyped-def]
+def run_kalman_filter(
+    z: Floats, phi1: float, phi2: float, theta: float, variance: float, white: float
+) -> tuple[int, float, float, float]:
     """Run the exact Kalman filter and return the sums of the likelihood.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Quality of a compensated rate, at rest or beside a known true rate: one measure for all methods.
+"""Quality of a compensated rate at rest, by one measure for all methods.
 
 The evaluated samples must not have been used for learning. A filter that uses only past samples fulfils this condition.
 A method that learns from a whole recording is evaluated on another part of it. The rate before compensation is
@@ -30,15 +30,6 @@ class RestScore:
     allan: Floats  # [k] overlapping Allan deviation
 
 
-@dataclass(frozen=True, slots=True)
-class MotionScore:
-    """Quality of one axis beside its known true rate."""
-
-    rms_error: float  # rms, rad/s
-    delay_s: float  # delay of the rate
-    angle_error_rad: float  # rms of the integrated error, rad
-
-
 def score_at_rest(rate: Floats, rate_hz: float) -> RestScore:
     """Return the quality of a rate whose true value is zero.
 
@@ -58,35 +49,6 @@ def score_at_rest(rate: Floats, rate_hz: float) -> RestScore:
         drift=tuple(_rms(_span_means(rate, round(span * rate_hz))) for span in SPANS_S),
         tau_s=sizes / rate_hz,
         allan=np.sqrt(allan),
-    )
-
-
-def score_in_motion(rate: Floats, truth: Floats, rate_hz: float) -> MotionScore:
-    """Return the quality of a rate beside the true rate.
-
-    Parameters
-    ----------
-    rate : ndarray, shape (n,)
-        Rate in rad/s; NaN = missing.
-    truth : ndarray, shape (n,)
-        True rate in rad/s.
-    rate_hz : float
-        Sample rate in Hz.
-
-    Examples
-    --------
-    >>> t = np.arange(1000) / 100.0
-    >>> one = score_in_motion(np.sin(t - 0.02), np.sin(t), 100.0)
-    >>> round(one.delay_s, 4)
-    0.02
-    """
-    difference = np.where(np.isfinite(rate), rate - truth, 0.0)
-    slope = np.gradient(truth) * rate_hz
-    moved = float(slope @ slope)
-    return MotionScore(
-        rms_error=_rms(rate - truth),
-        delay_s=-float(difference @ slope) / moved if moved > 0.0 else np.nan,
-        angle_error_rad=_rms(np.cumsum(difference) / rate_hz),
     )
 
 

@@ -76,7 +76,7 @@ class CompensatorState(NamedTuple):
     rest: motion_kernel.MotionState
     current: Ints  # [1] number of the current interval; -1 = none yet
     learned: Ints  # [3] intervals at rest from which the filters learned their noise
-    row: Floats  # [3, ROW_SIZE] one row of ``sage_husa`` for each axis
+    drift: np.ndarray  # [3] of sage_husa.DRIFT_FILTER
     bias: Floats  # [3] rad/s, bias that is subtracted now; NaN = not known yet
     bank: Floats  # [3, filters + 1, 5] columns as in ``motion_filter_bank``
     ages: Ints  # [3, filters, 2] columns as in ``motion_filter_bank``
@@ -162,7 +162,7 @@ class Compensator:
     @property
     def error(self) -> Floats:
         """Return the standard error [3] of the bias in rad/s; NaN means that the bias is not known yet."""
-        known = [sage_husa.expected_bias(row)[1] ** 0.5 for row in self._state.row]
+        known = [sage_husa.expected_bias(drift)[1] ** 0.5 for drift in self._state.drift]
         return np.where(np.isnan(self._state.bias), np.nan, known)
 
     def compensate(self, values: Floats, lost: int = 0) -> Floats:
@@ -253,12 +253,12 @@ class Compensator:
         if model is None:
             return
         self.models[axis] = model
-        row = self._state.row[axis]
-        count = row[sage_husa.REST_COUNT]
-        sage_husa.set_model(row, model)
-        sage_husa.refilter_history(row, *self._history(axis), _min_variance(self._state.rest.open, axis))
-        row[sage_husa.REST_COUNT] = count  # The repeated intervals are not counted a second time.
-        _update_bias(axis, self._state.row, self._state.bias, self._state.bank)
+        drift = self._state.drift[axis]
+        count = drift["rest_count"]
+        sage_husa.set_model(drift, model)
+        sage_husa.refilter_history(drift, *self._history(axis), _min_variance(self._state.rest.open, axis))
+        drift["rest_count"] = count  # The repeated intervals are not counted a second time.
+        _update_bias(axis, self._state.drift, self._state.bias, self._state.bank)
 
     def identify(self) -> None:
         """Identify the models of all axes that are due."""
@@ -304,11 +304,13 @@ def _initial_state(rate_hz: float, adapts: bool) -> CompensatorState:
     each = filter_memories(rate_hz)
     table, first = gain_table(each)
     filters = each.size
+    drift = np.zeros(GYROS, sage_husa.DRIFT_FILTER)
+    drift["adaptive"] = adapts
     return CompensatorState(
         rest=motion_kernel.make_state(),
         current=np.full(1, -1, np.int64),
         learned=np.zeros(GYROS, np.int64),
-        row=np.stack([sage_husa.initial_row(adapts)] * GYROS),
+        drift=drift,
         bias=np.full(GYROS, np.nan),
         bank=np.zeros((GYROS, filters + 1, 5)),
         ages=np.zeros((GYROS, filters, 2), np.int64),
@@ -326,7 +328,7 @@ def _initial_state(rate_hz: float, adapts: bool) -> CompensatorState:
 
 
 @compiled
-def _advance(values, index, size, s, out, outcomes):  # type: ignore[no-untyped-def]
+def _advance(values: Floats, index: int, size: int, s: CompensatorState, out: Floats, outcomes: Floats) -> int:
     """Process consecutive rows, write the results of finished intervals, and return their number."""
     keep = 0.5 / (2 << (s.ages.shape[1] - 1))
     filled, i, n = 0, 0, values.shape[0]
@@ -350,7 +352,7 @@ def _advance(values, index, size, s, out, outcomes):  # type: ignore[no-untyped-
 
 
 @compiled
-def _begin_block(number, waiting, sums):  # type: ignore[no-untyped-def]
+def _begin_block(number: int, waiting: Floats, sums: Floats) -> None:
     """Assign a slot to a new block and clear its sums."""
     for a in range(len(AXES)):
         waiting[a, BLOCK_NUMBER] = number
@@ -362,7 +364,7 @@ def _begin_block(number, waiting, sums):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _subtract_drift(z, axis, sums, s, keep, out):  # type: ignore[no-untyped-def]
+def _subtract_drift(z: Floats, axis: int, sums: Floats, s: CompensatorState, keep: float, out: Floats) -> None:
     """Remove the drift from samples of one gyro axis; NaN = missing."""
     bank, ages, feedback = s.bank[axis], s.ages[axis], s.feedback[axis]
     bias = s.bias[axis] if s.bias[axis] == s.bias[axis] else 0.0
@@ -379,7 +381,7 @@ def _subtract_drift(z, axis, sums, s, keep, out):  # type: ignore[no-untyped-def
 
 
 @compiled
-def _accumulate(values, sums):  # type: ignore[no-untyped-def]
+def _accumulate(values: Floats, sums: Floats) -> None:
     """Add values to the sums of a block; NaN values are skipped."""
     for k in range(values.size):
         if values[k] != values[k]:
@@ -393,10 +395,10 @@ def _accumulate(values, sums):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _apply_rest_decision(number, moves, s, outcomes):  # type: ignore[no-untyped-def]
+def _apply_rest_decision(number: int, moves: bool, s: CompensatorState, outcomes: Floats) -> bool:
     """Apply the final rest decision on a block, and return True if this ended the previous interval."""
     interval = number // BLOCKS_PER_INTERVAL
-    over = s.current[0] >= 0 and interval > s.current[0]
+    over = bool(s.current[0] >= 0 and interval > s.current[0])
     if over:
         _finish_interval(s, outcomes)
         for _ in range(min(interval - s.current[0] - 1, MAX_GAP_INTERVALS)):
@@ -418,7 +420,7 @@ def _apply_rest_decision(number, moves, s, outcomes):  # type: ignore[no-untyped
 
 
 @compiled
-def _exceeds_rest_limits(waiting):  # type: ignore[no-untyped-def]
+def _exceeds_rest_limits(waiting: Floats) -> bool:
     """Return True if a block exceeds the limits of rest, whatever the motion detector has learned."""
     for a in range(len(AXES)):
         n = waiting[a, COUNT]
@@ -433,7 +435,7 @@ def _exceeds_rest_limits(waiting):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _finish_interval(s, outcomes):  # type: ignore[no-untyped-def]
+def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
     """End the interval: update drift and filters with it, and predict the drift of the next interval."""
     outcomes[0] = s.current[0]
     for a in range(GYROS):
@@ -443,10 +445,10 @@ def _finish_interval(s, outcomes):  # type: ignore[no-untyped-def]
             outcome[column] = np.nan
         outcome[EXPECTED], outcome[OUTCOME] = s.bias[a], sage_husa.NOT_AT_REST
         if known:
-            outcome[EXPECTED_ERROR] = np.sqrt(sage_husa.expected_bias(s.row[a])[1])
+            outcome[EXPECTED_ERROR] = np.sqrt(sage_husa.expected_bias(s.drift[a])[1])
         count, mean, scatter = _interval_mean(s.means[a])
         if count >= MIN_REST_BLOCKS:
-            variance, became = sage_husa.update_with_interval(s.row[a], mean, scatter, _min_variance(s.rest.open, a))
+            variance, became = sage_husa.update_with_interval(s.drift[a], mean, scatter, _min_variance(s.rest.open, a))
             outcome[MEAN], outcome[INNOVATION_STD], outcome[OUTCOME], outcome[SCATTER] = (
                 mean,
                 np.sqrt(variance),
@@ -457,7 +459,7 @@ def _finish_interval(s, outcomes):  # type: ignore[no-untyped-def]
                 s.learned[a] += 1
                 update_rest_noise(s.bank[a], s.followed[a], s.samples[a], s.learned[a])
         else:
-            sage_husa.skip_interval(s.row[a])
+            sage_husa.skip_interval(s.drift[a])
         _predict_next_interval(a, s)
         for b in range(BLOCKS_PER_INTERVAL):
             s.means[a, b] = np.nan
@@ -467,7 +469,7 @@ def _finish_interval(s, outcomes):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _interval_mean(means):  # type: ignore[no-untyped-def]
+def _interval_mean(means: Floats) -> tuple[int, float, float]:
     """Return the number of blocks at rest in an interval, their mean, and the variance of the mean.
 
     The variance comes from half the differences of neighbouring blocks.
@@ -482,23 +484,23 @@ def _interval_mean(means):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _min_variance(blocks, axis):  # type: ignore[no-untyped-def]
+def _min_variance(blocks: Floats, axis: int) -> float:
     """Return the variance of an interval mean that rounding may hide; ``blocks`` is ``motion_kernel.State.open``."""
-    return blocks[axis, motion_kernel.STEP] ** 2 / 12.0 / BLOCKS_PER_INTERVAL + motion_kernel.MIN_VARIANCE
+    return float(blocks[axis, motion_kernel.STEP] ** 2 / 12.0 / BLOCKS_PER_INTERVAL + motion_kernel.MIN_VARIANCE)
 
 
 @compiled
-def _predict_next_interval(axis, s):  # type: ignore[no-untyped-def]
+def _predict_next_interval(axis: int, s: CompensatorState) -> None:
     """Predict the drift of the next interval, if a level is confirmed."""
-    if s.row[axis, sage_husa.REST_COUNT] >= sage_husa.MIN_CONFIRMED_INTERVALS:
-        sage_husa.predict(s.row[axis])
-        _update_bias(axis, s.row, s.bias, s.bank)
+    if s.drift[axis]["rest_count"] >= sage_husa.MIN_CONFIRMED_INTERVALS:
+        sage_husa.predict(s.drift[axis])
+        _update_bias(axis, s.drift, s.bias, s.bank)
 
 
 @compiled
-def _update_bias(axis, rows, biases, banks):  # type: ignore[no-untyped-def]
+def _update_bias(axis: int, drifts: np.ndarray, biases: Floats, banks: Floats) -> None:
     """Subtract the predicted drift from now on, and shift the filters by its change."""
-    now = sage_husa.expected_bias(rows[axis])[0]
+    now = sage_husa.expected_bias(drifts[axis])[0]
     before = biases[axis] if biases[axis] == biases[axis] else 0.0
     shift_bias(banks[axis], now - before)
     biases[axis] = now

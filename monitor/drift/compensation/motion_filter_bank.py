@@ -82,7 +82,7 @@ def gain_table(each: Ints) -> tuple[Floats, Ints]:
 
 
 @compiled
-def _gains(q, rows):  # type: ignore[no-untyped-def]
+def _gains(q: float, rows: int) -> Floats:
     """Return the gains [rows, 2] of a filter with an unknown initial state by the Riccati recursion."""
     out = np.empty((rows, 2))
     p00, p01, p11 = DIFFUSE_VARIANCE, 0.0, DIFFUSE_VARIANCE
@@ -96,7 +96,9 @@ def _gains(q, rows):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def filter_sample(z, bank, ages, table, first, sums, feedback, keep):  # type: ignore[no-untyped-def]
+def filter_sample(
+    z: float, bank: Floats, ages: Ints, table: Floats, first: Ints, sums: Floats, feedback: Floats, keep: float
+) -> float:
     """Process one sample of one axis, and return the filtered rate.
 
     Parameters
@@ -151,11 +153,11 @@ def filter_sample(z, bank, ages, table, first, sums, feedback, keep):  # type: i
             least, rate = error, now
     rate += keep * feedback[0]
     feedback[0] += z - rate
-    return rate
+    return float(rate)
 
 
 @compiled
-def predict_over_gap(bank, ages, samples):  # type: ignore[no-untyped-def]
+def predict_over_gap(bank: Floats, ages: Ints, samples: int) -> None:
     """Advance the filters over missing samples.
 
     Filters predict along their slopes. Filters with a memory shorter than the gap are reset.
@@ -178,7 +180,7 @@ def predict_over_gap(bank, ages, samples):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def shift_bias(bank, by):  # type: ignore[no-untyped-def]
+def shift_bias(bank: Floats, by: float) -> None:
     """Correct the filters after the estimate of the bias has changed.
 
     Parameters
@@ -193,7 +195,7 @@ def shift_bias(bank, by):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def update_rest_noise(bank, sums, count, intervals):  # type: ignore[no-untyped-def]
+def update_rest_noise(bank: Floats, sums: Floats, count: float, intervals: int) -> None:
     """Update the noise at rest with an interval that was at rest.
 
     Parameters

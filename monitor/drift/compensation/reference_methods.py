@@ -177,7 +177,7 @@ def _steady_covariance(step: Floats, new: float) -> Floats:
 
 
 @compiled
-def _run_filter(x, phi, gain):  # type: ignore[no-untyped-def]
+def _run_filter(x: Floats, phi: Floats, gain: Floats) -> Floats:
     """Run the filter with a constant gain [p] over x [n], and return its estimates [n]."""
     p = phi.size
     state, out = np.zeros(p), np.empty(x.size)

@@ -49,95 +49,95 @@ MIN_LEVEL_MEMORY, MAX_LEVEL_MEMORY = 40, 1000
 """Smallest and largest memory of the level in intervals. It is a third of the record of the identification, within
 these limits."""
 
-X, P = 0, 3
-"""First columns of the state and of its covariance."""
-PHI1, PHI2, G1, VARIANCE, LEVEL = range(12, 17)
-"""Columns of the model: φ1, φ2, G1, variance of a, and variance of the steps of the level."""
-S, R, SCATTER, SCATTER_COUNT, REST_COUNT, OUTLIER_RUN, LAST_OUTLIER, GUARD_LEFT, ADAPTIVE, IDENTIFIED = range(17, 27)
-"""Columns of the noise estimate, in the order of ROW_SIZE."""
-ROW_SIZE: Final = 27
-"""Number of columns of a row.
-
-The columns are the state [3], its covariance [9] and the model, followed by the noise estimate. The noise estimate
-holds s, R̂, the scatter within intervals, the number of intervals with a scatter and the number of intervals at rest.
-It also holds the number of successive outliers, the last outlier, the remaining guard intervals, and two flags.
-ADAPTIVE is 1 if the noise is estimated, and IDENTIFIED is 1 if a model has been identified.
-"""
+DRIFT_FILTER: Final = np.dtype(
+    [
+        ("state", "f8", (3,)),  # x, x̂ and level, rad/s
+        ("covariance", "f8", (3, 3)),  # (rad/s)²
+        ("phi1", "f8"),
+        ("phi2", "f8"),
+        ("g1", "f8"),
+        ("identified_variance", "f8"),  # variance of a as identified, (rad/s)²
+        ("level_variance", "f8"),  # variance of the steps of the level, (rad/s)²
+        ("variance", "f8"),  # s, estimated variance of a, (rad/s)²
+        ("white_variance", "f8"),  # R̂, (rad/s)²
+        ("scatter", "f8"),  # average variance of a mean from the scatter within the intervals, (rad/s)²
+        ("scatter_count", "f8"),  # number of intervals with a scatter
+        ("rest_count", "f8"),  # number of intervals at rest
+        ("outlier_run", "f8"),  # number of successive outliers
+        ("last_outlier", "f8"),  # mean of the last outlier, rad/s
+        ("guard_left", "f8"),  # number of remaining guard intervals
+        ("adaptive", "?"),  # True if the noise is estimated
+        ("identified", "?"),  # True if a model has been identified
+    ],
+    align=True,
+)
+"""Fields of the filter of one axis. Compiled code reads and writes a record of this type in place."""
 NOT_AT_REST, USED, REJECTED, STEPPED = range(4)
 """Outcomes of an interval: not at rest, used, rejected, or used as a step of the bias."""
 
 
-def initial_row(adapts: bool) -> Floats:
-    """Return a row before the first identification, which models a level only.
-
-    ``adapts`` is True if the noise is to be estimated continuously.
-    """
-    row = np.zeros(ROW_SIZE)
-    row[ADAPTIVE] = adapts
-    return row
-
-
-def set_model(row: Floats, arma: ArmaModel) -> None:
+def set_model(drift: np.void, arma: ArmaModel) -> None:
     """Set a new model, with an unknown state and the identified noise.
 
     Parameters
     ----------
-    row : ndarray, shape (ROW_SIZE,)
-        State of one axis. It is updated in place.
-    arma : Arma
+    drift : record of DRIFT_FILTER
+        Filter of one axis. It is updated in place.
+    arma : ArmaModel
         Identified model, in rad/s.
     """
     phi1, phi2 = arma.phi
     p11, p12, p22 = stationary_covariance(phi1, phi2, arma.theta)
-    row[X : X + 3] = 0.0, 0.0, arma.mean
-    row[P : P + 9] = arma.variance * np.array([p11, p12, 0.0, p12, p22, 0.0, 0.0, 0.0, 0.0])
-    row[PHI1], row[PHI2], row[G1] = phi1, phi2, phi1 + arma.theta
-    row[VARIANCE] = row[S] = arma.variance
-    row[R] = arma.white_variance
-    slow = (
-        arma.white_variance + arma.variance * ((1.0 + arma.theta) / (1.0 - phi1 - phi2)) ** 2
-    )  # spectral density at f = 0
-    row[LEVEL] = slow / min(max(arma.count / 3.0, MIN_LEVEL_MEMORY), MAX_LEVEL_MEMORY) ** 2
-    row[P + 8] = slow / arma.count
-    row[OUTLIER_RUN] = row[GUARD_LEFT] = 0.0
-    row[IDENTIFIED] = 1.0
+    drift["state"] = 0.0, 0.0, arma.mean
+    drift["covariance"] = arma.variance * np.array([[p11, p12, 0.0], [p12, p22, 0.0], [0.0, 0.0, 0.0]])
+    drift["phi1"], drift["phi2"], drift["g1"] = phi1, phi2, phi1 + arma.theta
+    drift["identified_variance"] = drift["variance"] = arma.variance
+    drift["white_variance"] = arma.white_variance
+    # Spectral density of the process and of v at f = 0.
+    slow = arma.white_variance + arma.variance * ((1.0 + arma.theta) / (1.0 - phi1 - phi2)) ** 2
+    drift["level_variance"] = slow / min(max(arma.count / 3.0, MIN_LEVEL_MEMORY), MAX_LEVEL_MEMORY) ** 2
+    drift["covariance"][2, 2] = slow / arma.count
+    drift["outlier_run"] = drift["guard_left"] = 0.0
+    drift["identified"] = True
 
 
 @compiled
-def predict(row):  # type: ignore[no-untyped-def]
+def predict(drift: np.void) -> None:
     """Predict the state of the next interval."""
-    phi1, phi2, g1, s = row[PHI1], row[PHI2], row[G1], row[S]
-    row[X], row[X + 1] = row[X + 1], phi2 * row[X] + phi1 * row[X + 1]
-    p00, p01, p02, p11, p12 = row[P], row[P + 1], row[P + 2], row[P + 4], row[P + 5]
-    row[P] = p11 + s
-    row[P + 1] = row[P + 3] = phi2 * p01 + phi1 * p11 + g1 * s
-    row[P + 4] = phi2 * phi2 * p00 + 2.0 * phi1 * phi2 * p01 + phi1 * phi1 * p11 + g1 * g1 * s
-    row[P + 2] = row[P + 6] = p12
-    row[P + 5] = row[P + 7] = phi2 * p02 + phi1 * p12
-    row[P + 8] += row[LEVEL]
+    phi1, phi2, g1, s = drift["phi1"], drift["phi2"], drift["g1"], drift["variance"]
+    x, p = drift["state"], drift["covariance"]
+    x[0], x[1] = x[1], phi2 * x[0] + phi1 * x[1]
+    p00, p01, p02, p11, p12 = p[0, 0], p[0, 1], p[0, 2], p[1, 1], p[1, 2]
+    p[0, 0] = p11 + s
+    p[0, 1] = p[1, 0] = phi2 * p01 + phi1 * p11 + g1 * s
+    p[1, 1] = phi2 * phi2 * p00 + 2.0 * phi1 * phi2 * p01 + phi1 * phi1 * p11 + g1 * g1 * s
+    p[0, 2] = p[2, 0] = p12
+    p[1, 2] = p[2, 1] = phi2 * p02 + phi1 * p12
+    p[2, 2] += drift["level_variance"]
 
 
 @compiled
-def skip_interval(row):  # type: ignore[no-untyped-def]
+def skip_interval(drift: np.void) -> None:
     """Process an interval that was not at rest."""
-    if row[REST_COUNT] < MIN_CONFIRMED_INTERVALS:
-        row[REST_COUNT] = 0.0
+    if drift["rest_count"] < MIN_CONFIRMED_INTERVALS:
+        drift["rest_count"] = 0.0
 
 
 @compiled
-def expected_bias(row):  # type: ignore[no-untyped-def]
+def expected_bias(drift: np.void) -> tuple[float, float]:
     """Return the expected bias of the interval in rad/s and its variance in (rad/s)²."""
-    return row[X] + row[X + 2], row[P] + 2.0 * row[P + 2] + row[P + 8]
+    x, p = drift["state"], drift["covariance"]
+    return x[0] + x[2], p[0, 0] + 2.0 * p[0, 2] + p[2, 2]
 
 
 @compiled
-def update_with_interval(row, z, scatter, least):  # type: ignore[no-untyped-def]
+def update_with_interval(drift: np.void, z: float, scatter: float, least: float) -> tuple[float, int]:
     """Process the mean of an interval at rest.
 
     Parameters
     ----------
-    row : ndarray, shape (ROW_SIZE,)
-        State of one axis. It is updated in place.
+    drift : record of DRIFT_FILTER
+        Filter of one axis. It is updated in place.
     z : float
         Mean of the interval, rad/s.
     scatter : float
@@ -150,71 +150,109 @@ def update_with_interval(row, z, scatter, least):  # type: ignore[no-untyped-def
     variance : float
         Variance S of the innovation, (rad/s)².
     outcome : int
-        USED, LEFT_OUT or STEPPED.
+        USED, REJECTED or STEPPED.
     """
-    loud = row[SCATTER_COUNT] >= MAX_SCATTER_RATIO[1] and scatter > MAX_SCATTER_RATIO[0] * max(row[SCATTER], least)
-    if scatter == scatter and not loud:
-        row[SCATTER_COUNT] += 1.0
-        row[SCATTER] += max(SCATTER_WEIGHT, 1.0 / row[SCATTER_COUNT]) * (scatter - row[SCATTER])
-    if row[IDENTIFIED] == 0.0:  # The row models a level only, so all other variation is scatter.
-        row[R] = max(row[SCATTER], least)
-        row[LEVEL] = row[R] / MIN_LEVEL_MEMORY**2
-        if row[REST_COUNT] == 0.0:
-            row[X + 2], row[P + 8] = z, row[R]
-    row[R] = max(row[R], least)
-    expected, known = expected_bias(row)
-    e, total = z - expected, known + row[R]
-    became = USED
+    loud = _update_scatter(drift, scatter, least)
+    if not drift["identified"]:
+        _model_level_only(drift, z, least)
+    drift["white_variance"] = max(drift["white_variance"], least)
+    expected, known = expected_bias(drift)
+    e, total = z - expected, known + drift["white_variance"]
+    outcome = USED
     if loud or e * e > OUTLIER_SIGMAS * OUTLIER_SIGMAS * total:
-        if row[REST_COUNT] < MIN_CONFIRMED_INTERVALS:
-            row[X + 2], row[P + 8], row[REST_COUNT] = z, row[R], 1.0
+        outcome = _process_outlier(drift, z, e)
+        if outcome == REJECTED:
             return total, REJECTED
-        alike = (z - row[LAST_OUTLIER]) ** 2 < 2.0 * OUTLIER_SIGMAS * OUTLIER_SIGMAS * row[R]
-        row[OUTLIER_RUN] = row[OUTLIER_RUN] + 1.0 if alike else 1.0
-        row[LAST_OUTLIER] = z
-        if row[OUTLIER_RUN] < min(max(row[REST_COUNT], STEP_INTERVALS[0]), STEP_INTERVALS[1]):
-            row[GUARD_LEFT] = GUARD_INTERVALS
-            return total, REJECTED
-        became, row[GUARD_LEFT] = STEPPED, 0.0
-        row[P + 8] += e * e
-        row[SCATTER_COUNT] = 0.0  # The noise may have changed with the level.
-    row[OUTLIER_RUN] = 0.0
-    if row[GUARD_LEFT] > 0.0:
-        agrees = (z - row[LAST_OUTLIER]) ** 2 < 2.0 * AGREEMENT_SIGMAS * AGREEMENT_SIGMAS * row[R]
-        row[GUARD_LEFT] = row[GUARD_LEFT] - 1.0 if agrees else GUARD_INTERVALS
-        row[LAST_OUTLIER] = z
+    drift["outlier_run"] = 0.0
+    if drift["guard_left"] > 0.0:
+        agrees = _agree(drift, z, AGREEMENT_SIGMAS)
+        drift["guard_left"] = drift["guard_left"] - 1.0 if agrees else GUARD_INTERVALS
+        drift["last_outlier"] = z
         return total, REJECTED
-    row[REST_COUNT] += 1.0
-    _correct(row, e)
-    if row[ADAPTIVE] > 0.0 and row[IDENTIFIED] > 0.0 and became == USED:
-        d = (1.0 - FORGETTING_FACTOR) / (1.0 - FORGETTING_FACTOR ** (row[REST_COUNT] + 1.0))
-        left = row[R] / total  # 1 − H K
-        row[R] = max((1.0 - d) * row[R] + d * (left * left * e * e + expected_bias(row)[1]), 0.5 * row[SCATTER], least)
-        s = row[S]
-        row[S] = max(s + d * s * s * (e * e - total) / (total * total), MIN_VARIANCE_SHARE * row[VARIANCE])
-    return total, became
+    drift["rest_count"] += 1.0
+    _correct(drift, e)
+    if drift["adaptive"] and drift["identified"] and outcome == USED:
+        _adapt_noise(drift, e, total, least)
+    return total, outcome
 
 
 @compiled
-def _correct(row, e):  # type: ignore[no-untyped-def]
+def _update_scatter(drift: np.void, scatter: float, least: float) -> bool:
+    """Update the average scatter, and return True if the scatter is far above the usual scatter."""
+    usual = max(drift["scatter"], least)
+    loud = drift["scatter_count"] >= MAX_SCATTER_RATIO[1] and scatter > MAX_SCATTER_RATIO[0] * usual
+    if scatter == scatter and not loud:
+        drift["scatter_count"] += 1.0
+        drift["scatter"] += max(SCATTER_WEIGHT, 1.0 / drift["scatter_count"]) * (scatter - drift["scatter"])
+    return bool(loud)
+
+
+@compiled
+def _model_level_only(drift: np.void, z: float, least: float) -> None:
+    """Set the noise before the first identification, when all variation except a level counts as scatter."""
+    drift["white_variance"] = max(drift["scatter"], least)
+    drift["level_variance"] = drift["white_variance"] / MIN_LEVEL_MEMORY**2
+    if drift["rest_count"] == 0.0:
+        drift["state"][2], drift["covariance"][2, 2] = z, drift["white_variance"]
+
+
+@compiled
+def _process_outlier(drift: np.void, z: float, e: float) -> int:
+    """Process an outlier with innovation ``e``, and return REJECTED, or STEPPED if the new value has persisted."""
+    if drift["rest_count"] < MIN_CONFIRMED_INTERVALS:
+        drift["state"][2], drift["covariance"][2, 2], drift["rest_count"] = z, drift["white_variance"], 1.0
+        return REJECTED
+    drift["outlier_run"] = drift["outlier_run"] + 1.0 if _agree(drift, z, OUTLIER_SIGMAS) else 1.0
+    drift["last_outlier"] = z
+    if drift["outlier_run"] < min(max(drift["rest_count"], STEP_INTERVALS[0]), STEP_INTERVALS[1]):
+        drift["guard_left"] = GUARD_INTERVALS
+        return REJECTED
+    drift["guard_left"] = 0.0
+    drift["covariance"][2, 2] += e * e
+    drift["scatter_count"] = 0.0  # The noise may have changed with the level.
+    return STEPPED
+
+
+@compiled
+def _agree(drift: np.void, z: float, sigmas: float) -> bool:
+    """Return True if a mean agrees with the last outlier."""
+    return bool((z - drift["last_outlier"]) ** 2 < 2.0 * sigmas * sigmas * drift["white_variance"])
+
+
+@compiled
+def _adapt_noise(drift: np.void, e: float, total: float, least: float) -> None:
+    """Update the noise estimate with an innovation ``e`` of variance ``total``, after the correction of the state."""
+    d = (1.0 - FORGETTING_FACTOR) / (1.0 - FORGETTING_FACTOR ** (drift["rest_count"] + 1.0))
+    r = drift["white_variance"]
+    left = r / total  # 1 − H K
+    r = (1.0 - d) * r + d * (left * left * e * e + expected_bias(drift)[1])
+    drift["white_variance"] = max(r, 0.5 * drift["scatter"], least)
+    s = drift["variance"]
+    s += d * s * s * (e * e - total) / (total * total)
+    drift["variance"] = max(s, MIN_VARIANCE_SHARE * drift["identified_variance"])
+
+
+@compiled
+def _correct(drift: np.void, e: float) -> None:
     """Correct state and covariance with the innovation ``e``: add K ε, and multiply P by I − K H."""
-    h = row[P] + row[P + 6], row[P + 1] + row[P + 7], row[P + 2] + row[P + 8]  # H P
-    total = h[0] + h[2] + row[R]
+    x, p = drift["state"], drift["covariance"]
+    h = p[0, 0] + p[2, 0], p[0, 1] + p[2, 1], p[0, 2] + p[2, 2]  # H P
+    total = h[0] + h[2] + drift["white_variance"]
     for i in range(3):
-        row[X + i] += h[i] / total * e
+        x[i] += h[i] / total * e
     for i in range(3):
         for j in range(3):
-            row[P + 3 * i + j] -= h[i] * h[j] / total
+            p[i, j] -= h[i] * h[j] / total
 
 
 @compiled
-def refilter_history(row, z, scatter, least):  # type: ignore[no-untyped-def]
+def refilter_history(drift: np.void, z: Floats, scatter: Floats, least: float) -> None:
     """Filter all remembered intervals again after ``set_model``.
 
     Parameters
     ----------
-    row : ndarray, shape (ROW_SIZE,)
-        State of one axis. It is updated in place.
+    drift : record of DRIFT_FILTER
+        Filter of one axis. It is updated in place.
     z : ndarray, shape (n,)
         Interval means in rad/s, oldest first; NaN = not at rest.
     scatter : ndarray, shape (n,)
@@ -224,5 +262,5 @@ def refilter_history(row, z, scatter, least):  # type: ignore[no-untyped-def]
     """
     for k in range(z.size):
         if z[k] == z[k]:
-            update_with_interval(row, z[k], scatter[k], least)
-        predict(row)
+            update_with_interval(drift, z[k], scatter[k], least)
+        predict(drift)

@@ -73,6 +73,8 @@ MIN_SWING_SIGMAS: Final = 5.0
 MIN_REVERSE_SHARE: Final = 0.1
 """Smallest share of the total temperature movement in the lesser direction. Below it, temperature only rose or only
 fell."""
+GOLDEN_STEPS: Final = 10
+"""Number of steps of the golden-section search."""
 GOLDEN_RATIO: Final = 0.6180339887498949
 """Step of the golden-section search."""
 
@@ -257,58 +259,75 @@ def _fit_shape(
     means: IntervalMeans, excess: Floats, shape: ThermalModelForm, since: int | None
 ) -> StepwiseWork[_ShapeFit]:
     """Fit a form with its best time constants and the best φ."""
-    best = yield from _fit_time_constants(means, excess, shape, PHI_VALUES[0], since)
+    best = yield from _TimeConstantSearch(means, excess, shape, PHI_VALUES[0], since).run()
     for phi in PHI_VALUES[1:]:
-        other = yield from _fit_time_constants(means, excess, shape, phi, since)
+        other = yield from _TimeConstantSearch(means, excess, shape, phi, since).run()
         best = min(best, other, key=lambda one: one.aicc)
     return best
 
 
-def _fit_time_constants(
-    means: IntervalMeans, excess: Floats, shape: ThermalModelForm, phi: float, since: int | None
-) -> StepwiseWork[_ShapeFit]:
-    """Fit a form with a given φ and its best time constants.
+class _TimeConstantSearch:
+    """Search for the time constants of a form with a given φ.
 
     The time constants are chosen one after the other from a grid, then refined by golden-section search.
     """
-    k = shape.memory
-    fastest, slowest = (
-        MIN_TIME_CONSTANT_INTERVALS * means.interval_s,
-        MAX_TIME_CONSTANT_SHARE * means.interval_s * excess.size,
-    )
-    grid = np.geomspace(fastest, slowest, GRID_POINTS)
-    ratio = float(grid[1] / grid[0])
-    constants: tuple[float, ...] = ()
 
-    def evaluate(each: tuple[float, ...]) -> StepwiseWork[_ShapeFit]:
+    def __init__(
+        self, means: IntervalMeans, excess: Floats, shape: ThermalModelForm, phi: float, since: int | None
+    ) -> None:
+        self._means, self._excess, self._shape, self._phi, self._since = means, excess, shape, phi, since
+        self._fastest = MIN_TIME_CONSTANT_INTERVALS * means.interval_s
+        self._slowest = MAX_TIME_CONSTANT_SHARE * means.interval_s * excess.size
+        self._grid = np.geomspace(self._fastest, self._slowest, GRID_POINTS)
+        self._constants: tuple[float, ...] = ()
+
+    def run(self) -> StepwiseWork[_ShapeFit]:
+        """Fit the form with its best time constants."""
+        k = self._shape.memory
+        for _ in range(k):
+            yield from self._add_from_grid()
+        for _ in range(2 if k > 1 else min(k, 1)):
+            for at in range(k):
+                yield from self._refine(at)
+        return (yield from self._evaluate(self._constants))
+
+    def _evaluate(self, constants: tuple[float, ...]) -> StepwiseWork[_ShapeFit]:
         yield
-        return _fit_sizes(means, excess, replace(shape, constants_s=tuple(sorted(each))), phi, since)
+        shape = replace(self._shape, constants_s=tuple(sorted(constants)))
+        return _fit_sizes(self._means, self._excess, shape, self._phi, self._since)
 
-    def bounds(at: int) -> tuple[float, float]:
-        """Return the limits of a time constant: its neighbours on the grid, at a distance from the other constants."""
-        one, others = constants[at], (*constants[:at], *constants[at + 1 :])
-        below = max((MIN_TIME_CONSTANT_RATIO * other for other in others if other < one), default=fastest)
-        above = min((other / MIN_TIME_CONSTANT_RATIO for other in others if other > one), default=slowest)
-        return max(one / ratio, fastest, min(below, one)), min(one * ratio, slowest, max(above, one))
-
-    for _ in range(k):
+    def _add_from_grid(self) -> StepwiseWork[None]:
+        """Add the best time constant of the grid that differs enough from the others."""
         free = [
-            one for one in grid.tolist() if all(max(one / c, c / one) >= MIN_TIME_CONSTANT_RATIO for c in constants)
+            one
+            for one in self._grid.tolist()
+            if all(max(one / c, c / one) >= MIN_TIME_CONSTANT_RATIO for c in self._constants)
         ]
-        looks = []
+        scores = []
         for one in free:
-            looks.append((yield from evaluate((*constants, one))).aicc)
-        constants = (*constants, free[int(np.argmin(looks))])
-    for _ in range(2 if k > 1 else min(k, 1)):
-        for at in range(k):
-            lo, hi = bounds(at)
-            for _ in range(10):
-                a, b = hi * (lo / hi) ** GOLDEN_RATIO, lo * (hi / lo) ** GOLDEN_RATIO
-                below = yield from evaluate((*constants[:at], a, *constants[at + 1 :]))
-                above = yield from evaluate((*constants[:at], b, *constants[at + 1 :]))
-                lo, hi = (lo, b) if below.aicc < above.aicc else (a, hi)
-            constants = (*constants[:at], (lo * hi) ** 0.5, *constants[at + 1 :])
-    return (yield from evaluate(constants))
+            scores.append((yield from self._evaluate((*self._constants, one))).aicc)
+        self._constants = (*self._constants, free[int(np.argmin(scores))])
+
+    def _refine(self, at: int) -> StepwiseWork[None]:
+        """Refine one time constant by golden-section search."""
+        lo, hi = self._bounds(at)
+        for _ in range(GOLDEN_STEPS):
+            a, b = hi * (lo / hi) ** GOLDEN_RATIO, lo * (hi / lo) ** GOLDEN_RATIO
+            below = yield from self._evaluate(self._replaced(at, a))
+            above = yield from self._evaluate(self._replaced(at, b))
+            lo, hi = (lo, b) if below.aicc < above.aicc else (a, hi)
+        self._constants = self._replaced(at, (lo * hi) ** 0.5)
+
+    def _replaced(self, at: int, constant: float) -> tuple[float, ...]:
+        return (*self._constants[:at], constant, *self._constants[at + 1 :])
+
+    def _bounds(self, at: int) -> tuple[float, float]:
+        """Return the limits of a time constant: its neighbours on the grid, at a distance from the other constants."""
+        one, others = self._constants[at], (*self._constants[:at], *self._constants[at + 1 :])
+        ratio = float(self._grid[1] / self._grid[0])
+        below = max((MIN_TIME_CONSTANT_RATIO * other for other in others if other < one), default=self._fastest)
+        above = min((other / MIN_TIME_CONSTANT_RATIO for other in others if other > one), default=self._slowest)
+        return max(one / ratio, self._fastest, min(below, one)), min(one * ratio, self._slowest, max(above, one))
 
 
 def _fit_sizes(

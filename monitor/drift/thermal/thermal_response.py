@@ -120,7 +120,7 @@ def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
 
 
 @compiled
-def first_order_lag(x, p):  # type: ignore[no-untyped-def]
+def first_order_lag(x: Floats, p: float) -> Floats:
     """Return a first-order lag of x, L_n = p L_{n−1} + (1 − p) x_n, settled at the first value.
 
     Parameters

@@ -23,9 +23,8 @@ from drivers.sample import AXES, Floats, make_block
 from monitor.commands.compensate import METHODS, Request, run_compensation
 from monitor.daemon.arma_worker import ArmaWorker
 from monitor.drift.compensation import sage_husa
-from monitor.drift.compensation.arma import fit_arma
+from monitor.drift.compensation.arma import fit_arma, stationary_covariance
 from monitor.drift.compensation.compensation_result import AxisCompensation
-from monitor.drift.compensation.compensation_score import MotionScore, score_in_motion
 from monitor.drift.compensation.compensator import Compensator
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
@@ -33,6 +32,7 @@ from monitor.drift.thermal.interval_means import compute_interval_means
 from monitor.noise.catalogue import load_model
 from tests.experiments.benchmarks.joint import compiled_joint, joint
 from tests.experiments.benchmarks.machine import console, table
+from tests.experiments.benchmarks.motion_score import MotionScore, score_in_motion
 
 RATE_HZ = 100.0
 SENSORS = ("mpu-6050", "consumer-mems", "adis16470")
@@ -212,7 +212,7 @@ def one_filter(_seeds: int) -> None:
         means = compute_interval_means(measured[:still], np.zeros(still), RATE_HZ, 1.0)
         model = fit_arma(means.bias, float(np.mean(means.error**2)), [(1, 0)])
         phi, white = max(model.phi[0], 0.5) ** (1.0 / RATE_HZ), float(measured[:still].var())
-        variance = model.stationary_std**2 * (1.0 - phi**2)
+        variance = model.variance * stationary_covariance(*model.phi, model.theta)[0] * (1.0 - phi**2)
         for intensity in (1e-8, 1e-6, 1e-4, 1e-2, 1.0):
             cells = []
             for truth in truths.values():
@@ -288,7 +288,8 @@ def doubling(seeds: int) -> None:
 
 def _followed(model, z: Floats, scatter: Floats, drift: Floats, adapts: bool) -> list[float]:  # type: ignore[no-untyped-def]
     """rms error before and after the change, and of ε/√S after it."""
-    row = sage_husa.initial_row(adapts)
+    row = np.zeros(1, sage_husa.DRIFT_FILTER)[0]
+    row["adaptive"] = adapts
     sage_husa.set_model(row, model)
     off, new = np.empty(z.size), np.empty(z.size)
     for k in range(z.size):
@@ -334,7 +335,7 @@ def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats
     for start in range(0, len(values) - size, size):
         one.compensate(values[start : start + size])
         one.identify()
-        kept.append((one._state.row.copy(), len(taught)))
+        kept.append((one._state.drift.copy(), len(taught)))
         taught += [interval.mean for interval in one.take_intervals()]
     means, per_min = np.array(taught), round(60.0 / one.interval_s)
     squares = np.zeros((3, len(spans)))
@@ -350,7 +351,7 @@ def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats
                 for _ in range(ahead + per_min // 2):
                     sage_husa.predict(row)
             now = np.array([sage_husa.expected_bias(row) for row in rows])
-            spread = now[:, 1] + np.array([row[sage_husa.R] for row in rows]) / per_min
+            spread = now[:, 1] + np.array([row["white_variance"] for row in rows]) / per_min
             squares[:, at] += np.mean([(truth - minute) ** 2, (truth - now[:, 0]) ** 2, spread], axis=1)
             count += 1
         squares[:, at] /= max(count, 1)
@@ -498,8 +499,8 @@ def robust(_seeds: int) -> None:
         one.identify()
         one.take_intervals()
         assert np.array_equal(np.isfinite(out), np.isfinite(values))
-        for row in one._state.row:
-            covariance = row[3:12].reshape(3, 3)
+        for row in one._state.drift:
+            covariance = row["covariance"]
             if np.trace(covariance) > 0.0:  # something is known
                 least = min(least, float(np.linalg.eigvalsh(covariance)[0] / np.trace(covariance)))
         done += size

@@ -11,8 +11,14 @@ from monitor.drift.compensation.arma import ArmaModel
 MODEL = ArmaModel((1.5, -0.53), -0.7, 0.2, mean=3.0, white_variance=1.0, count=900)
 
 
-def adopted(adapts: bool, model: ArmaModel = MODEL) -> np.ndarray:
-    row = sage_husa.initial_row(adapts)
+def unidentified(adapts: bool) -> np.void:
+    rows = np.zeros(1, sage_husa.DRIFT_FILTER)
+    rows["adaptive"] = adapts
+    return rows[0]
+
+
+def adopted(adapts: bool, model: ArmaModel = MODEL) -> np.void:
+    row = unidentified(adapts)
     sage_husa.set_model(row, model)
     return row
 
@@ -22,18 +28,18 @@ def test_without_adaptation_it_is_the_textbook_filter():
     phi1, phi2 = MODEL.phi
     a = np.array([[0.0, 1.0, 0.0], [phi2, phi1, 0.0], [0.0, 0.0, 1.0]])
     b, h = np.array([1.0, phi1 + MODEL.theta, 0.0]), np.array([1.0, 0.0, 1.0])
-    x, p = row[:3].copy(), row[3:12].reshape(3, 3).copy()
+    x, p = row["state"].copy(), row["covariance"].copy()
     for z in 3.0 + np.random.default_rng(0).standard_normal(50):
         s = h @ p @ h + MODEL.white_variance
         gain = p @ h / s
         x, p = x + gain * (z - h @ x), p - np.outer(gain, h @ p)
-        x, p = a @ x, a @ p @ a.T + MODEL.variance * np.outer(b, b) + np.diag([0.0, 0.0, row[sage_husa.LEVEL]])
+        x, p = a @ x, a @ p @ a.T + MODEL.variance * np.outer(b, b) + np.diag([0.0, 0.0, row["level_variance"]])
         total, became = sage_husa.update_with_interval(row, z, np.nan, 1e-12)
         sage_husa.predict(row)
         assert became == sage_husa.USED
         assert total == pytest.approx(s)
-    np.testing.assert_allclose(row[:3], x, rtol=1e-9)
-    np.testing.assert_allclose(row[3:12].reshape(3, 3), p, rtol=1e-9, atol=1e-15)
+    np.testing.assert_allclose(row["state"], x, rtol=1e-9)
+    np.testing.assert_allclose(row["covariance"], p, rtol=1e-9, atol=1e-15)
 
 
 def test_noise_that_doubles_is_noticed_and_only_by_the_one_that_adapts():
@@ -44,13 +50,13 @@ def test_noise_that_doubles_is_noticed_and_only_by_the_one_that_adapts():
         for row in (one, other):
             sage_husa.update_with_interval(row, z, 4.0 * rng.chisquare(3) / 3.0, 1e-12)
             sage_husa.predict(row)
-    assert one[sage_husa.R] == pytest.approx(4.0, rel=0.25)
-    assert other[sage_husa.R] == 1.0
+    assert one["white_variance"] == pytest.approx(4.0, rel=0.25)
+    assert other["white_variance"] == 1.0
 
 
 def test_an_outlier_is_left_out_and_a_step_taken_after_it_has_stayed():
     row = adopted(True)
-    row[sage_husa.REST_COUNT] = 40.0
+    row["rest_count"] = 40.0
     for k in range(60):
         became = sage_husa.update_with_interval(row, 3.0 + (100.0 if k == 5 else 0.0), 1.0, 1e-12)[1]
         sage_husa.predict(row)
@@ -73,12 +79,12 @@ def test_what_wanders_far_off_is_no_step():
 
 
 def test_a_first_level_has_to_be_confirmed():
-    row = sage_husa.initial_row(True)
+    row = unidentified(True)
     for k in range(sage_husa.MIN_CONFIRMED_INTERVALS - 1):
         sage_husa.update_with_interval(row, 50.0, 1.0, 1e-12)
-        assert row[sage_husa.REST_COUNT] == k + 1
+        assert row["rest_count"] == k + 1
     sage_husa.skip_interval(row)
-    assert row[sage_husa.REST_COUNT] == 0.0
+    assert row["rest_count"] == 0.0
     for _ in range(sage_husa.MIN_CONFIRMED_INTERVALS):
         sage_husa.update_with_interval(row, 2.0, 1.0, 1e-12)
     assert sage_husa.expected_bias(row)[0] == pytest.approx(2.0)
@@ -105,9 +111,9 @@ def test_covariances_stay_positive_whatever_comes(course, model):
             total, _ = sage_husa.update_with_interval(row, value, scatter, 1e-30)
             assert total > 0.0
         sage_husa.predict(row)
-        p = row[3:12].reshape(3, 3)
-        assert np.isfinite(row).all()
+        p = row["covariance"]
+        assert all(np.isfinite(row[name]).all() for name in row.dtype.names)
         np.testing.assert_allclose(p, p.T, atol=1e-9 * np.trace(p))
         assert np.linalg.eigvalsh(p)[0] >= -1e-9 * np.trace(p)
-        assert row[sage_husa.R] > 0.0
-        assert row[sage_husa.S] >= sage_husa.MIN_VARIANCE_SHARE * model.variance
+        assert row["white_variance"] > 0.0
+        assert row["variance"] >= sage_husa.MIN_VARIANCE_SHARE * model.variance
