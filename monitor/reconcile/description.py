@@ -252,16 +252,16 @@ def _quadratic_bounds(state: Hypothesis, index: int) -> ParameterInterval:
 
 
 EVIDENCE_TEXT: Final = {
-    "values": "the values themselves show it",
-    "psd": "power stands apart from the model's spectrum",
-    "lines": "a steady oscillation stands out of the spectrum",
-    "autocorrelation": "neighbouring samples are not independent once the model is taken out",
-    "level": "the level moves more than the model allows",
-    "temperature": "the level follows the temperature",
-    "other_axes": "another axis is seen in this one",
-    "tails": "samples lie further out than Gaussian noise puts them",
-    "variance": "the strength of the noise changes in time",
-    "spectrogram": "power changes in time within a band",
+    "values": "The measured values are quantized, clipped or repeated",
+    "psd": "The power differs from the spectrum of the model",
+    "lines": "The spectrum contains a steady oscillation",
+    "autocorrelation": "Successive samples are correlated more than the model allows",
+    "level": "The level changes more than the model allows",
+    "temperature": "The level depends on the temperature",
+    "other_axes": "The axis contains a share of another axis",
+    "tails": "The samples have heavier tails than Gaussian noise",
+    "variance": "The variance of the noise changes in time",
+    "spectrogram": "The power in a frequency band changes in time",
 }
 """For each diagnostic, the text that describes its evidence."""
 
@@ -269,18 +269,19 @@ EVIDENCE_TEXT: Final = {
 def _justification(
     effect: Effect, kind: StepKind, score: Score, after: Score, others: tuple[RunnerUp, ...], trial: Trial
 ) -> str:
-    """Return the sentence that justifies a step."""
-    where = _location_text(score)
-    seen = f"{EVIDENCE_TEXT[score.lens]}{where}, {score.gap:.1f} where a true model stays below {score.threshold:.1f}"
+    """Return the sentences that justify a step."""
+    gaps = f"the gap is {score.gap:.1f}, and a true model stays below {score.threshold:.1f}"
+    sentences = [f"{EVIDENCE_TEXT[score.lens]}{_location_text(score)}: {gaps}."]
     if kind == "retuned":
-        done = f"with another size of {effect.name}, which the model has, {after.gap:.1f} is left"
-    else:
-        done = f"with {effect.name} {after.gap:.1f} is left"
-    rival = ""
-    if others and kind == "added":
-        rival = f"; {others[0].effect} explains it {_comparison_phrase(others[0].confidence)}"
-    events = f" ({trial.events} seen)" if kind == "added" and trial.events and trial.name == effect.name else ""
-    return f"{seen[0].upper()}{seen[1:]}; {done}{events}{rival}."
+        sentences.append(f"With another size of {effect.name}, which the model has, the gap is {after.gap:.1f}.")
+        return " ".join(sentences)
+    sentences.append(f"With {effect.name}, the gap is {after.gap:.1f}.")
+    if trial.events and trial.name == effect.name:
+        sentences.append(f"The number of detected events is {trial.events}.")
+    if others:
+        phrase = _comparison_phrase(others[0].confidence)
+        sentences.append(f"The effect {others[0].effect} explains the difference {phrase}.")
+    return " ".join(sentences)
 
 
 def _comparison_phrase(confidence: float) -> str:

@@ -43,7 +43,7 @@ from monitor.reconcile.result import (
     Score,
     combine_decisions,
 )
-from monitor.reconcile.search.axis_preparation import prepare_axes, without_sources
+from monitor.reconcile.search.axis_preparation import prepare_axes
 from monitor.reconcile.search.candidates import PENALTY_NATS
 from monitor.reconcile.search.sample_rate_error import (
     SAMPLE_RATE_PENALTY_NATS,
@@ -189,22 +189,10 @@ def _fit_terms(axis: Axis) -> Effects:
     return best.effects
 
 
-def effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
+def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
     """Return the effects of each recorded axis without constant biases.
 
     A constant bias is not compared, because the mean of each axis is always free.
-
-    Parameters
-    ----------
-    model : NoiseModel
-        Model under test.
-    recording : Recording
-        Recording whose axes are used.
-
-    Returns
-    -------
-    dict of str to tuple of Effect
-        Effects of each axis.
     """
     return {
         axis: tuple(effect for effect in model.effects.get(axis, ()) if not isinstance(effect, Bias))
@@ -220,7 +208,7 @@ def _diagnose_simulations(
     The result has, for each of the named axes, the findings of each simulated recording.
     """
     template = run.recording
-    effects = effects_by_axis(model, template)
+    effects = _effects_by_axis(model, template)
 
     def diagnose(seed: int) -> dict[str, Findings]:
         drawn = model.simulate(template.samples, template.rate_hz, seed, template.temperature_c)
@@ -240,7 +228,7 @@ def _search_all_axes(run: RunContext, model: NoiseModel, null: Mapping[str, Axis
     The sample rate is tested first. If two axes each seem to leak into the other, the search is repeated on one of them
     without that source.
     """
-    effects = effects_by_axis(model, run.recording)
+    effects = _effects_by_axis(model, run.recording)
     axes = run.prepare(run.recording, effects, run.seed)
     error = detect_sample_rate_error(axes, effects)
     if error is not None:
@@ -252,8 +240,9 @@ def _search_all_axes(run: RunContext, model: NoiseModel, null: Mapping[str, Axis
         return search_axis(axes[name], effects[name], null[name], rng)
 
     found = dict(zip(axes, run.map(search, axes), strict=True))
-    for name, wrong_sources in _reversed_leak_sources(found, null).items():
-        axes[name] = without_sources(axes[name], wrong_sources)
+    for name, wrong in _reversed_leak_sources(found, null).items():
+        others = {source: one for source, one in axes[name].others.items() if source not in wrong}
+        axes[name] = replace(axes[name], others=others)
         found[name] = search(name)
     return SearchResults(found, error)
 

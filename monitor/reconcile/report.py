@@ -28,9 +28,9 @@ def encode_report(r: Reconciliation) -> bytes:
     return _JSON_ENCODER.encode({
         "schema": SCHEMA,
         "verdict": r.verdict,
-        "rate": _finite_or_none(r.rate_hz),
+        "rate": finite_or_none(r.rate_hz),
         "samples": int(r.samples),
-        "seconds": _finite_or_none(r.duration_s),
+        "seconds": finite_or_none(r.duration_s),
         "seed": int(r.seed),
         "fitted_first": bool(r.fitted_first),
         "notes": r.notes,
@@ -55,11 +55,9 @@ def _step_entry(step: ReconciliationStep) -> dict[str, Any]:
         "found": _score_entry(step.found),
         "kind": step.kind,
         "effect": step.effect,
-        "parameters": {name: _bounds_entry(bounds) for name, bounds in step.parameters.items()},
-        "confidence": _finite_or_none(step.confidence),
-        "runners_up": [
-            {"effect": one.effect, "confidence": _finite_or_none(one.confidence)} for one in step.runners_up
-        ],
+        "parameters": {name: parameter_entry(bounds) for name, bounds in step.parameters.items()},
+        "confidence": finite_or_none(step.confidence),
+        "runners_up": [{"effect": one.effect, "confidence": finite_or_none(one.confidence)} for one in step.runners_up],
         "gap": _gap_entry(step.before, step.after),
         "held_out_gap": held_out,
         **({} if held_out else {"held_out_reason": step.held_out_reason}),
@@ -73,10 +71,10 @@ def _gap_entry(before: Score | None, after: Score | None) -> dict[str, float | N
     if before is None or after is None:
         return None
     return {
-        "before": _finite_or_none(before.gap),
-        "after": _finite_or_none(after.gap),
-        "null95": _finite_or_none(after.null95),
-        "threshold": _finite_or_none(after.threshold),
+        "before": finite_or_none(before.gap),
+        "after": finite_or_none(after.gap),
+        "null95": finite_or_none(after.null95),
+        "threshold": finite_or_none(after.threshold),
     }
 
 
@@ -85,25 +83,25 @@ def _score_entry(score: Score) -> dict[str, Any]:
     return {
         "lens": score.lens,
         "where": _where_entry(score.where),
-        "gap": _finite_or_none(score.gap),
-        "null95": _finite_or_none(score.null95),
-        "threshold": _finite_or_none(score.threshold),
+        "gap": finite_or_none(score.gap),
+        "null95": finite_or_none(score.null95),
+        "threshold": finite_or_none(score.threshold),
     }
 
 
 def _where_entry(where: Location) -> dict[str, Any]:
     """Return the report entry of a location."""
     found = where.found().items()
-    return {name: place if isinstance(place, str) else [_finite_or_none(end) for end in place] for name, place in found}
+    return {name: place if isinstance(place, str) else [finite_or_none(end) for end in place] for name, place in found}
 
 
-def _bounds_entry(bounds: ParameterInterval) -> dict[str, Any]:
+def parameter_entry(bounds: ParameterInterval) -> dict[str, Any]:
     """Return the report entry of a parameter."""
     if isinstance(bounds.value, str):
         return {"value": bounds.value}
-    return {"value": _finite_or_none(bounds.value), "lo": _finite_or_none(bounds.lo), "hi": _finite_or_none(bounds.hi)}
+    return {"value": finite_or_none(bounds.value), "lo": finite_or_none(bounds.lo), "hi": finite_or_none(bounds.hi)}
 
 
-def _finite_or_none(value: float | None) -> float | None:
+def finite_or_none(value: float | None) -> float | None:
     """Return a Python float, because the encoder does not accept NumPy scalars, or None if the value is not finite."""
     return None if value is None or not isfinite(value) else float(value)

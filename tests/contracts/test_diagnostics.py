@@ -1,7 +1,8 @@
-"""What every lens must pass, found by listing ``DIAGNOSTICS``: no gap where there is none, a null that holds, no
-memory.
+"""Contract of the diagnostics, which are found by listing ``DIAGNOSTICS``.
 
-Noise is made by SciPy, white with a random walk; two minutes, beside a temperature and another axis.
+A diagnostic finds no difference in data that are equal to the expectation. Its null distribution holds for simulated
+recordings. It depends on nothing but its input. The data are one minute of white noise and random walk, drawn by SciPy,
+with a temperature and another axis.
 """
 
 from collections.abc import Callable
@@ -24,14 +25,14 @@ RUNS = 240
 OTHER = correlated(n, np.random.default_rng(99_999), 1e-2, 1.0)
 
 
-def beside_white(y: np.ndarray) -> WhitenedAxis:
-    """A series beside white noise of its own size."""
+def whitened_by_white_noise(y: np.ndarray) -> WhitenedAxis:
+    """Whiten a series by white noise of the same size."""
     return seen(axes({"gx": OTHER, "gz": y}, (WHITE,), warmth(n))["gz"], (WHITE,))
 
 
 @cache
 def findings(first: int, runs: int) -> list[dict[str, Finding]]:
-    """Of recordings of one model."""
+    """Return the findings on simulated recordings of one model."""
     found = []
     for seed in range(first, first + runs):
         rng = np.random.default_rng(seed)
@@ -43,7 +44,7 @@ def findings(first: int, runs: int) -> list[dict[str, Finding]]:
 
 @cache
 def all_nulls(name: str) -> np.ndarray:
-    """null95 of a lens, nats, as often as three axes of six recordings each give one."""
+    """Return null95 of a diagnostic in nats, from six recordings with three axes at a time."""
     found = findings(0, 108)
     parts = [found[at : at + 18] for at in range(0, 108, 18)]
     each = [null_distributions({axis: part[k::3] for k, axis in enumerate(("gx", "gy", "gz"))}, 3) for part in parts]
@@ -59,28 +60,28 @@ def signs(size: int) -> np.ndarray:
 
 
 def impulse() -> np.ndarray:
-    """An even periodogram, and a little noise so that no bin of the cosine transform is silent."""
+    """Return an impulse, whose periodogram is flat, with a little noise in each bin of the cosine transform."""
     y = white(n, np.random.default_rng(0), 0.1 * N)
     y[1] = SIGMA * n**0.5
     return y
 
 
 def impulses(apart: int) -> np.ndarray:
-    """The same power at each time and frequency."""
+    """Return impulses that have the same power at each time and frequency."""
     y = np.zeros(n)
     y[apart // 2 :: apart] = signs(y[apart // 2 :: apart].size) * apart**0.5
     return y
 
 
 def flat() -> np.ndarray:
-    """White noise whose slow half hardly moves the level."""
+    """Return white noise with reduced power at low frequencies, so that the level hardly changes."""
     coefficients = cosine_transform(white(n, np.random.default_rng(2)))
     coefficients[: n // 2] *= 0.2
     return inverse_cosine_transform(coefficients)
 
 
 def without(column: np.ndarray) -> np.ndarray:
-    """White noise that has nothing of a column, nor of its square, in it."""
+    """Return white noise without the contributions of a column and of its square."""
     stacked = np.stack([np.ones(n), column, column**2], axis=1)
     y = white(n, np.random.default_rng(3))
     return y - stacked @ np.linalg.lstsq(stacked, y, rcond=None)[0]
@@ -98,7 +99,7 @@ EQUAL: dict[str, Callable[[], np.ndarray]] = {
     "variance": lambda: signs(n),
     "spectrogram": lambda: impulses(128),
 }
-"""Data that are what each lens expects: an even spectrum, no correlation, a steady level, Gaussian quantiles, …"""
+"""For each diagnostic, data that are equal to the expectation."""
 
 HIDDEN: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "values": lambda y: 5e-4 * np.rint(y / 5e-4),
@@ -112,36 +113,39 @@ HIDDEN: dict[str, Callable[[np.ndarray], np.ndarray]] = {
     "variance": lambda y: np.where(time_s(n) < 40.0, y, 1.4 * y),
     "spectrogram": lambda y: y + 8e-4 * np.sin(2.0 * np.pi * 17.3 * time_s(n)) * (time_s(n) % 30.0 < 6.0),
 }
-"""What each lens is there to see."""
+"""For each diagnostic, a function that adds the difference that the diagnostic is meant to find."""
 
 
-def test_every_lens_is_here():
+def test_every_diagnostic_is_tested():
     assert set(EQUAL) == set(HIDDEN) == set(DIAGNOSTICS)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_data_that_equal_the_expectation_have_no_gap(name):
-    found = DIAGNOSTICS[name](beside_white(EQUAL[name]()))
+    found = DIAGNOSTICS[name](whitened_by_white_noise(EQUAL[name]()))
     assert 0.0 <= found.gain < 0.2 * null95(name)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_what_it_is_there_for_is_seen(name):
+def test_hidden_difference_is_found(name):
     y = white(n, np.random.default_rng(8))
-    found, before = DIAGNOSTICS[name](beside_white(HIDDEN[name](y))), DIAGNOSTICS[name](beside_white(y))
+    found, before = (
+        DIAGNOSTICS[name](whitened_by_white_noise(HIDDEN[name](y))),
+        DIAGNOSTICS[name](whitened_by_white_noise(y)),
+    )
     assert found.gain > 3.0 * null95(name)
     assert found.gain > before.gain + 10.0
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", NAMES)
-def test_runs_of_one_model_stay_under_their_null(name):
+def test_recordings_of_a_true_model_stay_below_the_null_distribution(name):
     gains = np.array([one[name].gain for one in findings(1000, RUNS)])
     assert np.all(np.isfinite(gains))
     assert np.all(gains >= 0.0)
 
     def beyond(factor: float) -> float:
-        """Of the runs, averaged over nulls."""
+        """Return the number of recordings above a multiple of null95, averaged over the null distributions."""
         return float(np.mean(gains > factor * all_nulls(name)[:, None]) * RUNS)
 
     # of 240 runs 12 are expected: 28 or more once in 10 000
@@ -153,11 +157,11 @@ def test_runs_of_one_model_stay_under_their_null(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_same_data_same_finding_and_nothing_is_changed(name):
+def test_finding_depends_only_on_the_input_and_the_input_is_not_changed(name):
     rng = np.random.default_rng(9)
     y = HIDDEN[name](white(n, rng))
     kept = y.copy()
-    one, other = beside_white(y), beside_white(kept)
+    one, other = whitened_by_white_noise(y), whitened_by_white_noise(kept)
     arrays = {field: getattr(one, field).copy() for field in ("whitened", "weight", "white", "fast")}
     coefficients, samples = one.axis.coefficients.copy(), one.axis.repaired.copy()
     found = DIAGNOSTICS[name](one)
@@ -170,8 +174,8 @@ def test_same_data_same_finding_and_nothing_is_changed(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_place_is_inside_the_recording(name):
-    where = DIAGNOSTICS[name](beside_white(HIDDEN[name](white(n, np.random.default_rng(10))))).where
+def test_location_is_inside_the_recording(name):
+    where = DIAGNOSTICS[name](whitened_by_white_noise(HIDDEN[name](white(n, np.random.default_rng(10))))).where
     limits = {
         "frequency": (-0.05, 0.5 * RATE_HZ + 0.05),
         "tau": (0.0, n / RATE_HZ),
@@ -185,9 +189,9 @@ def test_place_is_inside_the_recording(name):
         assert where.source == "gx"
 
 
-def test_the_place_is_that_of_what_is_hidden():
+def test_location_is_that_of_the_hidden_difference():
     def where(name):
-        return DIAGNOSTICS[name](beside_white(HIDDEN[name](white(n, np.random.default_rng(11))))).where
+        return DIAGNOSTICS[name](whitened_by_white_noise(HIDDEN[name](white(n, np.random.default_rng(11))))).where
 
     lo, hi = where("lines").frequency
     assert lo < 17.3 < hi

@@ -1,1 +1,1 @@
-"""Diagnostics that compare a recording with a model, and the distribution of their results under the model."""
+"""Diagnostics of the difference between an axis and a model, their null distributions, and the plots of the report."""

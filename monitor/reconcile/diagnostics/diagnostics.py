@@ -164,10 +164,10 @@ def diagnose_level(seen: WhitenedAxis) -> Finding:
     found = [Finding(float(gains[at]), Location(time=(float(times_s[at]), float(times_s[at]))))]
     for fraction in TRANSIENT_TIME_FRACTIONS:
         effect = TurnOnTransient(amplitude=1.0, time_constant=float(fraction * axis.length_s))
-        found.append(Finding(regressor_gain(seen, axis.columns(effect)), Location(time=(0.0, effect.time_constant))))
+        found.append(Finding(_regressor_gain(seen, axis.columns(effect)), Location(time=(0.0, effect.time_constant))))
     ramp = axis.columns(RateRamp(R=1.0))
-    curved = regressor_gain(seen, [*ramp, axis.regressors.curvature]) - CURVE_PENALTY_NATS
-    found.append(Finding(max(regressor_gain(seen, ramp), curved), Location(time=(0.0, axis.length_s))))
+    curved = _regressor_gain(seen, [*ramp, axis.regressors.curvature]) - CURVE_PENALTY_NATS
+    found.append(Finding(max(_regressor_gain(seen, ramp), curved), Location(time=(0.0, axis.length_s))))
     return max(found, key=lambda one: one.gain)
 
 
@@ -198,16 +198,8 @@ def step_gains(seen: WhitenedAxis) -> tuple[Floats, Floats]:
     return gains, np.arange(n)[inside] / axis.rate_hz
 
 
-def regressor_gain(seen: WhitenedAxis, columns: list[Floats]) -> float:
-    """Return the log-likelihood gain in nats of regressors with free sizes.
-
-    Parameters
-    ----------
-    seen : WhitenedAxis
-        Whitened axis.
-    columns : list of ndarray of float64, shape (n − 1,)
-        Transforms of the regressors.
-    """
+def _regressor_gain(seen: WhitenedAxis, columns: list[Floats]) -> float:
+    """Return the log-likelihood gain in nats of regressors, each of shape (n − 1,), with free sizes."""
     stacked = np.stack([column * seen.weight for column in columns])
     normal, right = stacked @ stacked.T, stacked @ seen.whitened
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -239,7 +231,7 @@ def diagnose_temperature(seen: WhitenedAxis) -> Finding:
     reference = float(temperature_c.mean())
 
     def gain(effect: TemperatureBias | TemperatureLag) -> float:
-        return regressor_gain(seen, seen.axis.columns(effect))
+        return _regressor_gain(seen, seen.axis.columns(effect))
 
     gains = [
         gain(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0)) - CURVE_PENALTY_NATS,
@@ -253,7 +245,7 @@ def diagnose_other_axes(seen: WhitenedAxis) -> Finding:
     """Find the axis that leaks most strongly into this axis."""
     best = NO_FINDING
     for name, coefficients in seen.axis.others.items():
-        gain = regressor_gain(seen, [coefficients])
+        gain = _regressor_gain(seen, [coefficients])
         if gain > best.gain:
             best = Finding(gain, Location(source=name))
     return best
@@ -262,7 +254,7 @@ def diagnose_other_axes(seen: WhitenedAxis) -> Finding:
 def diagnose_variance(seen: WhitenedAxis) -> Finding:
     """Find a variation of the noise variance in time: a step, a trend, a period or a slow random variation."""
     found = seen.variance_history
-    gain = max(found.step.gain, found.trend, found.periodic.gain, found.wander)
+    gain = max(found.step.gain, found.trend, found.periodic, found.wander)
     return Finding(gain, Location(time=(found.step.time.lo, found.step.time.hi)))
 
 

@@ -9,7 +9,7 @@ temperature.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import Final, TypeGuard
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -102,6 +102,15 @@ class RegressorCache:
         return self._make(with_factors(effect, np.ones(2)))
 
 
+class NoiseVariances(NamedTuple):
+    """Variances of the coefficients of each bin due to noise effects."""
+
+    free: list[int]  # index of each fitted noise effect
+    bases: list[Floats]  # [m] variance of each fitted noise effect with size one
+    start: list[float]  # starting value of θ for each fitted noise effect
+    constant: Floats  # [m] variance that is not fitted
+
+
 @dataclass(slots=True, eq=False)
 class Axis:
     """Samples, transforms and bins of one axis of one recording."""
@@ -181,43 +190,49 @@ class Axis:
         AxisFit
             Effects with fitted sizes and the log-likelihood.
         """
-        transforms = self._spectral_transforms(effects)
+        transforms = _spectral_transforms(effects, self.shown)
         floor = floor and any(isinstance(one, BandwidthLimit) for one in transforms)
-        constant = _density_after(transforms, None, self.bins) / (1.0 / self.rate_hz)
-        free, bases, start = [], [], []
-        for at, effect in enumerate(effects):
-            if type(effect) not in NOISE_SIZE_PARAMETERS:
-                continue
-            basis = self._variance_basis(effect, effects, transforms)
-            if at in held:
-                constant = constant + size(effect) ** 2 * basis
-            else:
-                free.append(at)
-                bases.append(basis)
-                start.append(min(size(effect) ** 2, self._full_power_theta(basis)))
-        unnamed = [(np.ones_like(constant), INITIAL_FLOOR_RATIO)] if floor else []
+        noise = self._noise_variances(effects, held, transforms)
+        unnamed = [(np.ones_like(noise.constant), INITIAL_FLOOR_RATIO)] if floor else []
         unnamed += [(row, INITIAL_EXTRA_RATIO) for row in (extra if extra is not None else ())]
-        for basis, ratio in unnamed:
-            bases.append(basis)
-            start.append(ratio * self._full_power_theta(basis))
+        bases = [*noise.bases, *(basis for basis, _ in unnamed)]
+        start = [*noise.start, *(ratio * self._full_power_theta(basis) for basis, ratio in unnamed)]
         slices, columns = self._regressors_of(effects)
         fitted = maximise_whittle(
             self.bins.count * self.used_bins,
             self.binned_sums([*columns, CURVATURE] if curved else columns),
             np.asarray(bases).reshape(len(bases), self.bins.count.size),
-            constant,
+            noise.constant,
             np.asarray(start, np.float64),
         )
         return AxisFit(
             self,
-            _with_fitted_sizes(effects, free, slices, fitted),
+            _with_fitted_sizes(effects, noise.free, slices, fitted),
             held,
             fitted.log_likelihood,
             fitted,
-            tuple(free),
+            tuple(noise.free),
             slices,
-            float(fitted.theta[len(free)]) if floor else 0.0,
+            float(fitted.theta[len(noise.free)]) if floor else 0.0,
         )
+
+    def _noise_variances(
+        self, effects: Sequence[Effect], held: frozenset[int], transforms: Sequence[Transform]
+    ) -> NoiseVariances:
+        """Return the variance bases of the fitted noise effects, and the variance of all other noise."""
+        constant = _density_after(transforms, None, self.bins) / (1.0 / self.rate_hz)
+        found = NoiseVariances([], [], [], constant)
+        for at, effect in enumerate(effects):
+            if type(effect) not in NOISE_SIZE_PARAMETERS:
+                continue
+            basis = self._variance_basis(effect, effects, transforms)
+            if at in held:
+                constant += size(effect) ** 2 * basis
+            else:
+                found.free.append(at)
+                found.bases.append(basis)
+                found.start.append(min(size(effect) ** 2, self._full_power_theta(basis)))
+        return found
 
     def binned_sums(self, columns: Sequence[Regressor]) -> BinSums:
         """Return the sums over bins of the products of the axis and regressors."""
@@ -239,15 +254,6 @@ class Axis:
                 slices.append((at, slice(len(columns), len(columns) + count)))
                 columns += [(effect, i) for i in range(count)]
         return tuple(slices), columns
-
-    def _spectral_transforms(self, effects: Sequence[Effect]) -> list[Transform]:
-        """Return the transforms that change the spectrum, in the order in which they act."""
-        return sorted((e for e in effects if self._changes_spectrum(e)), key=lambda e: TRANSFORM_ORDER.index(type(e)))
-
-    def _changes_spectrum(self, effect: Effect) -> TypeGuard[Transform]:
-        """Return True for a transform that changes the spectrum. Repeats at known positions have been replaced."""
-        replaced = isinstance(effect, SampleHold) and self.shown.repeats is not None and self.shown.repeats.mask.any()
-        return isinstance(effect, Transform) and not replaced
 
     def _variance_basis(self, effect: Effect, effects: Sequence[Effect], transforms: Sequence[Transform]) -> Floats:
         """Return the variance, shape (m,), of the coefficients of each bin for a noise effect with size one."""
@@ -325,6 +331,20 @@ class AxisFit:
             for factor, column in zip(self.fitted.beta[place], self.axis.columns(self.effects[at]), strict=True):
                 left -= factor * column
         return left
+
+
+def _spectral_transforms(effects: Sequence[Effect], shown: ValueStatistics) -> list[Transform]:
+    """Return the transforms that change the spectrum, in the order in which they act.
+
+    Repeated samples at known positions have been replaced and do not change the spectrum.
+    """
+    replaced = shown.repeats is not None and bool(shown.repeats.mask.any())
+    found = [
+        effect
+        for effect in effects
+        if isinstance(effect, Transform) and not (replaced and isinstance(effect, SampleHold))
+    ]
+    return sorted(found, key=lambda effect: TRANSFORM_ORDER.index(type(effect)))
 
 
 def _with_fitted_sizes(

@@ -1,10 +1,10 @@
 """Role of each effect in the likelihood of an axis: noise variance, regressor or transform.
 
-Each effect has one **size** that scales it, and **shape parameters** that do not. The variance of a
-``NOISE_SIZE_PARAMETERS`` effect is proportional to the square of its size. Its basis is its spectrum with size one. A
-``DETERMINISTIC_SIZE_PARAMETERS`` effect is a deterministic series times its size. Its regressor is the series with size
-one that the simulation also uses, so that fit and simulation agree. A ``Leak`` is a deterministic effect whose series
-is another axis. A transform changes the bases of all effects before it.
+The **size** of an effect is the parameter that scales the effect. All other parameters are **shape parameters**. The
+variance of a noise effect is proportional to the square of the size, and the spectrum with size one is the variance
+basis. A deterministic effect is a fixed series times the size. The regressor of a deterministic effect is the series
+with size one. The simulation uses the same series, so fit and simulation agree. A ``Leak`` is a deterministic effect
+whose series is another axis. A transform changes the variance bases of all effects before the transform.
 """
 
 from dataclasses import replace
@@ -44,7 +44,7 @@ NOISE_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
     RandomTelegraph: "amplitude",
     PoissonSteps: "height",
 }
-"""For each noise effect, the parameter that is its size."""
+"""For each noise effect, the name of the size parameter."""
 
 DETERMINISTIC_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
     RateRamp: "R",
@@ -56,10 +56,10 @@ DETERMINISTIC_SIZE_PARAMETERS: Final[dict[type[Effect], str]] = {
     GSensitivity: "coefficient",
     CrossAxis: "coefficient",
 }
-"""For each deterministic effect, the parameter that is its size."""
+"""For each deterministic effect, the name of the size parameter."""
 
 SIZE_PARAMETERS: Final = NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS
-"""For each effect with a size, the parameter that is its size."""
+"""For each effect with a size, the name of the size parameter."""
 
 ONE_TIME_EFFECTS: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
 """Names of the effects that happen once. One part of a recording contains no information about another part."""
@@ -87,7 +87,7 @@ NATURAL_DIAGNOSTIC: Final[dict[str, str]] = {
     "saturation": "values",
     "sample_hold": "values",
 }
-"""For each effect, the diagnostic that shows it most directly. It is used if it passes its threshold."""
+"""For each effect, the diagnostic that shows the effect most directly."""
 
 
 def size(effect: Effect) -> float:
@@ -194,7 +194,7 @@ def with_factors(effect: Effect, factors: Floats) -> Effect:
 def _series_of(effect: Source, n: int, rate_hz: float, temperature_c: Floats | None) -> Floats:
     """Return the series of a deterministic effect."""
     values = np.zeros(n)
-    warmth = np.full(n, np.nan) if temperature_c is None else temperature_c
+    known_c = np.full(n, np.nan) if temperature_c is None else temperature_c
     # a deterministic effect draws no random numbers, but the interface requires a generator
-    effect.start(rate_hz, np.random.default_rng(0)).add(values, SampleBlockContext(0, warmth, np.empty(n)))
+    effect.start(rate_hz, np.random.default_rng(0)).add(values, SampleBlockContext(0, known_c, np.empty(n)))
     return values

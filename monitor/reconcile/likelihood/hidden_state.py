@@ -2,11 +2,11 @@
 
 A random telegraph has the same second moments as exponentially correlated noise. Poisson steps have the same second
 moments as a random walk. Only the distributions differ. Both effects of a pair therefore get their full likelihood on
-the same data with the same additional noise. The result is a ``ModelComparison``. Its gain is the logarithm of the
+the same data with the same background noise. The result is a ``ModelComparison``. Its gain is the logarithm of the
 ratio of the two likelihoods, each at its maximum. The caller subtracts penalties for parameters and prior odds.
 
-The data are block means. The additional noise is a ``BackgroundNoise``: white, random walk, flicker and exponentially
-correlated noise. It is written as a sum of independent first-order processes whose block means are known given their
+The data are block means. The background noise consists of white noise, random walk, flicker noise and exponentially
+correlated noise. It is written as a sum of independent first-order processes whose block means are known given the
 value at the start of the block. Each block thus needs one step of a Kalman filter, and averaging adds no error. The
 first level has a nearly flat prior, the same for both effects.
 """
@@ -20,7 +20,6 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.common.distributions import Z95
 from monitor.reconcile.result import ParameterInterval
 
 MAX_BLOCKS: Final = 1 << 15
@@ -30,12 +29,12 @@ TARGET_BLOCKS: Final = 200.0
 MIN_BLOCKS: Final = 16
 """Smallest number of blocks."""
 INITIAL_VARIANCE_RATIO: Final = 100.0
-"""Prior variance of the first level relative to the variance of the data. It is effectively infinite and the same for
-both effects.
+"""Prior variance of the first level relative to the variance of the data. This prior is effectively flat. Both effects
+have the same prior.
 """
 FLICKER_TIME_RATIO: Final = 10.0
-"""Ratio of successive correlation times of the processes that approximate flicker noise. Their sum deviates by 5 % from
-1/f.
+"""Ratio of successive correlation times of the processes that approximate flicker noise. With this ratio, the spectrum
+deviates by 5 % from 1/f.
 """
 FLICKER_CUTOFF_RATIO: Final = 20.0
 """Highest frequency at which flicker noise is modelled, relative to the frequency at which it equals the white noise.
@@ -50,12 +49,12 @@ MAX_LOG_PARAMETER_RANGE: Final = log(30.0)
 
 @dataclass(frozen=True, slots=True)
 class ModelComparison:
-    """Comparison of two effects that have the same spectrum on one axis."""
+    """Comparison of a process of random events with an effect that has the same spectrum, on one axis."""
 
-    gain: float  # log-likelihood of the first minus that of the second
-    first: Mapping[str, ParameterInterval]  # parameters at the maximum, SI, 95 %
-    second: Mapping[str, ParameterInterval]
-    events: int  # switches or jumps expected, given the data and the first explanation
+    gain: float  # log-likelihood of the process minus that of the other effect
+    parameters: Mapping[str, ParameterInterval]  # of the process at the maximum, SI, 95 %
+    events: int  # expected number of switches or jumps, given the data and the process
+    single_steps: int = 0  # number of steps, if the process was compared with single steps
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,42 +70,33 @@ class BackgroundNoise:
 class StateSpaceNoise(NamedTuple):
     """Noise of block means as a sum of independent first-order processes and of white noise.
 
-    From the start of one block to the start of the next, x ← decay·x + w. The mean of the block is seen·x + v, with Var
-    w = drive and Cov(v, w) = shared. The first process is the level, including the random walk.
+    From the start of one block to the start of the next, a process changes by x ← decay·x + w. The mean of the block
+    contains seen·x + v, with Var w = drive and Cov(v, w) = shared. The first process is the level, including the random
+    walk.
     """
 
     table: Floats  # [d, 4] decay, seen, drive, shared
     white: float  # variance of the white noise and of all v
 
 
-class LikelihoodMaximum(NamedTuple):
-    """Maximum of a log-likelihood over the logarithms of its parameters."""
-
-    height: float  # log-likelihood at the maximum
-    at: Floats  # [k] parameters
-    deviation: Floats  # [k] standard deviations of their logarithms; NaN if there is no maximum
-
-    def bounds(self, k: int) -> ParameterInterval:
-        """Return parameter ``k`` with its 95 % interval, or without an interval if it is wider than the search."""
-        value, wide = float(self.at[k]), Z95 * float(self.deviation[k])
-        return (
-            ParameterInterval(value, value * exp(-wide), value * exp(wide))
-            if wide < MAX_LOG_PARAMETER_RANGE
-            else ParameterInterval(value)
-        )
-
-
 class EventProcessFit(NamedTuple):
-    """Fit of a process of random events at the maximum of its likelihood."""
+    """Fit of a process of random events at the maximum of the likelihood."""
 
-    peak: LikelihoodMaximum
-    names: tuple[str, str]
+    log_likelihood: float
+    parameters: dict[str, ParameterInterval]
     events: float  # expected number of events, given the data
 
-    @property
-    def parameters(self) -> dict[str, ParameterInterval]:
-        """Parameters with their intervals, by name."""
-        return {name: self.peak.bounds(k) for k, name in enumerate(self.names)}
+    def compare(self, log_likelihood: float, single_steps: int = 0) -> ModelComparison:
+        """Compare the process with another effect.
+
+        Parameters
+        ----------
+        log_likelihood : float
+            Log-likelihood of the other effect on the same data.
+        single_steps : int, optional
+            Number of steps, if the other effect is a number of single steps.
+        """
+        return ModelComparison(self.log_likelihood - log_likelihood, self.parameters, round(self.events), single_steps)
 
 
 def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float]:
@@ -151,7 +141,7 @@ def state_space_noise(rest: BackgroundNoise, block_s: float, span_s: float) -> S
 
     Parameters
     ----------
-    rest : Rest
+    rest : BackgroundNoise
         Noise of the axis.
     block_s : float
         Length of a block in seconds.
@@ -161,13 +151,13 @@ def state_space_noise(rest: BackgroundNoise, block_s: float, span_s: float) -> S
     Raises
     ------
     ValueError
-        If there is no white noise. Every single switch is then visible and no likelihood is needed.
+        If there is no white noise. Every single switch would then be visible without a likelihood.
     """
     if not rest.white > 0.0:
         raise ValueError(f"white noise of {rest.white:g}; it must be above zero")
     walk = rest.walk * block_s
     rows, white = [(1.0, 1.0, walk, 0.5 * walk)], rest.white / block_s + walk / 3.0
-    for sigma, time_s in (*rest.correlated, *flicker_processes(rest, block_s, span_s)):
+    for sigma, time_s in (*rest.correlated, *_flicker_processes(rest, block_s, span_s)):
         row, own = block_markov_noise(sigma, time_s, block_s)
         rows.append(row)
         white += own
@@ -203,26 +193,12 @@ def block_markov_noise(sigma: float, time_s: float, block_s: float) -> tuple[tup
     return (decay, seen, -(sigma**2) * float(np.expm1(-2.0 * x)), sigma**2 * seen * (1.0 - decay)), sigma**2 * own
 
 
-def flicker_processes(rest: BackgroundNoise, block_s: float, span_s: float) -> list[tuple[float, float]]:
-    """Return exponentially correlated noises whose sum is flicker noise.
+def _flicker_processes(rest: BackgroundNoise, block_s: float, span_s: float) -> list[tuple[float, float]]:
+    """Return the standard deviations and correlation times of correlated noises whose sum is flicker noise.
 
     The sum is B²/(2πf) from 1/span to the frequency at which white noise dominates. Processes with equal variance s and
     with a constant spacing ln ρ of ln T_c add up to πs/(ln ρ 2πf) (Keshner, "1/f noise", Proc. IEEE 70, 1982).
     Therefore s = B² ln ρ/π.
-
-    Parameters
-    ----------
-    rest : Rest
-        Noise of the axis.
-    block_s : float
-        Length of a block in seconds.
-    span_s : float
-        Length of the recording in seconds.
-
-    Returns
-    -------
-    list of tuple of float
-        Standard deviation, in the unit of the axis, and correlation time in seconds of each process.
     """
     if rest.flicker <= 0.0:
         return []
@@ -234,7 +210,7 @@ def flicker_processes(rest: BackgroundNoise, block_s: float, span_s: float) -> l
     return [(sigma, slowest * exp(-k * spacing)) for k in range(count)]
 
 
-def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> LikelihoodMaximum:
+def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> tuple[float, Floats]:
     """Maximise a log-likelihood over positive parameters, by the Nelder-Mead method in their logarithms.
 
     Parameters
@@ -243,6 +219,13 @@ def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> Li
         Function of the parameters.
     start : sequence of float
         Starting values of the parameters.
+
+    Returns
+    -------
+    log_likelihood : float
+        Log-likelihood at the maximum.
+    log_parameters : ndarray of float64, shape (k,)
+        Logarithms of the parameters at the maximum.
     """
     from scipy.optimize import minimize
 
@@ -252,13 +235,14 @@ def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> Li
         origin,
         method="Nelder-Mead",
         bounds=[(x - MAX_LOG_PARAMETER_RANGE, x + MAX_LOG_PARAMETER_RANGE) for x in origin],
-        options={"initial_simplex": _simplex(origin), "xatol": 0.02, "fatol": 0.02, "maxiter": 80},
+        options={
+            "initial_simplex": np.vstack([origin, origin + 0.3 * np.eye(origin.size)]),
+            "xatol": 0.02,
+            "fatol": 0.02,
+            "maxiter": 80,
+        },
     )
-    curvature = _curvature(lambda at: log_likelihood(*np.exp(at)), found.x, -float(found.fun))
-    deviation = np.full(origin.size, np.nan)
-    if (np.linalg.eigvalsh(curvature) < 0.0).all():
-        deviation = np.sqrt(np.diag(np.linalg.inv(-curvature)))
-    return LikelihoodMaximum(-float(found.fun), np.exp(found.x), deviation)
+    return -float(found.fun), np.asarray(found.x)
 
 
 def fit_process(likelihood: Callable[[float, float, float], float], start: Mapping[str, float]) -> EventProcessFit:
@@ -274,16 +258,31 @@ def fit_process(likelihood: Callable[[float, float, float], float], start: Mappi
     start : mapping of str to float
         Names and starting values of the two parameters.
     """
-    first, second = start
-    peak = maximise(lambda a, b: likelihood(a, b, 1.0), (start[first], start[second]))
-    a, b = peak.at.tolist()
-    events = (likelihood(a, b, 1.0 + ODDS_STEP) - peak.height) / ODDS_STEP
-    return EventProcessFit(peak, (first, second), events)
+    height, at = maximise(lambda a, b: likelihood(a, b, 1.0), list(start.values()))
+    deviations = _log_deviations(lambda x: likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, height)
+    first, second = np.exp(at).tolist()
+    events = (likelihood(first, second, 1.0 + ODDS_STEP) - height) / ODDS_STEP
+    bounds = [_log_interval(*one) for one in zip((first, second), deviations.tolist(), strict=True)]
+    return EventProcessFit(height, dict(zip(start, bounds, strict=True)), events)
 
 
-def _simplex(origin: Floats) -> Floats:
-    """Return the initial simplex."""
-    return np.vstack([origin, origin + 0.3 * np.eye(origin.size)])
+def _log_interval(value: float, deviation: float) -> ParameterInterval:
+    """Return a parameter with its 95 % interval, or without an interval if this is wider than the search.
+
+    ``deviation`` is the standard deviation of the logarithm.
+    """
+    wide = INTERVAL_SIGMAS * deviation
+    if not wide < MAX_LOG_PARAMETER_RANGE:
+        return ParameterInterval(value)
+    return ParameterInterval(value, value * exp(-wide), value * exp(wide))
+
+
+def _log_deviations(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
+    """Return the standard deviations of the logarithms of the parameters, or NaN if there is no maximum."""
+    curvature = _curvature(function, at, height)
+    if (np.linalg.eigvalsh(curvature) < 0.0).all():
+        return np.asarray(np.sqrt(np.diag(np.linalg.inv(-curvature))))
+    return np.full(at.size, np.nan)
 
 
 def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
@@ -305,10 +304,12 @@ def prior_level_variance(means: Floats) -> float:
 
 
 @compiled
-def initial_covariance(table, start):  # type: ignore[no-untyped-def]
-    """Return the state covariance, shape (d, d), before the first block: a wide prior for the level, stationary for the
-    others.
+def initial_covariance(noise: StateSpaceNoise, start: float) -> Floats:
+    """Return the state covariance, shape (d, d), before the first block.
+
+    The level has a wide prior with the variance ``start``. The other processes are stationary.
     """
+    table = noise.table
     d = table.shape[0]
     covariance = np.zeros((d, d))
     covariance[0, 0] = start
@@ -318,8 +319,9 @@ def initial_covariance(table, start):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def predict_block(table, covariance, reach):  # type: ignore[no-untyped-def]
-    """Return the variance of a block mean without its v. Store its covariance with the next state in ``reach`` [d]."""
+def predict_block(noise: StateSpaceNoise, covariance: Floats, reach: Floats) -> float:
+    """Return the variance of a block mean, and store its covariance with the next state in ``reach`` [d]."""
+    table = noise.table
     d = table.shape[0]
     variance = 0.0
     for i in range(d):
@@ -328,28 +330,60 @@ def predict_block(table, covariance, reach):  # type: ignore[no-untyped-def]
             total += covariance[i, j] * table[j, 1]
         variance += table[i, 1] * total
         reach[i] = table[i, 0] * total + table[i, 3]
-    return variance
+    return variance + noise.white
 
 
 @compiled
-def kalman_log_likelihood(means, table, white, start):  # type: ignore[no-untyped-def]
+def innovation_of(z: float, noise: StateSpaceNoise, at: Floats) -> float:
+    """Return the difference of a block mean from the prediction by the state ``at`` [d]."""
+    innovation = z
+    for i in range(noise.table.shape[0]):
+        innovation -= noise.table[i, 1] * at[i]
+    return innovation
+
+
+@compiled
+def innovation_variances(free: Floats, noise: StateSpaceNoise, start: float) -> tuple[Floats, Floats]:
+    """Return the variances of the innovations, shape (m,), and their covariances with the next state, shape (m, d).
+
+    ``free`` [m] is additional variance of the level at the start of each block.
+    """
+    table = noise.table
+    d, m = table.shape[0], free.size
+    variances, reaches, covariance = np.empty(m), np.empty((m, d)), initial_covariance(noise, start)
+    for k in range(m):
+        covariance[0, 0] += free[k]
+        variances[k] = predict_block(noise, covariance, reaches[k])
+        for i in range(d):
+            for j in range(d):
+                covariance[i, j] *= table[i, 0] * table[j, 0]
+                covariance[i, j] -= reaches[k, i] * reaches[k, j] / variances[k]
+            covariance[i, i] += table[i, 2]
+    return variances, reaches
+
+
+@compiled
+def innovations_of(series: Floats, noise: StateSpaceNoise, variances: Floats, reaches: Floats) -> Floats:
+    """Return the innovations of a series, shape (m,): the differences from the predictions of the Kalman filter."""
+    table = noise.table
+    d = table.shape[0]
+    at, innovations = np.zeros(d), np.empty(series.size)
+    for k in range(series.size):
+        innovations[k] = innovation_of(series[k], noise, at)
+        for i in range(d):
+            at[i] = table[i, 0] * at[i] + reaches[k, i] * innovations[k] / variances[k]
+    return innovations
+
+
+@compiled
+def kalman_log_likelihood(means: Floats, noise: StateSpaceNoise, start: float) -> float:
     """Return the log-likelihood of Gaussian noise in block means.
 
     The Kalman filter follows Anderson & Moore, "Optimal Filtering", 1979, sections 5.5 and 10.4.
     """
-    d = table.shape[0]
-    covariance, at, reach = initial_covariance(table, start), np.zeros(d), np.empty(d)
+    variances, reaches = innovation_variances(np.zeros(means.size), noise, start)
+    innovations = innovations_of(means, noise, variances, reaches)
     total = 0.0
-    for z in means:
-        variance = predict_block(table, covariance, reach) + white
-        innovation = z
-        for i in range(d):
-            innovation -= table[i, 1] * at[i]
-        total -= 0.5 * (np.log(2.0 * np.pi * variance) + innovation * innovation / variance)
-        for i in range(d):
-            at[i] = table[i, 0] * at[i] + reach[i] * innovation / variance
-            for j in range(d):
-                covariance[i, j] *= table[i, 0] * table[j, 0]
-                covariance[i, j] -= reach[i] * reach[j] / variance
-            covariance[i, i] += table[i, 2]
+    for k in range(means.size):
+        total -= 0.5 * (np.log(2.0 * np.pi * variances[k]) + innovations[k] * innovations[k] / variances[k])
     return total

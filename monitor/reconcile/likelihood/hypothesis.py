@@ -146,24 +146,12 @@ def refine_shape(axis: Axis, effects: Effects, index: int, names: Sequence[str],
             width = log(reach) / (turn + 1)
             middle = log(getattr(found[index], name))
             best = _golden_section(axis, found, index, name, middle - width, middle + width)
-            found = with_shape(found, index, name, exp(best))
+            found = _with_shape(found, index, name, exp(best))
     return found
 
 
-def with_shape(effects: Effects, index: int, name: str, value: float) -> Effects:
-    """Return the effects with another value of one parameter of one effect.
-
-    Parameters
-    ----------
-    effects : tuple of Effect
-        Effects of the axis.
-    index : int
-        Index of the effect to change. A negative index counts from the end.
-    name : str
-        Name of the parameter.
-    value : float
-        New value, in the unit of the parameter.
-    """
+def _with_shape(effects: Effects, index: int, name: str, value: float) -> Effects:
+    """Return the effects with another value of one parameter of the effect with the given index."""
     index %= len(effects)
     changed: Any = replace(effects[index], **{name: value})  # type: ignore[type-var]
     return (*effects[:index], changed, *effects[index + 1 :])
@@ -194,7 +182,7 @@ def _golden_section(axis: Axis, effects: Effects, index: int, name: str, lo: flo
     """
 
     def value(x: float) -> float:
-        return axis.fit(with_shape(effects, index, name, exp(x))).log_likelihood
+        return axis.fit(_with_shape(effects, index, name, exp(x))).log_likelihood
 
     a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
     at_a, at_b = value(a), value(b)
@@ -247,7 +235,7 @@ def shape_bounds(fit: AxisFit, index: int, name: str) -> ParameterInterval:
     value = float(getattr(fit.effects[index], name))
 
     def fall(factor: float) -> float:
-        changed = with_shape(fit.effects, index, name, value * factor)
+        changed = _with_shape(fit.effects, index, name, value * factor)
         return fit.log_likelihood - fit.axis.fit(changed, fit.held).log_likelihood
 
     ends = []

@@ -124,7 +124,7 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
 
 
 @compiled
-def _bin_magnitudes(w, unit):  # type: ignore[no-untyped-def]
+def _bin_magnitudes(w: Floats, unit: float) -> tuple[Floats, Floats]:
     """Return the counts of |w|/unit in the bins and their sums of squares."""
     counts, squares = np.zeros(TOTAL_BINS), np.zeros(TOTAL_BINS)
     for k in range(w.size):
@@ -141,7 +141,7 @@ def _bin_magnitudes(w, unit):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _fit_mixture(counts, squares, start_widths):  # type: ignore[no-untyped-def]
+def _fit_mixture(counts: Floats, squares: Floats, start_widths: Floats) -> tuple[float, float, float, float]:
     """Return variances, share and log-likelihood of the best mixture.
 
     EM runs for a few steps from every start, and then until convergence from the best result.
@@ -165,7 +165,9 @@ def _fit_mixture(counts, squares, start_widths):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _em_step(counts, squares, total, narrow, wide, share, held):  # type: ignore[no-untyped-def]
+def _em_step(
+    counts: Floats, squares: Floats, total: float, narrow: float, wide: float, share: float, held: bool
+) -> tuple[float, float, float, float]:
     """Perform one EM step and return the log-likelihood before it.
 
     If ``held`` is True, the wide variance stays fixed.

@@ -10,7 +10,7 @@ worse. The size of the gain indicates jumps, not its sign.
 
 from dataclasses import replace
 from math import exp, expm1
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -25,6 +25,7 @@ from monitor.reconcile.likelihood.hidden_state import (
     block_means,
     fit_process,
     initial_covariance,
+    innovation_of,
     kalman_log_likelihood,
     maximise,
     predict_block,
@@ -35,10 +36,10 @@ from monitor.reconcile.likelihood.hidden_state import (
 BLOCKS_PER_CROSSING_TIME: Final = 3.0
 """Number of blocks in N/K, the time at which white noise and random walk are equal."""
 JUMP_AGES: Final = 16
-"""Number of hypotheses: a jump in the newest block, in the block before, and so on. The last one holds all older jumps.
+"""Number of hypotheses about the block of the last jump. The last hypothesis holds all older jumps.
 
-Together they cover five times N/K. If they cover 1.3 times N/K, the rate is 15 to 25 % too low; with 2.7 times N/K it
-is 5 to 10 % too low.
+Together, the hypotheses cover five times N/K. If they cover 1.3 times N/K, the estimated rate is 15 to 25 % too low. If
+they cover 2.7 times N/K, the estimated rate is 5 to 10 % too low.
 """
 MIN_HYPOTHESIS_PROBABILITY: Final = 1e-6
 """Probability below which a hypothesis is dropped."""
@@ -57,47 +58,39 @@ def compare_steps_with_random_walk(y: Floats, tau0_s: float, rest: BackgroundNoi
         Series in the unit of the axis, without gaps.
     tau0_s : float
         Sample period in seconds.
-    rest : Rest
-        Additional noise of the axis. A random walk in it is present in both alternatives.
+    rest : BackgroundNoise
+        Additional noise of the axis. Both alternatives contain a random walk that is part of this noise.
     K : float
         Starting value of the random walk coefficient, in unit/√s, above zero.
 
     Returns
     -------
     ModelComparison
-        ``rate`` and ``height`` of the Poisson steps (first), ``K`` of the random walk (second), and the number of
-        jumps.
+        Gain, ``rate`` and ``height`` of the Poisson steps, and the number of jumps.
 
     Raises
     ------
     ValueError
         If there are too few samples or no white noise.
     """
-    means, block_s = block_means(y, tau0_s, block_for(y.size * tau0_s, rest, K))
+    means, block_s = block_means(y, tau0_s, block_length_s(y.size * tau0_s, rest, K))
     start, span_s = prior_level_variance(means), means.size * block_s
 
     def walk(K: float) -> float:
         noise = state_space_noise(replace(rest, walk=rest.walk + K * K), block_s, span_s)
-        return float(kalman_log_likelihood(means, noise.table, noise.white, start))
+        return float(kalman_log_likelihood(means, noise, start))
 
-    first = fit_jumps(means, block_s, rest, K)
-    second = maximise(walk, (K,))
-    return ModelComparison(
-        first.peak.height - second.height,
-        first.parameters,
-        {"K": second.bounds(0)},
-        round(first.events),
-    )
+    return fit_jumps(means, block_s, rest, K).compare(maximise(walk, (K,))[0])
 
 
-def block_for(span_s: float, rest: BackgroundNoise, K: float) -> float:
+def block_length_s(span_s: float, rest: BackgroundNoise, K: float) -> float:
     """Return the length of a block in seconds.
 
     Parameters
     ----------
     span_s : float
         Length of the recording in seconds.
-    rest : Rest
+    rest : BackgroundNoise
         Additional noise of the axis.
     K : float
         Random walk coefficient in unit/√s.
@@ -117,7 +110,7 @@ def fit_jumps(means: Floats, block_s: float, rest: BackgroundNoise, K: float) ->
         Block means in the unit of the axis.
     block_s : float
         Length of a block in seconds.
-    rest : Rest
+    rest : BackgroundNoise
         Additional noise of the axis.
     K : float
         Random walk coefficient in unit/√s.
@@ -126,113 +119,137 @@ def fit_jumps(means: Floats, block_s: float, rest: BackgroundNoise, K: float) ->
     noise = state_space_noise(rest, block_s, span_s)
 
     def poisson(rate: float, height: float, odds: float = 1.0) -> float:
-        return log_likelihood(means, noise, start, rate * block_s, height, odds)
+        return _log_likelihood(means, noise, start, rate * block_s, height, odds)
 
     rates = np.geomspace(2.0 / span_s, max(MAX_START_JUMPS * K / rest.white**0.5, 4.0 / span_s), START_RATES)
     rate = max(rates, key=lambda rate: poisson(rate, K / rate**0.5))
     return fit_process(poisson, {"rate": rate, "height": K / rate**0.5})
 
 
-def log_likelihood(
+def _log_likelihood(
     means: Floats, noise: StateSpaceNoise, start: float, jumps: float, height: float, odds: float = 1.0
 ) -> float:
-    """Return the log-likelihood of Poisson steps in block means.
+    """Return the log-likelihood of Poisson steps in block means with an expected number of jumps in a block.
 
-    Parameters
-    ----------
-    means : ndarray of float64, shape (m,)
-        Block means in the unit of the axis.
-    noise : StateSpaceNoise
-        Additional noise.
-    start : float
-        Prior variance of the first level, in the squared unit of the axis.
-    jumps : float
-        Expected number of jumps in a block, λΔ.
-    height : float
-        Standard deviation of a jump, in the unit of the axis.
-    odds : float, optional
-        Factor on the probability of each jump.
+    ``odds`` is a factor on the probability of each jump.
     """
     some = -expm1(-jumps)
     variance = jumps / some * height**2  # variance of the sum of all jumps in a block with at least one jump
-    return float(
-        jump_log_likelihood(means, noise.table, noise.white, start, JUMP_AGES, exp(-jumps), odds * some, variance)
-    )
+    return float(_jump_log_likelihood(means, noise, start, JumpProbabilities(exp(-jumps), odds * some, variance)))
+
+
+class JumpProbabilities(NamedTuple):
+    """Probabilities of jumps in a block."""
+
+    none: float  # probability of no jump
+    some: float  # probability of at least one jump
+    variance: float  # variance of the sum of all jumps in a block with at least one jump
+
+
+class GaussianMixture(NamedTuple):
+    """Mixture of Gaussian distributions of the state of the background noise."""
+
+    weight: Floats  # [k] probability of each component, or its logarithm
+    mean: Floats  # [k, d]
+    covariance: Floats  # [k, d, d]
 
 
 @compiled
-def jump_log_likelihood(means, table, white, start, ages, none, some, variance):  # type: ignore[no-untyped-def]
-    """Return the log-likelihood of a level that jumps in a block with probability ``some``, by a height with that
-    variance.
-
-    A jump at a uniformly distributed time in the block changes the block mean by 1/2 of its height on average and
-    contributes 1/3 of its variance.
-    """
-    d = table.shape[0]
-    share, at, covariance = np.zeros(ages), np.zeros((ages, d)), np.zeros((ages, d, d))
-    # for each hypothesis: entries below ``ages`` without a jump, the others with a jump
-    weight, moved, spread = np.empty(2 * ages), np.zeros((2 * ages, d)), np.zeros((2 * ages, d, d))
-    reach = np.empty(d)
-    share[ages - 1] = 1.0
-    covariance[ages - 1] = initial_covariance(table, start)
-    total = -0.5 * means.size * np.log(2.0 * np.pi)
+def _jump_log_likelihood(means: Floats, noise: StateSpaceNoise, start: float, jumps: JumpProbabilities) -> float:
+    """Return the log-likelihood of a level that jumps at random times."""
+    d = noise.table.shape[0]
+    by_age = GaussianMixture(np.zeros(JUMP_AGES), np.zeros((JUMP_AGES, d)), np.zeros((JUMP_AGES, d, d)))
+    # for each hypothesis: entries below JUMP_AGES without a jump, the others with a jump
+    branches = GaussianMixture(np.empty(2 * JUMP_AGES), np.zeros((2 * JUMP_AGES, d)), np.zeros((2 * JUMP_AGES, d, d)))
+    by_age.weight[JUMP_AGES - 1] = 1.0
+    by_age.covariance[JUMP_AGES - 1] = initial_covariance(noise, start)
+    total: float = -0.5 * means.size * np.log(2.0 * np.pi)
     for z in means:
-        for age in range(ages):
-            weight[age] = weight[ages + age] = -np.inf
-            if share[age] < MIN_HYPOTHESIS_PROBABILITY:
-                continue
-            seen = predict_block(table, covariance[age], reach) + white
-            innovation = z
-            for i in range(d):
-                innovation -= table[i, 1] * at[age, i]
-            for jump in range(2):
-                to, chance = (ages + age, some) if jump else (age, none)
-                if jump:
-                    seen += variance / 3.0
-                    reach[0] += 0.5 * variance
-                weight[to] = np.log(share[age] * chance) - 0.5 * (innovation * innovation / seen + np.log(seen))
-                for i in range(d):
-                    moved[to, i] = table[i, 0] * at[age, i] + reach[i] * innovation / seen
-                    for j in range(d):
-                        spread[to, i, j] = table[i, 0] * table[j, 0] * covariance[age, i, j]
-                        spread[to, i, j] -= reach[i] * reach[j] / seen
-                    spread[to, i, i] += table[i, 2]
-                spread[to, 0, 0] += jump * variance
-        highest = weight[0]
-        for k in range(1, 2 * ages):
-            highest = max(highest, weight[k])
-        density = 0.0
-        for k in range(2 * ages):
-            weight[k] = np.exp(weight[k] - highest)
-            density += weight[k]
-        total += highest + np.log(density)
-        for k in range(2 * ages):
-            weight[k] /= density
-        for age in range(ages):
+        for age in range(JUMP_AGES):
+            _branch(z, age, by_age, branches, noise, jumps)
+        total += _normalise(branches.weight)
+        for age in range(JUMP_AGES):
             if age == 0:  # all hypotheses with a jump in this block
-                first, end = ages, 2 * ages
+                first, end = JUMP_AGES, 2 * JUMP_AGES
             else:  # no jump in this block: the previous age, and for the last age also the last age itself
-                first, end = age - 1, age + age // (ages - 1)
-            _merge_hypotheses(first, end, weight, moved, spread, age, share, at, covariance)
+                first, end = age - 1, age + age // (JUMP_AGES - 1)
+            _merge(branches, first, end, by_age, age)
     return total
 
 
 @compiled
-def _merge_hypotheses(first, end, weight, moved, spread, to, share, at, covariance):  # type: ignore[no-untyped-def]
-    """Merge hypotheses ``first`` to ``end`` − 1 into one Gaussian with their mean and covariance, at index ``to``."""
-    share[to] = 0.0
-    for k in range(first, end):
-        share[to] += weight[k]
-    if share[to] < MIN_HYPOTHESIS_PROBABILITY:
+def _branch(
+    z: float,
+    age: int,
+    by_age: GaussianMixture,
+    branches: GaussianMixture,
+    noise: StateSpaceNoise,
+    jumps: JumpProbabilities,
+) -> None:
+    """Update one hypothesis by a block mean ``z``, once without a jump in the block and once with a jump.
+
+    A jump at a uniformly distributed time in the block changes the block mean by 1/2 of its height on average and
+    contributes 1/3 of its variance.
+    """
+    branches.weight[age] = branches.weight[JUMP_AGES + age] = -np.inf
+    if by_age.weight[age] < MIN_HYPOTHESIS_PROBABILITY:
         return
-    d = moved.shape[1]
+    table = noise.table
+    d = table.shape[0]
+    covariance, reach = by_age.covariance[age], np.empty(d)
+    seen = predict_block(noise, covariance, reach)
+    innovation = innovation_of(z, noise, by_age.mean[age])
+    for jump in range(2):
+        to, chance = (JUMP_AGES + age, jumps.some) if jump else (age, jumps.none)
+        if jump:
+            seen += jumps.variance / 3.0
+            reach[0] += 0.5 * jumps.variance
+        likelihood = -0.5 * (innovation * innovation / seen + np.log(seen))
+        branches.weight[to] = np.log(by_age.weight[age] * chance) + likelihood
+        spread = branches.covariance[to]
+        for i in range(d):
+            branches.mean[to, i] = table[i, 0] * by_age.mean[age, i] + reach[i] * innovation / seen
+            for j in range(d):
+                spread[i, j] = table[i, 0] * table[j, 0] * covariance[i, j]
+                spread[i, j] -= reach[i] * reach[j] / seen
+            spread[i, i] += table[i, 2]
+        spread[0, 0] += jump * jumps.variance
+
+
+@compiled
+def _normalise(weight: Floats) -> float:
+    """Convert logarithms of probabilities in place to probabilities with the sum 1, and return ln of their sum."""
+    highest = weight[0]
+    for k in range(1, weight.size):
+        highest = max(highest, weight[k])
+    density = 0.0
+    for k in range(weight.size):
+        weight[k] = np.exp(weight[k] - highest)
+        density += weight[k]
+    for k in range(weight.size):
+        weight[k] /= density
+    log_sum: float = highest + np.log(density)
+    return log_sum
+
+
+@compiled
+def _merge(branches: GaussianMixture, first: int, end: int, merged: GaussianMixture, to: int) -> None:
+    """Merge branches ``first`` to ``end`` − 1 into one Gaussian with their mean and covariance, at index ``to``."""
+    share = 0.0
+    for k in range(first, end):
+        share += branches.weight[k]
+    merged.weight[to] = share
+    if share < MIN_HYPOTHESIS_PROBABILITY:
+        return
+    d = branches.mean.shape[1]
+    mean, covariance = merged.mean[to], merged.covariance[to]
     for i in range(d):
-        at[to, i] = 0.0
+        mean[i] = 0.0
         for k in range(first, end):
-            at[to, i] += weight[k] / share[to] * moved[k, i]
+            mean[i] += branches.weight[k] / share * branches.mean[k, i]
     for i in range(d):
         for j in range(d):
-            covariance[to, i, j] = 0.0
+            covariance[i, j] = 0.0
             for k in range(first, end):
-                apart = (moved[k, i] - at[to, i]) * (moved[k, j] - at[to, j])
-                covariance[to, i, j] += weight[k] / share[to] * (spread[k, i, j] + apart)
+                apart = (branches.mean[k, i] - mean[i]) * (branches.mean[k, j] - mean[j])
+                covariance[i, j] += branches.weight[k] / share * (branches.covariance[k, i, j] + apart)

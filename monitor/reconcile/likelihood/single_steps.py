@@ -19,20 +19,18 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.common.distributions import Z95
 from monitor.reconcile.likelihood import poisson_steps
 from monitor.reconcile.likelihood.hidden_state import (
     BackgroundNoise,
     ModelComparison,
     StateSpaceNoise,
     block_means,
-    initial_covariance,
+    innovation_variances,
+    innovations_of,
     kalman_log_likelihood,
-    predict_block,
     prior_level_variance,
     state_space_noise,
 )
-from monitor.reconcile.result import ParameterInterval
 
 TIMES_PER_BLOCK: Final = 8
 """Number of times that are tried within a block."""
@@ -41,22 +39,8 @@ TIMES_PER_BLOCK: Final = 8
 class SingleStepsFit(NamedTuple):
     """Best fit of single steps."""
 
-    height: float  # log-likelihood less the penalties for times and heights
+    score: float  # log-likelihood less the penalties for times and heights
     times: Floats  # [k] in blocks since the start
-    earliest: Floats  # [k] lower end of the 95 % interval of the time
-    latest: Floats  # [k] upper end of the same interval
-    heights: Floats  # [k] unit of the axis
-    deviations: Floats  # [k] standard deviations of the heights
-
-    def parameters(self, block_s: float) -> dict[str, ParameterInterval]:
-        """Return ``time_1``, ``height_1``, ``time_2``, … with 95 % intervals, in the order of time."""
-        found: dict[str, ParameterInterval] = {}
-        for k in range(self.times.size):
-            time, early, late = (float(t[k]) * block_s for t in (self.times, self.earliest, self.latest))
-            height, wide = float(self.heights[k]), Z95 * float(self.deviations[k])
-            found[f"time_{k + 1}"] = ParameterInterval(time, early, late)
-            found[f"height_{k + 1}"] = ParameterInterval(height, height - wide, height + wide)
-        return found
 
 
 def compare_steps_with_single_steps(
@@ -70,7 +54,7 @@ def compare_steps_with_single_steps(
         Series in the unit of the axis, without gaps.
     tau0_s : float
         Sample period in seconds.
-    rest : Rest
+    rest : BackgroundNoise
         Additional noise of the axis.
     K : float
         Starting value of the random walk coefficient, in unit/√s, above zero.
@@ -80,44 +64,28 @@ def compare_steps_with_single_steps(
     Returns
     -------
     ModelComparison
-        ``rate`` and ``height`` of the Poisson steps (first). ``time_1`` in seconds from the start, ``height_1``,
-        ``time_2``, … of the single steps (second). The number of jumps of the Poisson steps.
+        Gain, ``rate`` and ``height`` of the Poisson steps, the number of jumps, and the number of single steps.
 
     Raises
     ------
     ValueError
         If there are too few samples or no white noise.
     """
-    means, block_s = block_means(y, tau0_s, poisson_steps.block_for(y.size * tau0_s, rest, K))
-    first = poisson_steps.fit_jumps(means, block_s, rest, K)
-    second = fit_single_steps(means, state_space_noise(rest, block_s, means.size * block_s), most)
-    return ModelComparison(
-        first.peak.height - second.height, first.parameters, second.parameters(block_s), round(first.events)
-    )
+    means, block_s = block_means(y, tau0_s, poisson_steps.block_length_s(y.size * tau0_s, rest, K))
+    single = _fit_single_steps(means, state_space_noise(rest, block_s, means.size * block_s), most)
+    return poisson_steps.fit_jumps(means, block_s, rest, K).compare(single.score, single.times.size)
 
 
-def fit_single_steps(means: Floats, noise: StateSpaceNoise, most: int) -> SingleStepsFit:
-    """Fit the number of single steps that explains the block means at the smallest cost.
-
-    Parameters
-    ----------
-    means : ndarray of float64, shape (m,)
-        Block means in the unit of the axis.
-    noise : StateSpaceNoise
-        Additional noise.
-    most : int
-        Largest number of steps.
-    """
+def _fit_single_steps(means: Floats, noise: StateSpaceNoise, most: int) -> SingleStepsFit:
+    """Fit the number of single steps that explains the block means with the smallest penalty."""
     blocks: list[int] = []
-    best = SingleStepsFit(
-        kalman_log_likelihood(means, noise.table, noise.white, prior_level_variance(means)), *np.empty((5, 0))
-    )
+    best = SingleStepsFit(kalman_log_likelihood(means, noise, prior_level_variance(means)), np.empty(0))
     for _ in range(most):
         blocks.append(int(np.argmax(_shock_gains(means, noise, blocks))))
         for k in range(len(blocks)):
             blocks[k] = int(np.argmax(_shock_gains(means, noise, blocks[:k] + blocks[k + 1 :])))
         found = _refine_steps(means, noise, sorted(blocks))
-        if found.height > best.height:
+        if found.score > best.score:
             best = found
     return best
 
@@ -129,7 +97,7 @@ def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Fl
     """
     free = np.zeros(means.size)
     free[blocks] = prior_level_variance(means)
-    scores = np.asarray(shock_statistics(means, noise.table, noise.white, prior_level_variance(means), free))
+    scores = _shock_statistics(means, noise, prior_level_variance(means), free)
     scores[blocks] = 0.0
     return scores
 
@@ -145,10 +113,7 @@ def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> S
         times = max(tried, key=lambda t: _fit_heights(means, noise, t)[0])
     total, heights, deviations = _fit_heights(means, noise, times)
     cost = times.size * log(means.size) + 0.5 * float(np.log1p((heights / deviations) ** 2).sum())
-    earliest, latest = np.array([_time_interval(means, noise, blocks, k) for k in range(len(blocks))]).T
-    return SingleStepsFit(
-        total - cost, times, np.minimum(earliest, times), np.maximum(latest, times), heights, deviations
-    )
+    return SingleStepsFit(total - cost, times)
 
 
 def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[float, Floats, Floats]:
@@ -158,7 +123,7 @@ def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[
     # fraction of each block that lies after the step
     columns = np.clip(np.arange(1.0, means.size + 1.0)[:, None] - times, 0.0, 1.0)
     columns = np.column_stack([means, columns])
-    logarithms = whiten(columns, noise.table, noise.white, prior_level_variance(means))
+    logarithms = _whiten(columns, noise, prior_level_variance(means))
     data, design = columns[:, 0], columns[:, 1:]
     normal = np.linalg.inv(design.T @ design)
     heights = normal @ (design.T @ data)
@@ -166,21 +131,13 @@ def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[
     return -0.5 * float(logarithms + left @ left), heights, np.sqrt(np.diag(normal))
 
 
-def _time_interval(means: Floats, noise: StateSpaceNoise, blocks: list[int], k: int) -> tuple[float, float]:
-    """Return the 95 % interval of the time of step ``k``, in blocks, with the other steps fixed."""
-    scores = _shock_gains(means, noise, blocks[:k] + blocks[k + 1 :])
-    worse = np.flatnonzero(scores < scores[blocks[k]] - Z95**2)
-    before, after = worse[worse < blocks[k]], worse[worse > blocks[k]]
-    return float(before[-1] if before.size else 0), float(after[0] if after.size else means.size)
-
-
 @compiled
-def whiten(columns, table, white, start):  # type: ignore[no-untyped-def]
-    """Whiten columns, shape (m, c), in place to unit variance and return Σ ln 2πS of their innovation variances."""
-    variances, reaches = _innovation_variances(np.zeros(columns.shape[0]), table, white, start)
+def _whiten(columns: Floats, noise: StateSpaceNoise, start: float) -> float:
+    """Whiten columns, shape (m, c), in place to unit variance and return Σ ln 2πS of their innovation variances S."""
+    variances, reaches = innovation_variances(np.zeros(columns.shape[0]), noise, start)
     total = 0.0
     for c in range(columns.shape[1]):
-        innovations = _innovations(columns[:, c].copy(), table, variances, reaches)
+        innovations = innovations_of(columns[:, c].copy(), noise, variances, reaches)
         for k in range(innovations.size):
             columns[k, c] = innovations[k] / np.sqrt(variances[k])
     for variance in variances:
@@ -189,67 +146,43 @@ def whiten(columns, table, white, start):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def shock_statistics(means, table, white, start, free):  # type: ignore[no-untyped-def]
+def _shock_statistics(means: Floats, noise: StateSpaceNoise, start: float, free: Floats) -> Floats:
     """Return twice the log-likelihood ratio, shape (m,), of a shock of the level at the start of each block.
 
     The ratio is r²/N of the fixed-interval smoother (de Jong & Penzer 1998, section 2). The backward recursions are r ←
     h e/S + L'r and N ← h h'/S + L'N L, with L = F − reach h'/S. ``free`` has the same meaning as in
-    ``_innovation_variances``.
+    ``innovation_variances``.
     """
+    table = noise.table
     d, m = table.shape[0], means.size
-    variances, reaches = _innovation_variances(free, table, white, start)
-    innovations = _innovations(means, table, variances, reaches)
+    variances, reaches = innovation_variances(free, noise, start)
+    innovations = innovations_of(means, noise, variances, reaches)
     r, N, scores = np.zeros(d), np.zeros((d, d)), np.empty(m)
-    L, NL, new = np.empty((d, d)), np.empty((d, d)), np.empty(d)
+    L = np.empty((d, d))
     for k in range(m - 1, -1, -1):
         for i in range(d):
             for j in range(d):
                 L[i, j] = (table[i, 0] if i == j else 0.0) - reaches[k, i] * table[j, 1] / variances[k]
-        for i in range(d):
-            new[i] = table[i, 1] * innovations[k] / variances[k]
-            for j in range(d):
-                new[i] += L[j, i] * r[j]
-                NL[i, j] = 0.0
-                for n in range(d):
-                    NL[i, j] += N[i, n] * L[n, j]
-        for i in range(d):
-            r[i] = new[i]
-            for j in range(d):
-                N[i, j] = table[i, 1] * table[j, 1] / variances[k]
-                for n in range(d):
-                    N[i, j] += L[n, i] * NL[n, j]
+        _smooth_backward(r, N, L, table, innovations[k], variances[k])
         scores[k] = r[0] * r[0] / N[0, 0]
     return scores
 
 
 @compiled
-def _innovation_variances(free, table, white, start):  # type: ignore[no-untyped-def]
-    """Return the variances of the innovations, shape (m,), and their covariances with the next state, shape (m, d).
-
-    ``free`` [m] is additional variance of the level at the start of each block.
-    """
-    d, m = table.shape[0], free.size
-    variances, reaches, covariance = np.empty(m), np.empty((m, d)), initial_covariance(table, start)
-    for k in range(m):
-        covariance[0, 0] += free[k]
-        variances[k] = predict_block(table, covariance, reaches[k]) + white
-        for i in range(d):
-            for j in range(d):
-                covariance[i, j] *= table[i, 0] * table[j, 0]
-                covariance[i, j] -= reaches[k, i] * reaches[k, j] / variances[k]
-            covariance[i, i] += table[i, 2]
-    return variances, reaches
-
-
-@compiled
-def _innovations(series, table, variances, reaches):  # type: ignore[no-untyped-def]
-    """Return the innovations of a series, shape (m,): the differences from the predictions of the Kalman filter."""
-    d = table.shape[0]
-    at, innovations = np.zeros(d), np.empty(series.size)
-    for k in range(series.size):
-        innovations[k] = series[k]
-        for i in range(d):
-            innovations[k] -= table[i, 1] * at[i]
-        for i in range(d):
-            at[i] = table[i, 0] * at[i] + reaches[k, i] * innovations[k] / variances[k]
-    return innovations
+def _smooth_backward(r: Floats, N: Floats, L: Floats, table: Floats, innovation: float, variance: float) -> None:
+    """Update r [d] and N [d, d] of the smoother by one block."""
+    d = r.size
+    NL, new = np.empty((d, d)), np.empty(d)
+    for i in range(d):
+        new[i] = table[i, 1] * innovation / variance
+        for j in range(d):
+            new[i] += L[j, i] * r[j]
+            NL[i, j] = 0.0
+            for n in range(d):
+                NL[i, j] += N[i, n] * L[n, j]
+    for i in range(d):
+        r[i] = new[i]
+        for j in range(d):
+            N[i, j] = table[i, 1] * table[j, 1] / variance
+            for n in range(d):
+                N[i, j] += L[n, i] * NL[n, j]

@@ -1,24 +1,22 @@
 """Variance of white residuals as a function of time, for all frequencies together and for each band.
 
-``fit_variance_history`` fits a step of the variance at every time, and alternatives to a step: a trend, a periodic
-variation, several steps and a slow random variation. The alternatives are fitted to the energies of blocks (χ²;
-log-linear variances). Every gain is a log-likelihood gain over a constant variance, so that the gains are comparable. A
-step is accepted if it gains more than its alternatives and nothing is left after it.
+``fit_variance_history`` fits a step of the variance at every time, and three alternatives to a step: a trend, a
+periodic variation and a slow random variation. The alternatives are fitted to the energies of blocks, which are
+distributed as χ². Every gain is a log-likelihood gain over a constant variance, so that the gains are comparable.
 
-``find_least_constant_tiles`` cuts the recording into pieces and takes the Fourier transform of each piece midway
-between the usual frequencies. There white noise is independent everywhere and a steady line has a steady power. Every
-rectangle of 2^a pieces by 2^b frequencies is compared with the rest of its frequencies, so that a steady line or a
-coloured spectrum has no influence. Every row of rectangles is also compared with a constant row. Long pieces detect
+``find_least_constant_tiles`` divides the recording into pieces and takes the Fourier transform of each piece midway
+between the usual frequencies. At these frequencies white noise is independent, and a steady line has a steady power.
+Every rectangle of 2^a pieces by 2^b frequencies is compared with the rest of its frequencies, so that a steady line or
+a coloured spectrum has no influence. Every row of rectangles is also compared with a constant row. Long pieces detect
 lines that vary, and short pieces detect bursts.
 
-All statistics are ratios of energies. They have no unit, and their distribution under white Gaussian noise depends only
-on the number of samples. Outliers violate this and must be replaced before.
+All statistics are ratios of energies without a unit. Under white Gaussian noise, their distribution depends only on the
+number of samples. Outliers change the distribution and must be replaced before.
 """
 
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.fft import fft
@@ -43,10 +41,6 @@ MIN_VARIANCE_BLOCKS: Final = 8
 """Smallest number of blocks or pieces for a variance history."""
 MIN_CYCLES: Final = 2
 """Smallest number of periods in the recording. A slower variation is a trend."""
-MAX_CHANGES: Final = 8
-"""Largest number of steps that are sought one after the other."""
-MIN_CHANGE_GAIN_NATS: Final = 12.0
-"""Gain in nats below which no further steps are sought."""
 PIECE_SAMPLES: Final = (256, 2048)
 """Numbers of samples in a piece of the spectrogram."""
 MIN_SQUARES_PER_CELL: Final = 64
@@ -65,25 +59,13 @@ class VarianceStep:
 
 
 @dataclass(frozen=True, slots=True)
-class PeriodicVariance:
-    """Periodic variation of the variance."""
-
-    gain: float  # log-likelihood gain over a constant variance, nats
-    frequency: float  # Hz
-    depth: float  # amplitude of ln σ: σ varies by the factor e^±depth
-
-
-@dataclass(frozen=True, slots=True)
 class VarianceHistory:
-    """Variance history: a step and its alternatives."""
+    """Best step of the variance, and the gains of its alternatives over a constant variance in nats."""
 
     step: VarianceStep
-    trend: float  # gain of ln σ² = a + b t + c t² over a constant, nats
-    periodic: PeriodicVariance
-    wander: float  # gain of a slow random variation over a constant, nats
-    changes: tuple[VarianceStep, ...]  # in the order in which they were found, each with its gain over those before
-    block_s: float
-    energy: Floats  # [k] mean square of each block, in the squared unit of w
+    trend: float  # ln σ² = a + b t + c t²
+    periodic: float  # ln σ² with a period
+    wander: float  # slow random variation
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,12 +73,10 @@ class SpectrogramExtremes:
     """Rectangle and row of a spectrogram that are least constant in time."""
 
     gain: float  # gain of the best rectangle over the rest of its row, nats
-    ratio: float  # power of the rectangle over the power of the rest
     time: tuple[float, float]  # s from the first sample
     frequency: tuple[float, float]  # Hz
     row_gain: float  # −ln of the probability that a row with constant power is as uneven
     row: tuple[float, float]  # frequency range of the row, Hz
-    seconds: tuple[float, float]  # length of the pieces of the rectangle and of the row, s
 
 
 def fit_variance_history(w: Floats, tau0_s: float) -> VarianceHistory:
@@ -130,16 +110,12 @@ def fit_variance_history(w: Floats, tau0_s: float) -> VarianceHistory:
     count = w.size // length
     energy = squares[: count * length].reshape(count, length).mean(axis=1)
     scores = energy / energy.mean() - 1.0
-    step = _best_step(squares, tau0_s)
     time = np.linspace(-1.0, 1.0, count)
     return VarianceHistory(
-        step=step,
+        step=_best_step(squares, tau0_s),
         trend=_log_linear_gain(energy, length, np.stack([time, time**2 - 1.0 / 3.0])),
-        periodic=_fit_periodic(energy, scores, length, length * tau0_s),
+        periodic=_periodic_gain(energy, scores, length),
         wander=_slow_variation_gain(scores, length),
-        changes=_segment_steps(squares, tau0_s, step),
-        block_s=length * tau0_s,
-        energy=energy,
     )
 
 
@@ -169,24 +145,16 @@ def find_least_constant_tiles(w: Floats, tau0_s: float) -> SpectrogramExtremes:
     """
     if w.size < MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0]:
         raise ValueError(f"{w.size} samples are too few, {MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0]} are needed")
-    best = row = (-1.0, 0, 0, 0, 0, 0, 0.0)
-    for piece in (one for one in PIECE_SAMPLES if w.size >= MIN_VARIANCE_BLOCKS * one):
-        one, other = _best_tiles(_piece_spectra(w, piece), piece)
-        best, row = max(best, one), max(row, other)
-    _, piece, a, i, b, j, ratio = best
+    pieces = [piece for piece in PIECE_SAMPLES if w.size >= MIN_VARIANCE_BLOCKS * piece]
+    tiles, rows = zip(*(_best_tiles(_piece_spectra(w, piece), piece) for piece in pieces), strict=True)
+    best, row = max(tiles), max(rows)
     return SpectrogramExtremes(
-        gain=best[0],
-        ratio=ratio,
-        time=(i * a * piece * tau0_s, (i + 1) * a * piece * tau0_s),
-        frequency=(j * b / (piece * tau0_s), (j + 1) * b / (piece * tau0_s)),
-        row_gain=row[0],
-        row=(row[5] * row[4] / (row[1] * tau0_s), (row[5] + 1) * row[4] / (row[1] * tau0_s)),
-        seconds=(piece * tau0_s, row[1] * tau0_s),
+        best.gain, best.time_s(tau0_s), best.frequency_hz(tau0_s), row.gain, row.frequency_hz(tau0_s)
     )
 
 
-def _best_step(squares: Floats, tau0_s: float, first: int = 0) -> VarianceStep:
-    """Return the best single step of squared residuals that begin at sample ``first``.
+def _best_step(squares: Floats, tau0_s: float) -> VarianceStep:
+    """Return the best single step of the variance of squared residuals.
 
     The gain is computed at every ``STEP_SEARCH_STRIDE``-th time, and at every time in the range where a step is likely.
     """
@@ -212,7 +180,7 @@ def _best_step(squares: Floats, tau0_s: float, first: int = 0) -> VarianceStep:
     ends = (at, min(int(k[lo]), at) - stride + 1, max(int(k[hi]), at) + stride - 1)
     return VarianceStep(
         float(gains[best]),
-        Interval(*((first + one) * tau0_s for one in ends)),
+        Interval(*(one * tau0_s for one in ends)),
         Interval(ratio, ratio / half, ratio * half),
     )
 
@@ -221,24 +189,6 @@ def _step_gains(sums: Floats, k: Ints) -> Floats:
     """Return the log-likelihood gains of a step after ``k`` samples, from running sums of squares."""
     n, before, after = sums.size, sums[k - 1], sums[-1] - sums[k - 1]
     return np.asarray(0.5 * (n * np.log(sums[-1] / n) - k * np.log(before / k) - (n - k) * np.log(after / (n - k))))
-
-
-def _segment_steps(squares: Floats, tau0_s: float, step: VarianceStep) -> tuple[VarianceStep, ...]:
-    """Return the given step and further steps by binary segmentation.
-
-    Each further step divides the segment in which it gains most.
-    """
-    found = [step]
-    ends = [0, squares.size]
-    open_: dict[tuple[int, int], VarianceStep] = {}
-    while len(found) < MAX_CHANGES and found[-1].gain >= MIN_CHANGE_GAIN_NATS:
-        ends = sorted({*ends, round(found[-1].time.value / tau0_s)})
-        parts = [(a, b) for a, b in pairwise(ends) if b - a > 4 * MIN_SEGMENT_SAMPLES]
-        open_ = {part: open_.get(part) or _best_step(squares[slice(*part)], tau0_s, part[0]) for part in parts}
-        if not open_:
-            break
-        found.append(max(open_.values(), key=lambda one: one.gain))
-    return tuple(found)
 
 
 def _log_linear_gain(energy: Floats, length: int, rows: Floats) -> float:
@@ -261,19 +211,16 @@ def _log_linear_gain(energy: Floats, length: int, rows: Floats) -> float:
     return max(0.5 * length * float(constant - (level + energy * np.exp(-level)).sum()), 0.0)
 
 
-def _fit_periodic(energy: Floats, scores: Floats, length: int, block_s: float) -> PeriodicVariance:
-    """Return the fit at the best frequency of the periodogram of the scores, which is zero-padded to twice its
-    length.
-    """
+def _periodic_gain(energy: Floats, scores: Floats, length: int) -> float:
+    """Return the log-likelihood gain of a variation with the best frequency in the periodogram of the scores."""
     power = np.abs(np.fft.rfft(scores, 2 * scores.size)) ** 2
     power[: 2 * MIN_CYCLES] = 0.0
     best = int(power[:-1].argmax())
-    around = np.fft.rfft(scores, 16 * scores.size)[max(8 * best - 8, 16 * MIN_CYCLES) : 8 * best + 9]
-    frequency = (max(8 * best - 8, 16 * MIN_CYCLES) + int(np.abs(around).argmax())) / (16.0 * scores.size)
+    first = max(8 * best - 8, 16 * MIN_CYCLES)
+    around = np.fft.rfft(scores, 16 * scores.size)[first : 8 * best + 9]
+    frequency = (first + int(np.abs(around).argmax())) / (16.0 * scores.size)  # cycles per block
     angle = 2.0 * np.pi * frequency * np.arange(scores.size)
-    rows = np.stack([np.cos(angle), np.sin(angle)])
-    depth = float(np.hypot(*(rows @ np.log(energy)))) / scores.size
-    return PeriodicVariance(_log_linear_gain(energy, length, rows), frequency / block_s, depth)
+    return _log_linear_gain(energy, length, np.stack([np.cos(angle), np.sin(angle)]))
 
 
 def _slow_variation_gain(scores: Floats, length: int) -> float:
@@ -289,8 +236,25 @@ def _slow_variation_gain(scores: Floats, length: int) -> float:
     return float(np.where(means > 1.0, gains, 0.0).max())
 
 
-TileScore = tuple[float, int, int, int, int, int, float]
-"""Gain, samples in a piece, pieces, index of the pieces, frequencies, index of the frequencies, and ratio of powers."""
+class TileScore(NamedTuple):
+    """Part of a spectrogram, and how much its power differs from the rest of its frequencies."""
+
+    gain: float  # nats
+    samples: int  # samples in a piece
+    pieces: int  # pieces in the tile
+    piece_at: int  # index of the tile in time
+    frequencies: int  # frequencies in the tile
+    frequency_at: int  # index of the tile in frequency
+
+    def time_s(self, tau0_s: float) -> tuple[float, float]:
+        """Return the time range in seconds for a sample period of ``tau0_s`` seconds."""
+        length = self.pieces * self.samples
+        return self.piece_at * length * tau0_s, (self.piece_at + 1) * length * tau0_s
+
+    def frequency_hz(self, tau0_s: float) -> tuple[float, float]:
+        """Return the frequency range in Hz for a sample period of ``tau0_s`` seconds."""
+        first, step = self.frequency_at, self.samples * tau0_s
+        return first * self.frequencies / step, (first + 1) * self.frequencies / step
 
 
 def _piece_spectra(w: Floats, piece: int) -> Floats:
@@ -305,18 +269,18 @@ def _piece_spectra(w: Floats, piece: int) -> Floats:
 
 def _best_tiles(power: Floats, piece: int) -> tuple[TileScore, TileScore]:
     """Return the best rectangle and the best row of powers, shape (pieces, frequencies)."""
-    best = row = (-1.0, piece, 1, 0, 1, 0, 1.0)
+    best = row = TileScore(-1.0, piece, 1, 0, 1, 0)
     b, total = 1, power.sum(axis=0)
     while True:
         tall, a = power, 1
         while tall.shape[0] >= 2:
             low, low_at, high, high_at, logs = _column_extremes(tall)
             for x, at in ((low, low_at), (high, high_at)):
-                gain, j, ratio = _best_contrast(x, total, 2 * a * b, 2 * power.shape[0] * b)
-                best = max(best, (gain, piece, a, int(at[j]), b, j, ratio))
+                gain, j = _best_contrast(x, total, 2 * a * b, 2 * power.shape[0] * b)
+                best = max(best, TileScore(gain, piece, a, int(at[j]), b, j))
             if 2 * a * b >= MIN_SQUARES_PER_CELL or a == 1:
                 gain, j = _bartlett_test(tall.sum(axis=0), logs, tall.shape[0], 2 * a * b)
-                row = max(row, (gain, piece, a, 0, b, j, 1.0))
+                row = max(row, TileScore(gain, piece, a, 0, b, j))
             even = tall.shape[0] // 2 * 2
             tall, a = tall[0:even:2] + tall[1:even:2], 2 * a
         if power.shape[1] == 1:
@@ -325,7 +289,7 @@ def _best_tiles(power: Floats, piece: int) -> tuple[TileScore, TileScore]:
 
 
 @compiled
-def _column_extremes(power):  # type: ignore[no-untyped-def]
+def _column_extremes(power: Floats) -> tuple[Floats, Ints, Floats, Ints, Floats]:
     """Return the minimum and maximum of each column with their positions, and the sum of its logarithms.
 
     The logarithms are taken of products of eight values.
@@ -350,25 +314,25 @@ def _column_extremes(power):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _best_contrast(x, total, inside, whole):  # type: ignore[no-untyped-def]
-    """Return gain, index and power ratio of the best energy of ``inside`` squares over the rest of its column.
+def _best_contrast(x: Floats, total: Floats, inside: int, whole: int) -> tuple[float, int]:
+    """Return gain and index of the best energy of ``inside`` squares over the rest of its column.
 
     With x of c squares inside and R of d squares outside, the gain is (c+d)/2 ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2
     ln(R/d). It is convex in x, so that only the smallest and the largest value of a column can be the best. A low power
     of only a few squares is no evidence.
     """
     outside = whole - inside
-    best, place, ratio = -1.0, 0, 1.0
+    best, place = -1.0, 0
     for j in range(x.size):
         u = max(x[j] * whole / (inside * total[j]), 1e-30)
         if u < 1.0 and inside < MIN_SQUARES_FOR_DECREASE:
-            gain, v = 0.0, 1.0
+            gain = 0.0
         else:
             v = max((total[j] - x[j]) * whole / (outside * total[j]), 1e-30)
             gain = -0.5 * (inside * np.log(u) + outside * np.log(v))
         if gain > best:
-            best, place, ratio = gain, j, u / v
-    return best, place, ratio
+            best, place = gain, j
+    return best, place
 
 
 def _bartlett_test(total: Floats, logs: Floats, count: int, squares: int) -> tuple[float, int]:

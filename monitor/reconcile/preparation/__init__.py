@@ -1,1 +1,1 @@
-"""Preparation of a recording: missing and wrong samples, value statistics, sample rate."""
+"""Preparation of a recording: usable axes, value statistics, repair of samples, and the cosine transform."""

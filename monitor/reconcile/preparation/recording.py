@@ -76,23 +76,12 @@ def select_usable_axes(recording: Recording, model: NoiseModel | None) -> tuple[
         raise NotReady("no axis to compare: " + "; ".join(notes))
     temperature_c = recording.temperature_c
     if temperature_c is not None:
-        temperature_c = smooth_temperature(temperature_c) if np.isfinite(temperature_c).any() else None
+        temperature_c = _smooth_temperature(temperature_c) if np.isfinite(temperature_c).any() else None
     return Recording(kept, recording.rate_hz, temperature_c), tuple(notes)
 
 
-def smooth_temperature(temperature_c: Floats) -> Floats:
-    """Return the temperature with missing samples interpolated and with thermometer noise averaged out.
-
-    Parameters
-    ----------
-    temperature_c : ndarray of float64, shape (n,)
-        Temperature in °C. NaN marks a missing sample. At least one sample must be finite.
-
-    Returns
-    -------
-    ndarray of float64, shape (n,)
-        Smoothed temperature in °C.
-    """
+def _smooth_temperature(temperature_c: Floats) -> Floats:
+    """Return the temperature with missing samples interpolated and with thermometer noise averaged out."""
     known = np.flatnonzero(np.isfinite(temperature_c))
     whole = np.interp(np.arange(temperature_c.size), known, temperature_c[known])
     half = int(0.5 * TEMPERATURE_SMOOTHING_FRACTION * whole.size)

@@ -2,10 +2,10 @@
 
 ``fill_missing`` draws each missing sample from its neighbourhood. The draw is the mean of good neighbours plus the
 deviation of a randomly chosen neighbour from its own mean. Level, drift and white noise thus continue through the gap.
-The neighbourhood is as wide as the drift allows. The mean carries the noise of the samples it is made of. If p percent
-of the samples are missing and the noise is white, frequencies below the inverse of the neighbourhood length are
+The neighbourhood is as wide as the drift allows. The mean contains the noise of the averaged samples. If p percent of
+the samples are missing and the noise is white, the spectral density below the inverse of the neighbourhood length is
 therefore 2p percent too high. Other frequencies are not affected. A long gap is filled along a line between the levels
-at its ends. Its random walk is as strong as that of the recording over such a time.
+at both ends, with a random walk as strong as the drift of the recording.
 
 ``restore_clipped`` draws from the tail of a Gaussian beyond the limit. The local mean of this Gaussian accounts for the
 clipped samples.
@@ -153,7 +153,7 @@ def _local_means(y: Floats, good: Mask, at: Ints) -> Floats:
 
 
 @compiled
-def _running_sums(y, good, middle):  # type: ignore[no-untyped-def]
+def _running_sums(y: Floats, good: Mask, middle: float) -> tuple[Floats, Ints]:
     """Return, before each sample, the sum of the good samples less ``middle`` and their number."""
     sums, counts = np.empty(y.size + 1), np.empty(y.size + 1, np.int64)
     total, count = 0.0, 0
@@ -175,9 +175,9 @@ def _neighbourhood_width(y: Floats, where: Ints, sums: Floats, counts: Ints, mid
         others = counts[hi] - counts[lo] - 1
         some_, lo, hi, others = (x[others > 0] for x in (some, lo, hi, others))
         value = y[some_] - middle
-        foretold = (sums[hi] - sums[lo] - value) / others
+        predicted = (sums[hi] - sums[lo] - value) / others
         # the mean of k samples adds 1/k of the variance of one sample
-        errors.append(float(np.mean((value - foretold) ** 2 / (1.0 + 1.0 / others))) if some_.size else np.inf)
+        errors.append(float(np.mean((value - predicted) ** 2 / (1.0 + 1.0 / others))) if some_.size else np.inf)
     return next(
         width
         for width, error in zip(NEIGHBOURHOOD_WIDTHS, errors, strict=True)
@@ -186,7 +186,9 @@ def _neighbourhood_width(y: Floats, where: Ints, sums: Floats, counts: Ints, mid
 
 
 @compiled
-def _draw_missing(new, where, missing, sums, counts, middle, width, chances):  # type: ignore[no-untyped-def]
+def _draw_missing(
+    new: Floats, where: Ints, missing: Ints, sums: Floats, counts: Ints, middle: float, width: int, chances: Floats
+) -> None:
     """Fill the missing samples of ``new`` in place.
 
     ``where`` holds the positions of the good samples. ``chances`` holds a random number in [0, 1) for each missing

@@ -245,7 +245,7 @@ def _sample_noise(values: Floats) -> float:
 
 
 @compiled
-def _total_variation(values):  # type: ignore[no-untyped-def]
+def _total_variation(values: Floats) -> float:
     """Return the sum of the absolute differences of neighbours."""
     total = 0.0
     for k in range(1, values.size):

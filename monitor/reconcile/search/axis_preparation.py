@@ -7,7 +7,6 @@ way, each with its own model. The spectrum then describes the remaining effects.
 """
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Final, TypeVar
 
 import numpy as np
@@ -52,11 +51,11 @@ def prepare_axes(
     raw = recording.values
     bins = frequency_bins(recording.samples, recording.rate_hz)
     shown = {name: measure_value_statistics(y) for name, y in raw.items()}
-    repaired = {name: repair_samples(y, shown[name], effects[name], rng) for name, y in raw.items()}
+    repaired = {name: _repair_samples(y, shown[name], effects[name], rng) for name, y in raw.items()}
     coefficients = {name: cosine_transform(y) for name, y in repaired.items()}
     axes = {}
     for name, y in raw.items():
-        others = {other: one for other, one in coefficients.items() if may_leak(other, name)}
+        others = {other: one for other, one in coefficients.items() if _may_leak(other, name)}
         axis = Axis(
             name, y, repaired[name], coefficients[name], bins, others, recording.temperature_c, shown[name], regressors
         )
@@ -76,33 +75,13 @@ def repair_again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis
     rng : numpy.random.Generator
         Generator for the replacement samples.
     """
-    return _replace_outliers(axis.with_samples(repair_samples(axis.raw, axis.shown, effects, rng)), effects, rng)
+    return _replace_outliers(axis.with_samples(_repair_samples(axis.raw, axis.shown, effects, rng)), effects, rng)
 
 
-def without_sources(axis: Axis, sources: frozenset[str]) -> Axis:
-    """Return the same axis without some axes as possible sources of a leak.
-
-    Parameters
-    ----------
-    axis : Axis
-        Axis to copy.
-    sources : frozenset of str
-        Names of the axes that do not leak into this axis.
-    """
-    return replace(axis, others={name: one for name, one in axis.others.items() if name not in sources})
-
-
-def may_leak(source: str, axis: str) -> bool:
+def _may_leak(source: str, axis: str) -> bool:
     """Return True if one axis may leak into another.
 
     Gyroscopes and accelerometers leak into their own kind. Accelerometers also leak into gyroscopes.
-
-    Parameters
-    ----------
-    source : str
-        Name of the axis that leaks.
-    axis : str
-        Name of the affected axis.
     """
     return source != axis and (axis.startswith("g") or source.startswith("a"))
 
@@ -115,24 +94,10 @@ def measure_value_statistics(y: Floats) -> ValueStatistics:
     return ValueStatistics(grid, ends, detect_repeats(y, step, ends.limit.value if ends and ends.symmetric else np.inf))
 
 
-def repair_samples(y: Floats, shown: ValueStatistics, effects: Effects, rng: np.random.Generator) -> Floats:
-    """Return the samples with missing, repeated and clipped samples replaced.
+def _repair_samples(y: Floats, shown: ValueStatistics, effects: Effects, rng: np.random.Generator) -> Floats:
+    """Return the samples ``y``, shape (n,), with missing, repeated and clipped samples replaced.
 
-    Parameters
-    ----------
-    y : ndarray of float64, shape (n,)
-        Measured samples. NaN marks a missing sample.
-    shown : ValueStatistics
-        Statistics of the measured values.
-    effects : tuple of Effect
-        Effects of the axis. Repeats and clipping are repaired only if they are among them.
-    rng : numpy.random.Generator
-        Generator for the replacement samples.
-
-    Returns
-    -------
-    ndarray of float64, shape (n,)
-        Repaired samples in the unit of ``y``.
+    Repeats and clipping are repaired only if they are among the effects.
     """
     missing = ~np.isfinite(y)
     if _first_of_type(effects, SampleHold) and shown.repeats:

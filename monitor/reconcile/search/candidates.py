@@ -180,22 +180,14 @@ def find_spectral_peaks(seen: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple
 def propose_sinusoids(seen: WhitenedAxis) -> list[Effect]:
     """Return sinusoids at the lines of the spectrum."""
     return [
-        Sinusoidal(amplitude=start_size(seen.axis), frequency=line_frequency(seen, f_hz), phase=0.0)
+        Sinusoidal(amplitude=start_size(seen.axis), frequency=_line_frequency(seen, f_hz), phase=0.0)
         for gain, f_hz in find_line_peaks(seen.white, seen.axis.rate_hz, MAX_PEAKS)
         if gain > PENALTY_NATS["sinusoidal"] / 2.0
     ]
 
 
-def line_frequency(seen: WhitenedAxis, f_hz: float) -> float:
-    """Return the frequency of the maximum of the periodogram near a given frequency, by golden-section search.
-
-    Parameters
-    ----------
-    seen : WhitenedAxis
-        Whitened axis.
-    f_hz : float
-        Approximate frequency in Hz.
-    """
+def _line_frequency(seen: WhitenedAxis, f_hz: float) -> float:
+    """Return the frequency of the maximum of the periodogram near a given frequency, by golden-section search."""
     t = np.arange(seen.axis.n) / seen.axis.rate_hz
     half = 0.5 * seen.axis.rate_hz / seen.axis.n
 

@@ -156,10 +156,10 @@ def fit_telegraph_alternative(state: Hypothesis, at: int) -> NonGaussianAlternat
         return None
     series, tau0_s = _residual_series(state.fit), 1.0 / state.axis.rate_hz
     compared = compare_telegraph_with_correlated(series, tau0_s, rest, noise.sigma, noise.correlation_time)
-    amplitude, dwell = (float(compared.first[name].value) for name in ("amplitude", "dwell_time"))
+    amplitude, dwell = (float(compared.parameters[name].value) for name in ("amplitude", "dwell_time"))
     effect = RandomTelegraph(amplitude=amplitude, dwell_time=dwell)
     found = (*state.effects[state.given : at], *state.effects[at + 1 :], effect)
-    return NonGaussianAlternative(found, compared.gain, compared.first, compared.events)
+    return NonGaussianAlternative(found, compared.gain, compared.parameters, compared.events)
 
 
 def fit_poisson_alternative(state: Hypothesis) -> NonGaussianAlternative | None:
@@ -185,11 +185,10 @@ def fit_poisson_alternative(state: Hypothesis) -> NonGaussianAlternative | None:
     gain, whole = compared.gain, walk.log_likelihood + compared.gain
     if steps:
         compared = compare_steps_with_single_steps(series, tau0_s, rest, excess, most=max(steps, MIN_FITTED_STEPS))
-        single = sum(name.startswith("time") for name in compared.second)
-        gain = compared.gain + STEP_PENALTY_NATS * max(single - MAX_FREE_STEPS, 0)
-    rate, height = (float(compared.first[name].value) for name in ("rate", "height"))
+        gain = compared.gain + STEP_PENALTY_NATS * max(compared.single_steps - MAX_FREE_STEPS, 0)
+    rate, height = (float(compared.parameters[name].value) for name in ("rate", "height"))
     found = (*effects[state.given :], PoissonSteps(rate=rate, height=height))
-    return NonGaussianAlternative(found, gain - POISSON_PENALTY_NATS, compared.first, compared.events, whole=whole)
+    return NonGaussianAlternative(found, gain - POISSON_PENALTY_NATS, compared.parameters, compared.events, whole=whole)
 
 
 def _residual_series(fit: AxisFit) -> Floats:

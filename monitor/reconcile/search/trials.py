@@ -184,7 +184,7 @@ def _noise_step_trial(seen: WhitenedAxis) -> list[Trial]:
     margin_s = STEP_MARGIN_FRACTION * length_s
     if AngleRandomWalk not in seen.types or not margin_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s:
         return []
-    rivals = (history.trend, history.periodic.gain, history.wander)
+    rivals = (history.trend, history.periodic, history.wander)
     if step.gain <= max(rivals) - RIVAL_MARGIN_NATS or step.gain <= _band_burst_gain(seen) - RIVAL_MARGIN_NATS:
         return []
     bounds = {"time": _scaled_bounds(step.time), "ratio": _scaled_bounds(step.ratio)}

@@ -3,9 +3,9 @@
 The result is the meaning of the absence and a sentence that can be checked. The gap of a steady effect grows with the
 square root of the length of the recording. The gap of a temperature effect also grows with the range of the
 temperature. If the other noise is similar, the gap in the other recording can therefore be predicted to about one
-standard deviation. If the prediction is clearly larger than the threshold of that recording, the absence is a
+standard deviation. If the prediction is clearly larger than the threshold of the other recording, the absence is a
 contradiction. Otherwise the data are not sensitive enough. There is no conclusion for effects that happen once, for
-effects of another axis, and for recordings with an unnamed difference in the same diagnostic.
+leaks from another axis, and for recordings with an unnamed difference in the same diagnostic.
 """
 
 from dataclasses import dataclass
@@ -51,41 +51,34 @@ class StrongestObservation:
     seconds: float  # length of that recording, s
 
 
-def explain_absence(shown: StrongestObservation, run: str, other: Reconciliation) -> Absence:
-    """Return why a recording does not show an effect.
+def explain_absence(shown: StrongestObservation, other: Reconciliation) -> tuple[Meaning, str]:
+    """Return why a recording does not show an effect: the meaning, and a sentence that explains it.
 
     Parameters
     ----------
-    shown : Shown
+    shown : StrongestObservation
         Effect in the recording that shows it most clearly.
-    run : str
-        Name of the recording without the effect.
     other : Reconciliation
         Result of the recording without the effect.
     """
-    return Absence(run, *_explain_absence(shown, other))
-
-
-def _explain_absence(shown: StrongestObservation, other: Reconciliation) -> tuple[Meaning, str]:
-    """Return the meaning of the absence and the sentence that explains it."""
     step, of = shown.step, shown.of
     there = other.axes.get(of.axis)
     if there is None:
-        return "may_differ", f"{of.axis} is not in it"
+        return "may_differ", f"the recording does not contain {of.axis}"
     if step.effect in ONE_TIME_EFFECTS:
-        return "may_differ", "what happens once need not happen in another recording"
+        return "may_differ", "an effect that happens once need not happen in another recording"
     if rival := _confused_effect(step, of, there):
-        return "other_name", f"what is seen there was named {rival}, and the two are hard to tell apart"
+        return "other_name", f"the difference was named {rival} there, and the two effects are hard to distinguish"
     seen = next((score for score in there.end.scores if score.lens == step.found.lens), None)
     if any(score.lens == step.found.lens for score in there.left_over):
-        return "unnamed", f"through the same lens ({step.found.lens}) something without a name is left over there"
+        return "unnamed", f"the same diagnostic ({step.found.lens}) leaves a difference without a name there"
     if step.effect in LEAK_EFFECTS:
         source = step.parameters["source"].value
         if source not in other.axes:
-            return "too_faint", f"{source} is not in it"
-        return "may_differ", f"how much of it is seen depends on how {source} moves"
+            return "too_faint", f"the recording does not contain {source}"
+        return "may_differ", f"the contribution to the axis depends on the motion of {source}"
     if seen is None or not shown.gap > 0.0:
-        return "may_differ", f"the lens that found it ({step.found.lens}) tells nothing of its size there"
+        return "may_differ", f"the diagnostic that found the effect ({step.found.lens}) does not determine a size there"
     growth = _gap_ratio(step, shown.seconds, other.duration_s, seen)
     if growth is None:
         return "too_faint", "no changing temperature was recorded"
@@ -95,8 +88,8 @@ def _explain_absence(shown: StrongestObservation, other: Reconciliation) -> tupl
 def _compare_expected_gap(expected: float, growth: float, seen: Score, seconds: float) -> tuple[Meaning, str]:
     """Return whether an expected gap should have passed the threshold, with the sentence that explains it."""
     said = (
-        f"at the size seen elsewhere, its {seconds:.6g} s would show a gap of about {expected:.1f} ({seen.lens}), "
-        f"and the threshold of {seen.threshold:.1f} is not passed"
+        f"with the size in the other recording, {seconds:.6g} s of data would show a gap of about {expected:.1f} "
+        f"({seen.lens}), and the threshold of {seen.threshold:.1f} is not passed"
     )
     # a gap has a standard deviation of one, and so has the gap from which the expectation is scaled
     enough = seen.threshold + MIN_EXCESS_SIGMA * hypot(1.0, growth)

@@ -1,11 +1,10 @@
 """Comparison of several recordings of one sensor with one model: effects that all of them show, and effects of some.
 
 The reconciliations of the recordings with the same model give a ``Comparison``. Steps of two recordings are the same
-effect if they have the same name, the same kind and the same identifying parameter: a frequency, a time constant or a
-source axis. Identifying parameters match if their intervals overlap after they are stretched and widened by a share
-that allows for the drift of real sensors. An effect is common if every recording with the axis shows it. Its parameters
-are then pooled. Every other effect is single, and its absence in each other recording is explained. The sample rate
-error is common to all axes of a recording.
+effect if they have the same name, the same kind and matching identifying parameters (``effect_matching``). An effect is
+common if every recording with the axis shows this effect. The parameters of a common effect are pooled. Every other
+effect is single, and the absence in each other recording is explained. The sample rate error is common to all axes of a
+recording.
 
 The resulting model is the model under test with the common effects. An effect that only one recording shows is not yet
 a property of the sensor.
@@ -112,7 +111,7 @@ def compare(
 
     Parameters
     ----------
-    runs : sequence of Run
+    runs : sequence of NamedResult
         Two or more recordings with different names.
     fitted_to : str, optional
         Recording to which the five terms of the model were fitted.
@@ -127,25 +126,18 @@ def compare(
         dict(silent or {}),
         axes,
         baseline,
-        add_common_effects(baseline, axes, {run.name: run.result.model for run in runs}),
+        _add_common_effects(baseline, axes, {run.name: run.result.model for run in runs}),
         fitted_to,
         runs[0].result.seed,
     )
 
 
-def add_common_effects(
+def _add_common_effects(
     baseline: NoiseModel, axes: Mapping[str, AxisRuns], models: Mapping[str, NoiseModel]
 ) -> NoiseModel:
     """Return the model under test with the common effects and their pooled parameters.
 
-    Parameters
-    ----------
-    baseline : NoiseModel
-        Model under test.
-    axes : mapping of str to AxisRuns
-        Effects of each axis.
-    models : mapping of str to NoiseModel
-        Model of each recording, with all effects that were found.
+    ``models`` holds the model of each recording, with all effects that were found.
     """
     effects = dict(baseline.effects)
     for axis, one in axes.items():
@@ -245,7 +237,7 @@ def _summarise_group(group: Mapping[str, ReconciliationStep], axis: str, runs: S
     # the sample rate error may be on another axis in that recording
     of = next(one for one in strongest.result.axes.values() if any(own is step for own in one.steps))
     shown = StrongestObservation(step, of, _gap_of_effect(step, axis, strongest.result), strongest.result.duration_s)
-    absent = tuple(explain_absence(shown, run.name, run.result) for run in having if run.name not in group)
+    absent = tuple(Absence(run.name, *explain_absence(shown, run.result)) for run in having if run.name not in group)
     return MatchedEffect(first.effect, first.kind, dict(group), parameters, _size_agreement(sizes, parameters), absent)
 
 

@@ -7,12 +7,12 @@ becomes null. The ``parameters`` of an effect are pooled over the recordings tha
 ``report.json``, in ``folder``.
 """
 
-from math import isfinite
 from typing import Any, Final
 
 import msgspec
 
-from monitor.reconcile.result import ParameterInterval, ReconciliationStep
+from monitor.reconcile.report import finite_or_none, parameter_entry
+from monitor.reconcile.result import ReconciliationStep
 from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect, NamedResult
 
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
@@ -40,9 +40,9 @@ def _run_entry(run: NamedResult) -> dict[str, Any]:
         "name": run.name,
         "folder": run.name,
         "verdict": run.result.verdict,
-        "rate": _finite_or_none(run.result.rate_hz),
+        "rate": finite_or_none(run.result.rate_hz),
         "samples": int(run.result.samples),
-        "seconds": _finite_or_none(run.result.duration_s),
+        "seconds": finite_or_none(run.result.duration_s),
     }
 
 
@@ -68,11 +68,11 @@ def _effect_entry(seen: MatchedEffect) -> dict[str, Any]:
         "kind": seen.kind,
         "recordings": list(seen.steps),
         "parameters": {
-            name: {**_bounds_entry(one.bounds), **({} if one.p is None else {"p": _finite_or_none(one.p)})}
+            name: {**parameter_entry(one.bounds), **({} if one.p is None else {"p": finite_or_none(one.p)})}
             for name, one in seen.parameters.items()
         },
         "consistent": seen.consistent,
-        "p": _finite_or_none(seen.p),
+        "p": finite_or_none(seen.p),
         "each": {run: _step_entry(step) for run, step in seen.steps.items()},
     }
 
@@ -80,19 +80,7 @@ def _effect_entry(seen: MatchedEffect) -> dict[str, Any]:
 def _step_entry(step: ReconciliationStep) -> dict[str, Any]:
     """Return the report entry of one effect in one recording."""
     return {
-        "parameters": {name: _bounds_entry(one) for name, one in step.parameters.items()},
-        "confidence": _finite_or_none(step.confidence),
-        "gap": {"before": _finite_or_none(step.before.gap), "after": _finite_or_none(step.after.gap)},
+        "parameters": {name: parameter_entry(one) for name, one in step.parameters.items()},
+        "confidence": finite_or_none(step.confidence),
+        "gap": {"before": finite_or_none(step.before.gap), "after": finite_or_none(step.after.gap)},
     }
-
-
-def _bounds_entry(one: ParameterInterval) -> dict[str, Any]:
-    """Return the report entry of a parameter."""
-    if isinstance(one.value, str):
-        return {"value": one.value}
-    return {"value": _finite_or_none(one.value), "lo": _finite_or_none(one.lo), "hi": _finite_or_none(one.hi)}
-
-
-def _finite_or_none(value: float | None) -> float | None:
-    """Return the value, or None if it is not finite."""
-    return None if value is None or not isfinite(value) else float(value)

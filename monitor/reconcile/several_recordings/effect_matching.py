@@ -1,8 +1,9 @@
 """Matching of effects between recordings of one sensor.
 
-The key of an effect is the parameter that distinguishes effects of the same name: a frequency, a time constant or a
-source axis. Two keys match if their intervals overlap after they are stretched and widened by a share that allows for
-the drift of real sensors. An effect without a key occurs only once on an axis.
+An identifying parameter distinguishes effects of the same name. It is a frequency, a time constant or a source axis.
+Two identifying parameters match if their intervals overlap. Before this test, the intervals are stretched and widened
+by a share that allows for the drift of real sensors. An effect without an identifying parameter occurs only once on an
+axis.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,11 +45,11 @@ def identifying_parameter_name(effect: str) -> str:
 def identifying_parameter(step: ReconciliationStep, axis: str, model: NoiseModel) -> ParameterInterval | None:
     """Return the parameter that identifies an effect among effects of the same name.
 
-    A step that changes a known effect contains only its size. The model of the recording then provides the parameter.
+    A step that changes a known effect contains only the size. The model of the recording then provides the parameter.
 
     Parameters
     ----------
-    step : Step
+    step : ReconciliationStep
         Step of the reconciliation.
     axis : str
         Name of the axis.
@@ -70,7 +71,7 @@ def distance(effect: str, a: ParameterInterval | None, b: ParameterInterval | No
     ----------
     effect : str
         Name of the effect.
-    a, b : Bounds or None
+    a, b : ParameterInterval or None
         Identifying parameters in two recordings.
 
     Examples
@@ -97,7 +98,7 @@ def effect_of(model: NoiseModel, axis: str, step: ReconciliationStep) -> Effect:
         Model of the recording, with all effects that were found.
     axis : str
         Name of the axis.
-    step : Step
+    step : ReconciliationStep
         Step of the reconciliation.
     """
     clock = (

@@ -1,9 +1,9 @@
 """Weighted mean of one parameter over several recordings, and a test of whether the recordings agree.
 
-The 95 % intervals of the parameter in each recording give the mean with inverse variances as weights, its interval, and
-χ² with its degrees of freedom. If the intervals are symmetric as factors (a standard deviation, a time constant), the
-logarithm is averaged. If the recordings disagree, the interval of the mean is widened by √(χ²/ν) to reflect their
-scatter (Birge, "The calculation of errors by the method of least squares", Phys. Rev. 40, 1932). A parameter without an
+The mean is weighted with the inverse variances of the single recordings, which follow from the 95 % intervals. χ²
+measures the scatter of the recordings about the mean. If the intervals are symmetric as factors (a standard deviation,
+a time constant), the logarithm is averaged. If the recordings disagree, the interval of the mean is widened by √(χ²/ν)
+(Birge, "The calculation of errors by the method of least squares", Phys. Rev. 40, 1932). A parameter without an
 interval (the name of an axis, an order) is taken from the first recording.
 """
 
@@ -82,7 +82,7 @@ def distance_in_sigma(bounds: ParameterInterval, value: float) -> float:
 
     Parameters
     ----------
-    bounds : Bounds
+    bounds : ParameterInterval
         Parameter with its interval.
     value : float
         Value in the unit of the parameter.

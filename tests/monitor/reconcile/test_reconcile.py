@@ -26,10 +26,10 @@ from monitor.reconcile.likelihood.axis import RegressorCache
 from monitor.reconcile.preparation.recording import (
     MIN_SAMPLES,
     Recording,
+    _smooth_temperature,
     select_usable_axes,
-    smooth_temperature,
 )
-from monitor.reconcile.reconcile import RunContext, effects_by_axis, fit_five_terms, reconcile
+from monitor.reconcile.reconcile import RunContext, _effects_by_axis, fit_five_terms, reconcile
 from monitor.reconcile.report import encode_report
 from monitor.reconcile.result import combine_decisions
 from tests.monitor.reconcile.axes import (
@@ -213,8 +213,8 @@ def test_axes_that_cannot_be_compared_are_left_out_and_told():
 
 def test_a_constant_bias_is_no_part_of_the_comparison():
     model = MODEL + NoiseModel({"gz": (Bias(value=0.3),)})
-    assert effects_by_axis(model, drawn())["gz"] == TERMS
-    assert effects_by_axis(NoiseModel({}), drawn()) == dict.fromkeys(GYRO_AXES, ())
+    assert _effects_by_axis(model, drawn())["gz"] == TERMS
+    assert _effects_by_axis(NoiseModel({}), drawn()) == dict.fromkeys(GYRO_AXES, ())
 
 
 def test_temperature_is_made_smooth_and_whole():
@@ -222,12 +222,12 @@ def test_temperature_is_made_smooth_and_whole():
     true = changing(n)
     noisy = true + 0.3 * rng.standard_normal(n)
     noisy[rng.random(n) < 0.5] = np.nan
-    found = smooth_temperature(noisy)
+    found = _smooth_temperature(noisy)
     assert np.isfinite(found).all()
     inside = slice(100, -100)
     assert np.std((found - true)[inside]) < 0.1
-    np.testing.assert_allclose(smooth_temperature(np.full(n, 25.0)), 25.0)
-    assert smooth_temperature(np.array([1.0, np.nan, 3.0])).tolist() == [1.0, 2.0, 3.0]
+    np.testing.assert_allclose(_smooth_temperature(np.full(n, 25.0)), 25.0)
+    assert _smooth_temperature(np.array([1.0, np.nan, 3.0])).tolist() == [1.0, 2.0, 3.0]
 
 
 @pytest.mark.parametrize(

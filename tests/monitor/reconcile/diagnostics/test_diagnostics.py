@@ -8,9 +8,9 @@ from scipy.signal import periodogram
 from monitor.noise.effects import AngleRandomWalk, NoiseStep, RateRandomWalk, Resolution, Sinusoidal
 from monitor.reconcile.diagnostics import diagnostics
 from monitor.reconcile.diagnostics.diagnostics import (
+    _regressor_gain,
     find_line_peaks,
     power_gain,
-    regressor_gain,
     step_gains,
 )
 from monitor.reconcile.likelihood.whitening import noise_deviation_over_time
@@ -48,9 +48,11 @@ def test_gain_of_a_course_is_that_of_least_squares():
     t = time_s(n)
     view = seen(axis(drawn(1) + 1e-4 * t), MODEL)
     columns = [cosine_transform(t), cosine_transform(t**2), cosine_transform(np.cos(t))]
-    assert regressor_gain(view, columns[:1]) == pytest.approx(least_squares(view, columns[:1]), rel=1e-6)
-    assert regressor_gain(view, columns) == pytest.approx(least_squares(view, columns), rel=1e-5)
-    assert regressor_gain(view, [columns[0], columns[0]]) == pytest.approx(regressor_gain(view, columns[:1]), rel=1e-4)
+    assert _regressor_gain(view, columns[:1]) == pytest.approx(least_squares(view, columns[:1]), rel=1e-6)
+    assert _regressor_gain(view, columns) == pytest.approx(least_squares(view, columns), rel=1e-5)
+    assert _regressor_gain(view, [columns[0], columns[0]]) == pytest.approx(
+        _regressor_gain(view, columns[:1]), rel=1e-4
+    )
 
 
 def test_gain_of_power_is_that_of_a_variance_of_its_own():

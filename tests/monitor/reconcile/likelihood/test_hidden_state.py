@@ -7,10 +7,11 @@ from scipy.stats import multivariate_normal
 from monitor.reconcile.likelihood.hidden_state import (
     MAX_LOG_PARAMETER_RANGE,
     BackgroundNoise,
-    LikelihoodMaximum,
+    _flicker_processes,
+    _log_interval,
     block_markov_noise,
     block_means,
-    flicker_processes,
+    fit_process,
     kalman_log_likelihood,
     maximise,
     prior_level_variance,
@@ -32,7 +33,7 @@ def test_filter_is_the_dense_gaussian_likelihood(rest):
     covariance = dense(rest, 300, start=5.0)
     means = np.linalg.cholesky(covariance) @ np.random.default_rng(0).standard_normal(300)
     around = state_space_noise(rest, BLOCK_S, 300 * BLOCK_S)
-    found = kalman_log_likelihood(means, around.table, around.white, 5.0)
+    found = kalman_log_likelihood(means, around, 5.0)
     assert found == pytest.approx(multivariate_normal.logpdf(means, cov=covariance), abs=1e-6)
 
 
@@ -50,11 +51,11 @@ def test_slow_process_is_a_random_walk_in_a_block():
 def test_flicker_is_one_over_f_until_white_noise_rules():
     rest, span_s = BackgroundNoise(2.25e-8, flicker=9e-10), 3600.0
     f = np.geomspace(1.0 / span_s, rest.flicker / (2.0 * np.pi * rest.white), 50)
-    summed = sum(2.0 * s * s * t / (1.0 + (2.0 * np.pi * f * t) ** 2) for s, t in flicker_processes(rest, 1.0, span_s))
+    summed = sum(2.0 * s * s * t / (1.0 + (2.0 * np.pi * f * t) ** 2) for s, t in _flicker_processes(rest, 1.0, span_s))
     assert summed == pytest.approx(rest.flicker / (2.0 * np.pi * f), rel=0.25)
     inside = f > 4.0 / span_s
     assert summed[inside] == pytest.approx(rest.flicker / (2.0 * np.pi * f[inside]), rel=0.12)
-    assert flicker_processes(BackgroundNoise(1.0), 1.0, span_s) == []
+    assert _flicker_processes(BackgroundNoise(1.0), 1.0, span_s) == []
 
 
 def test_maximum_and_its_width():
@@ -64,25 +65,28 @@ def test_maximum_and_its_width():
         x = np.log([a, b]) - target
         return 7.0 - 0.5 * x @ inverse @ x
 
-    peak = maximise(likelihood, (5e-4, 9.0))
-    assert peak.height == pytest.approx(7.0, abs=0.02)
-    assert peak.at == pytest.approx(np.exp(target), rel=0.05)
-    assert peak.deviation == pytest.approx(np.sqrt(np.diag(np.linalg.inv(inverse))), rel=1e-4)
-    bounds = peak.bounds(1)
-    assert bounds.hi / bounds.value == pytest.approx(np.exp(1.96 * peak.deviation[1]))
-    assert bounds.lo * bounds.hi == pytest.approx(bounds.value**2)
+    height, at = maximise(likelihood, (5e-4, 9.0))
+    assert height == pytest.approx(7.0, abs=0.02)
+    assert at == pytest.approx(target, abs=0.05)
+    found = fit_process(lambda a, b, odds: likelihood(a, b) + 12.0 * np.log(odds), {"a": 5e-4, "b": 9.0})
+    assert found.log_likelihood == height
+    assert found.events == pytest.approx(12.0, rel=1e-3)
+    for k, name in enumerate(("a", "b")):
+        bounds = found.parameters[name]
+        assert bounds.value == pytest.approx(np.exp(at[k]))
+        assert bounds.hi / bounds.value == pytest.approx(np.exp(1.96 * np.linalg.inv(inverse)[k, k] ** 0.5), rel=1e-4)
+        assert bounds.lo * bounds.hi == pytest.approx(bounds.value**2)
 
 
 def test_no_interval_without_a_peak():
-    flat = maximise(lambda a, b: -0.0 * a * b, (1.0, 1.0))
-    assert np.isnan(flat.deviation).all()
-    assert flat.bounds(0).lo is None
-    assert LikelihoodMaximum(0.0, np.array([1.0]), np.array([MAX_LOG_PARAMETER_RANGE])).bounds(0).hi is None
+    flat = fit_process(lambda a, b, _odds: -0.0 * a * b, {"a": 1.0, "b": 1.0})
+    assert flat.parameters["a"].lo is None
+    assert _log_interval(1.0, MAX_LOG_PARAMETER_RANGE).hi is None
 
 
 def test_search_does_not_leave_the_neighbourhood_of_its_start():
-    peak = maximise(np.log, (2.0,))
-    assert 2.0 < peak.at[0] <= 60.0 * (1.0 + 1e-9)
+    _, (at,) = maximise(np.log, (2.0,))
+    assert 2.0 < np.exp(at) <= 60.0 * (1.0 + 1e-9)
 
 
 def test_block_means():

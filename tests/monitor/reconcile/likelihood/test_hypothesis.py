@@ -14,12 +14,12 @@ from monitor.noise.effects import (
     Sinusoidal,
 )
 from monitor.reconcile.likelihood.hypothesis import (
+    _with_shape,
     fit_with_fewest_changes,
     fit_with_given_sizes,
     refine_shape,
     shape_bounds,
     size_bounds,
-    with_shape,
 )
 from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, K, N, axis, correlated, time_s, walk, white
 
@@ -79,7 +79,7 @@ def test_a_shape_is_at_the_top_of_its_profile():
     found = refine_shape(one, effects, 1, ["correlation_time"], 3.0)
 
     def loss(x):
-        return -one.fit(with_shape(effects, 1, "correlation_time", float(np.exp(x)))).log_likelihood
+        return -one.fit(_with_shape(effects, 1, "correlation_time", float(np.exp(x)))).log_likelihood
 
     best = minimize_scalar(loss, bounds=(np.log(0.2), np.log(2.0)), method="bounded", options={"xatol": 1e-4})
     assert found[1].correlation_time == pytest.approx(np.exp(best.x), rel=0.05)
@@ -98,7 +98,7 @@ def test_an_interval_of_a_shape_ends_where_its_profile_has_fallen():
     assert found.lo < found.value < found.hi
     assert found.lo < 0.5 < found.hi
     for end in (found.lo, found.hi):
-        fallen = state.fit.log_likelihood - one.fit(with_shape(effects, 1, "correlation_time", end)).log_likelihood
+        fallen = state.fit.log_likelihood - one.fit(_with_shape(effects, 1, "correlation_time", end)).log_likelihood
         assert fallen == pytest.approx(0.5 * chi2.ppf(0.95, 1), abs=0.2)
 
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from monitor.reconcile.likelihood import single_steps
-from monitor.reconcile.likelihood.hidden_state import BackgroundNoise, state_space_noise
+from monitor.reconcile.likelihood.hidden_state import BackgroundNoise, block_means, state_space_noise
 from monitor.reconcile.likelihood.single_steps import compare_steps_with_single_steps
 from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, white
 
@@ -28,7 +28,7 @@ def test_every_shock_gains_what_a_regression_gains(short):
     free = np.zeros(M)
     free[known] = 1e4
     covariance += 1e4 * np.outer(np.arange(M) >= known, np.arange(M) >= known)
-    scores = single_steps.shock_statistics(means, around.table, around.white, 50.0, free)
+    scores = single_steps._shock_statistics(means, around, 50.0, free)
     for k in (3, 17, 39, 55):
         step = (np.arange(M) >= k).astype(float)
         solved = np.linalg.solve(covariance, np.column_stack([step, means]))
@@ -39,7 +39,7 @@ def test_whitened_columns_have_the_dense_likelihood(short):
     means, covariance = short
     around = state_space_noise(REST, BLOCK_S, M * BLOCK_S)
     columns = np.column_stack([means, np.arange(M) >= 20.0])
-    logs = single_steps.whiten(columns, around.table, around.white, 50.0)
+    logs = single_steps._whiten(columns, around, 50.0)
     assert -0.5 * (logs + columns[:, 0] @ columns[:, 0]) == pytest.approx(
         multivariate_normal.logpdf(means, cov=covariance)
     )
@@ -52,17 +52,14 @@ def stepped(times, heights, rng):
     return white(HOUR, rng) + sum(height * (t >= time) for time, height in zip(times, heights, strict=True))
 
 
-def test_finds_times_and_heights():
+def test_finds_times():
     times, heights = (700.3, 1801.7, 2950.1), (4e-4, -3e-4, 5e-4)
-    found = compare_steps_with_single_steps(
-        stepped(times, heights, np.random.default_rng(0)), TAU0_S, BackgroundNoise(N * N), 1e-5
-    )
-    assert list(found.second) == ["time_1", "height_1", "time_2", "height_2", "time_3", "height_3"]
-    for k in range(3):
-        time, height = found.second[f"time_{k + 1}"], found.second[f"height_{k + 1}"]
-        assert time.lo <= times[k] <= time.hi < time.lo + 20.0
-        assert time.value == pytest.approx(times[k], abs=3.0)
-        assert height.lo < heights[k] < height.hi
+    y = stepped(times, heights, np.random.default_rng(0))
+    means, block_s = block_means(y, TAU0_S, 5.0)
+    noise = state_space_noise(BackgroundNoise(N * N), block_s, means.size * block_s)
+    assert single_steps._fit_single_steps(means, noise, 5).times * block_s == pytest.approx(times, abs=3.0)
+    found = compare_steps_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5)
+    assert found.single_steps == 3
     assert found.gain < 2.0
 
 
@@ -70,13 +67,13 @@ def test_nothing_is_no_step():
     contest = compare_steps_with_single_steps(
         white(HOUR, np.random.default_rng(1)), TAU0_S, BackgroundNoise(N * N), 2e-6
     )
-    assert contest.second == {}
+    assert contest.single_steps == 0
     assert abs(contest.gain) < 2.0
 
 
 def test_no_more_than_are_asked_for():
     y = stepped((500.0, 1500.0, 2500.0), (4e-4, 4e-4, 4e-4), np.random.default_rng(2))
-    assert len(compare_steps_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5, most=2).second) == 4
+    assert compare_steps_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5, most=2).single_steps == 2
 
 
 def test_one_step_is_no_process():
@@ -95,7 +92,6 @@ def test_steps_stay_apart_in_neighbouring_blocks():
     """A climb in two blocks side by side: times are refined without ever meeting, where no height could be told."""
     means = np.where(np.arange(M) < 30, 0.0, np.where(np.arange(M) < 31, 20.0, 60.0)) - 29.0
     means = means + 0.1 * np.random.default_rng(0).standard_normal(M)
-    found = single_steps.fit_single_steps(means, state_space_noise(BackgroundNoise(0.03), BLOCK_S, M * BLOCK_S), 2)
+    found = single_steps._fit_single_steps(means, state_space_noise(BackgroundNoise(0.03), BLOCK_S, M * BLOCK_S), 2)
     assert found.times.size == 2
     assert found.times[1] - found.times[0] >= 1.0
-    assert found.heights == pytest.approx([20.0, 40.0], rel=0.05)

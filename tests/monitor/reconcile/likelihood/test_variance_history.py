@@ -50,23 +50,11 @@ def test_intervals_hold_the_truth():
     assert 106 <= inside <= 120  # of 120 at 95 %
 
 
-def test_one_step_leaves_nothing_and_several_are_told_one_after_the_other():
-    w = noise()
-    w[20_000:] *= 1.3
-    assert [one.gain > 12.0 for one in fit_variance_history(w, TAU0).changes] == [True, False]
-    w[45_000:] *= 0.8
-    changes = fit_variance_history(w, TAU0).changes
-    assert sorted(one.time.value for one in changes[:2]) == pytest.approx([200.0, 450.0], abs=3.0)
-    assert changes[2].gain < 12.0
-
-
 @pytest.mark.parametrize("frequency", [0.007, 0.11, 0.6])
 def test_breathing_noise_is_periodic_before_it_is_a_step(frequency):
     found = fit_variance_history(noise() * np.exp(0.15 * np.sin(2.0 * np.pi * frequency * T)), TAU0)
-    assert found.periodic.frequency == pytest.approx(frequency, rel=0.02)
-    assert found.periodic.depth == pytest.approx(0.15, rel=0.3)
-    assert found.periodic.gain > 50.0
-    assert found.periodic.gain > found.step.gain + 20.0
+    assert found.periodic > 50.0
+    assert found.periodic > found.step.gain + 20.0
 
 
 def test_a_trend_gains_more_than_a_step():
@@ -85,15 +73,8 @@ def test_steady_noise_gains_little():
     courses = [fit_variance_history(noise(seed), TAU0) for seed in range(30)]
     assert max(one.step.gain for one in courses) < 12.0
     assert max(one.trend for one in courses) < 9.0
-    assert max(one.periodic.gain for one in courses) < 18.0
+    assert max(one.periodic for one in courses) < 18.0
     assert max(one.wander for one in courses) < 9.0
-
-
-def test_the_energies_are_those_of_the_blocks():
-    w = noise()
-    found = fit_variance_history(w, TAU0)
-    length = round(found.block_s / TAU0)
-    assert found.energy[7] == pytest.approx(np.mean(w[7 * length : 8 * length] ** 2))
 
 
 def within(pair, value):
@@ -104,7 +85,6 @@ def test_a_line_that_comes_and_goes_is_found_in_time_and_frequency():
     w = noise() + np.where((T > 200.0) & (T < 330.0), 0.3, 0.0) * np.sin(2.0 * np.pi * 31.4 * T)
     found = find_least_constant_tiles(w, TAU0)
     assert found.gain > 50.0
-    assert found.ratio > 2.0
     assert within(found.frequency, 31.4)
     assert within((200.0 - 25.0, 330.0 + 25.0), sum(found.time) / 2.0)
     assert found.row_gain > 50.0
@@ -122,7 +102,6 @@ def test_a_pause_is_found_too():
     w = noise()
     w[30_000:34_000] *= 0.7
     found = find_least_constant_tiles(w, TAU0)
-    assert found.ratio < 0.8
     assert found.gain > 30.0
 
 
@@ -163,5 +142,5 @@ def test_too_few_samples_are_refused(look):
 
 def test_short_recordings_have_short_pieces_only():
     found = find_least_constant_tiles(noise()[:5_000], TAU0)
-    assert found.seconds == (2.56, 2.56)
     assert found.gain < 15.0
+    assert round((found.time[1] - found.time[0]) / 2.56) >= 1

@@ -21,7 +21,7 @@ from monitor.noise.effects import (
 )
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.search import candidates
-from monitor.reconcile.search.candidates import PENALTY_NATS, find_spectral_peaks, line_frequency
+from monitor.reconcile.search.candidates import PENALTY_NATS, _line_frequency, find_spectral_peaks
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
     TERMS,
@@ -106,7 +106,7 @@ def test_a_line():
     best = minimize_scalar(
         lambda f: -abs(np.exp(-2j * np.pi * f * t) @ view.white), bounds=(17.303, 17.306), method="bounded"
     )
-    assert line_frequency(view, 17.303) == pytest.approx(best.x, abs=1e-5)
+    assert _line_frequency(view, 17.303) == pytest.approx(best.x, abs=1e-5)
     assert asked(candidates.propose_sinusoids, axis(noise(5))) == {}
 
 

@@ -43,7 +43,7 @@ def test_what_is_not_known_is_null_or_absent() -> None:
     (single,) = written(made())["axes"]["gz"]["single"]
     assert single["parameters"] == {"source": {"value": "gx"}, "coefficient": {"value": 0.1, "lo": None, "hi": None}}
     assert (single["consistent"], single["p"]) == (None, None)
-    assert single["absent"] == [{"run": "a", "meaning": "too_faint", "because": "gx is not in it"}]
+    assert single["absent"] == [{"run": "a", "meaning": "too_faint", "because": "the recording does not contain gx"}]
 
 
 def test_what_is_no_number_is_null() -> None:
