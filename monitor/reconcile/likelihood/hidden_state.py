@@ -20,6 +20,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
+from monitor.common.distributions import Z95
 from monitor.reconcile.result import ParameterInterval
 
 MAX_BLOCKS: Final = 1 << 15
@@ -271,7 +272,7 @@ def _log_interval(value: float, deviation: float) -> ParameterInterval:
 
     ``deviation`` is the standard deviation of the logarithm.
     """
-    wide = INTERVAL_SIGMAS * deviation
+    wide = Z95 * deviation
     if not wide < MAX_LOG_PARAMETER_RANGE:
         return ParameterInterval(value)
     return ParameterInterval(value, value * exp(-wide), value * exp(wide))
