@@ -9,7 +9,7 @@ import time
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -28,14 +28,12 @@ from monitor.daemon.pipeline import DevicePipeline, KernelReadiness
 from monitor.daemon.ring_buffer import RingBuffer
 from monitor.daemon.slewed_clock import MAX_SLEW_RATE, SlewedClock
 from monitor.daemon.storage.recorder import Recorder, RecordingTail
-from monitor.drift.compensation.live_compensation import DriftUpdate, LiveCompensation
-from monitor.drift.thermal.live_thermal import ThermalUpdate
-from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalCurve
+from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.estimation.detection.model_agreement import ModelAgreement
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.window_snapshot import WindowSnapshot
+from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings.loading import Device, VirtualTable
 
 RING_S: Final = 10.0
@@ -90,45 +88,23 @@ class Output:
             Offset that converts the times to Unix time, in nanoseconds.
         """
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Receive a new estimate.
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        """Receive a result of one of the kinds in ``monitor.publishing.result_kinds``.
+
+        Estimates arrive at the configured rate. A device without a model in force has no ``ModelGap``, and a device
+        without a thermal model no ``ThermalUpdate``. ``DriftUpdate`` arrives every second of drift compensation, and
+        ``SlowStatistics`` when its step by step computation is complete.
 
         Parameters
         ----------
         device : str
             Name of the device.
         unix_s : float
-            Time of the newest sample in the window.
-        estimate : Estimate
-            Allan curve and noise coefficients.
-        """
-
-    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """Receive the comparison of the window with the model in force. Not called for a device without a model.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float
-            Time of the newest sample in the window.
-        gap : ModelGap
-            Comparison of the window with the model.
-        """
-
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
-        """Receive the mean of an interval and its prediction from temperature. Not called without a thermal model.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float
-            Time of the interval.
+            Time of the result: of the newest sample in the window, or of the end of the interval.
         received : int
             Number of samples of the device since the start.
-        look : ThermalUpdate
-            Mean of the interval and its prediction.
+        result : object
+            The result.
         """
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
@@ -144,36 +120,6 @@ class Output:
             Compensated samples in SI units, with times in nanoseconds.
         offset_ns : array of int64, shape (n,), or int
             Offset that converts the times to Unix time, in nanoseconds.
-        """
-
-    def drift(self, device: str, unix_s: float, look: DriftUpdate) -> None:
-        """Receive the state of the drift compensation after an interval of one second.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float
-            Time of the interval.
-        look : DriftUpdate
-            Drift, innovations and models.
-        """
-
-    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
-        """Receive the total and Hadamard deviations, which are computed step by step and published when complete.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float
-            Time of the newest sample.
-        received : int
-            Number of samples of the device since the start.
-        total : TotalCurve
-            Total deviations.
-        hadamard : HadamardCurve
-            Hadamard deviations.
         """
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
@@ -637,8 +583,7 @@ class DeviceWorker:
             for output in outputs:
                 output.compensated(self.name, self.published - len(samples) + at, without, offsets_ns)
         for look in live.take():
-            for output in outputs:
-                output.drift(self.name, self.unix_s(look.t_ns), look)
+            self._publish_result(outputs, look.t_ns, look)
 
     def _publish_estimate(self, outputs: Sequence[Output], now_s: float, drain: bool) -> bool:
         """Update the fit and publish the estimate if it is due; return True if it was published."""
@@ -663,8 +608,7 @@ class DeviceWorker:
         if not (self._due("publish", self.device.publish_s, now_s) or drain):
             return False
         self._refitted = False
-        for output in outputs:
-            output.estimate(self.name, self.unix_s(self.latest.t_ns), self.latest)
+        self._publish_result(outputs, self.latest.t_ns, self.latest)
         if self.chain.model_in_force is not None:
             look = self.chain.model_in_force.compare(self.latest)
             self._publish_gap(outputs, replace(look, axes={}) if any(self._rate_doubts) else look)
@@ -691,9 +635,13 @@ class DeviceWorker:
         """Publish the comparison of the window with the model in force, and its events."""
         events = self._agreement.update(look)
         look = replace(look, agrees=self._agreement.verdicts)
-        for output in outputs:
-            output.model_gap(self.name, self.unix_s(look.t_ns), look)
+        self._publish_result(outputs, look.t_ns, look)
         self._publish_events(outputs, events)
+
+    def _publish_result(self, outputs: Sequence[Output], t_ns: int, result: Any) -> None:
+        """Publish a result that belongs to the host time ``t_ns``."""
+        for output in outputs:
+            output.result(self.name, self.unix_s(t_ns), self.driver.counts.received, result)
 
     def _publish_events(self, outputs: Sequence[Output], events: Sequence[Event]) -> None:
         """Publish events."""
@@ -710,14 +658,12 @@ class DeviceWorker:
         found = estimator.step_slow_statistics()
         self._next_s["total"] = now_s + max(TOTAL_INTERVAL_S, (time.perf_counter() - begun_s) / TOTAL_CPU_SHARE)
         if found is not None:
-            for output in outputs:
-                output.total(self.name, self.unix_s(self.chain.newest_ns), self.driver.counts.received, *found)
+            self._publish_result(outputs, self.chain.newest_ns, SlowStatistics(*found))
 
     def _publish_thermal(self, outputs: Sequence[Output], now_s: float) -> None:
         """Publish the finished thermal intervals, and continue the selection of a thermal model."""
         for look in self.chain.take_thermal_intervals():
-            for output in outputs:
-                output.thermal(self.name, self.unix_s(look.t_ns), self.driver.counts.received, look)
+            self._publish_result(outputs, look.t_ns, look)
         thermal = self.chain.thermal
         if thermal is None or not thermal.choosing or now_s < self._next_s["thermal"]:
             return

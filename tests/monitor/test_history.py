@@ -59,8 +59,9 @@ class Told(Output):
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         self.received = received
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        self.estimates.append((unix_s, estimate))
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        if isinstance(result, Estimate):
+            self.estimates.append((unix_s, result))
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.events.append((unix_s, event))

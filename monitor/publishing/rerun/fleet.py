@@ -17,8 +17,9 @@ from monitor.common import topics
 from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import AllanMessage, EventMessage, StatusMessage
 from monitor.publishing.remote_devices import DeviceStates, split_key
-from monitor.publishing.rerun.panels import fleet_text
+from monitor.publishing.rerun.panel_text import fleet_text
 from monitor.publishing.rerun.view import RerunView
+from monitor.publishing.result_kinds import OverviewText, SampleRows
 from monitor.publishing.terminal.watch import connection_note
 from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
 
@@ -106,12 +107,12 @@ class FleetView:
         decoded = self.board.process_message(message.key, message.payload)
         device, topic = split_key(message.key) or ("", topics.ALIVE)
         if isinstance(decoded, EventMessage) and decoded.t is not None:
-            self._viewer.event(device, decoded.t, decoded.to_event())
+            self._viewer.put(device, decoded.t, decoded.to_event())
         elif device not in self._detail:
             return
         elif isinstance(decoded, StatusMessage):
             if decoded.t is not None:
-                self._viewer.health(device, decoded.t, decoded.to_health())
+                self._viewer.put(device, decoded.t, decoded.to_health())
         elif decoded is None:
             try:
                 self._show(device, topic, message.payload)
@@ -129,18 +130,20 @@ class FleetView:
             Current time on the clock of the messages [s].
         """
         devices = self.board.devices(now_s)
-        self._viewer.overview(wall_s, fleet_text(devices, now_s, MAX_ROWS, connection_note(self.board, self._arriving)))
+        note = connection_note(self.board, self._arriving)
+        self._viewer.put("", wall_s, OverviewText(fleet_text(devices, now_s, MAX_ROWS, note)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
         """Pass samples or a curve of a device shown in detail to the viewer."""
         if topic is topics.SAMPLES:
             rows = decode_samples(payload).block
-            self._viewer.samples(device, rows.t_ns / 1e9, rows.values, rows.temperature_c)
+            unix_s = rows.t_ns / 1e9
+            self._viewer.put(device, float(unix_s[-1]), SampleRows(unix_s, rows.values, rows.temperature_c))
         elif topic is topics.ALLAN:
             message, known = decode_message(AllanMessage, payload), self.board.coefficients(device)
             if known is not None:
                 estimate = message.to_estimate(known.coefficients, known.k_or_r)
-                self._viewer.estimate(device, estimate.t_ns / 1e9, estimate)
+                self._viewer.put(device, estimate.t_ns / 1e9, estimate)
 
     def _trouble(self) -> str:
         """Return the problems of the viewer and of the subscriber."""

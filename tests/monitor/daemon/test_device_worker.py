@@ -17,7 +17,12 @@ from drivers.sample import concatenate_blocks, make_block
 from monitor.daemon import device_worker
 from monitor.daemon.device_worker import DeviceWorker
 from monitor.daemon.pipeline import KernelReadiness
+from monitor.drift.compensation.live_compensation import DriftUpdate
+from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import Status
+from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings import loading as settings
 from monitor.settings.loading import Device
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -38,24 +43,16 @@ class Caught:
         self.blocks.append(samples)
         self.counts.append(received)
 
-    def estimate(self, device, unix_s, estimate):
-        self.estimates.append((unix_s, estimate))
-
-    def gap(self, device, unix_s, gap):
-        self.gaps.append((unix_s, gap))
-
-    def thermal(self, device, unix_s, received, look):
-        self.thermals.append((unix_s, look))
+    def result(self, device, unix_s, received, result):
+        kept = {Estimate: self.estimates, ModelGap: self.gaps, ThermalUpdate: self.thermals, DriftUpdate: self.drifts}
+        if isinstance(result, SlowStatistics):
+            self.totals.append((received, *result))
+            self.total_times.append(unix_s)
+        else:
+            kept[type(result)].append((unix_s, result))
 
     def compensated(self, device, received, samples, offset_ns):
         self.rates.append(samples)
-
-    def drift(self, device, unix_s, look):
-        self.drifts.append((unix_s, look))
-
-    def total(self, device, unix_s, received, total, hadamard):
-        self.totals.append((received, total, hadamard))
-        self.total_times.append(unix_s)
 
     def event(self, device, unix_s, received, event):
         self.events.append((unix_s, event))
@@ -736,7 +733,7 @@ def test_a_step_of_the_bias_is_an_event_of_its_time():
         rig.finish_models()
     told = [event for _, event in rig.caught.events if event.kind == "drift_unexplained" and "stepped" in event.text]
     assert [event.axis for event in told] == ["gy"]
-    assert told[0].what["bias"]["size"] == pytest.approx(0.02, rel=0.05)
+    assert told[0].values["bias"]["size"] == pytest.approx(0.02, rel=0.05)
     assert 390 < told[0].t_ns / 1e9 < 510  # as long as the level before had been confirmed, 5 min at most
 
 

@@ -296,7 +296,7 @@ def test_a_full_disk_keeps_nothing_half_and_resumes(tmp_path: Path) -> None:
         writers.RETRY_S = 0.05
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         path = Path({str(tmp_path / "h.sqlite")!r})
-        writer = writers.Writer(path, lambda: 0.0)
+        writer = writers.HistoryWriter(path, lambda: 0.0)
         writer.start()
         fill(writer, 20)
         wait_for(lambda: writer.written == 40)
