@@ -69,7 +69,7 @@ class DeviceCoefficients:
         """
         axes = tuple(axis for axis in AXES if axis in message.axes)
         k_or_r = frozenset(axis for axis in axes if any(one.other for one in message.axes[axis].values()))
-        return cls(message.to_coefficients(), axes, k_or_r, message.filled)
+        return cls(message.to_coefficients(), axes, k_or_r, message.filled_s)
 
 
 @dataclass(slots=True)

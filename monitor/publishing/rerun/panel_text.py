@@ -123,7 +123,7 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
     ]
     if status is None:
         return f"| **{name}** | {word} | | | | | {' | '.join(noise)} | nothing known yet |"
-    rate = format_sample_rate(status.rate)
+    rate = format_sample_rate(status.rate_hz)
     trouble = _escape_cell(one.problems()) or (
         f"no data for {now_s - one.last_message_s:.1f} s" if state in ("gone", "silent") else ""
     )

@@ -229,7 +229,7 @@ def _count_cells(one: RemoteDevice, layout: Layout) -> list[Text]:
     """Return the cells of the rate and of the sample counters."""
     if one.status is None:
         return [Text(NO_VALUE, style="dim")] * 4
-    rate = NO_VALUE if one.status.rate is None else format_number(one.status.rate, 4)
+    rate = NO_VALUE if one.status.rate_hz is None else format_number(one.status.rate_hz, 4)
     write = "{:,}".format if layout.full_counts else format_short_count
     lost, bad = (Text(write(count), style="yellow" if count else "dim") for count in (one.status.lost, one.status.bad))
     return [Text(rate), Text(write(one.status.received)), lost, bad]

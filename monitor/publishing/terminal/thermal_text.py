@@ -3,7 +3,6 @@
 import math
 from typing import Any, Final
 
-import msgspec
 import numpy as np
 from rich.console import Console
 from rich.padding import Padding
@@ -17,6 +16,7 @@ from monitor.drift.thermal.thermal_model import Prediction
 from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_study import ModelComparison, ThermalFitReport, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
+from monitor.publishing.messages.message import encode_json
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
@@ -176,14 +176,7 @@ def _json(
         "refused": dict(refused),
         "notes": list(notes),
     }
-    return msgspec.json.encode(whole, enc_hook=_encode_array)
-
-
-def _encode_array(value: Any) -> Any:
-    """Convert an array for JSON; values that are not finite become null."""
-    if isinstance(value, np.ndarray):
-        return [float(x) if np.isfinite(x) else None for x in value]
-    raise TypeError(f"{type(value).__name__} has no JSON")
+    return encode_json(whole)
 
 
 def _summary_line(recording: str, interval_s: float, means: Any) -> str:
