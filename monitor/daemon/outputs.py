@@ -17,7 +17,7 @@ from monitor.daemon.device_worker import Output
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.history.minute_aggregation import MinuteAggregator
-from monitor.history.sqlite_store import StoredEvent
+from monitor.history.stored_events import StoredEvent
 from monitor.history.writer import HistoryWriter
 from monitor.publishing.messages.message import Message
 from monitor.publishing.messages.results import (

@@ -17,7 +17,8 @@ from drivers.errors import NotReady
 from drivers.sample import Floats, Ints
 from monitor.common.units import format_utc
 from monitor.history.bucket import HistoryRow, Singles, merge_rows, select_columns
-from monitor.history.sqlite_store import HistoryReader, StoredEvent
+from monitor.history.sqlite_store import HistoryReader
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 
 DEFAULT_POINTS: Final = 1000
@@ -116,9 +117,9 @@ def read_history(
     Raises
     ------
     NotReady
-        The time range contains no rows and no events.
+        If the time range contains no rows and no events.
     RecordingError
-        A row cannot be read.
+        If a row cannot be read.
     """
     held = reader.stored_range(device)
     if held is None:

@@ -37,9 +37,9 @@ from monitor.history.sqlite_store import (
     REPLACED,
     SQLITE_SUFFIXES,
     HistoryStore,
-    StoredEvent,
     UnusableHistory,
 )
+from monitor.history.stored_events import StoredEvent
 
 QUEUE_CAPACITY: Final = 4096
 """Capacity of the queue in rows and events: three days of a full disk with one device, about 12 MB."""

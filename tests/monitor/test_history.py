@@ -19,7 +19,8 @@ from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history import reading as past
 from monitor.history.reading import HistoryTable
-from monitor.history.sqlite_store import FILE_NAME, StoredEvent, open_history
+from monitor.history.sqlite_store import FILE_NAME, open_history
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.noise.catalogue import read_model
 from monitor.publishing.messages.history import decode_history

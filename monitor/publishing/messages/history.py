@@ -20,7 +20,7 @@ from monitor.history.bucket import COUNTS, STATES
 from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
 from monitor.history.query import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, HistoryQuery
 from monitor.history.reading import MAX_EVENTS, ColumnStatistics, HistoryTable
-from monitor.history.sqlite_store import StoredEvent
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages.message import Message, decode_message, remove_control_characters, shared_fields
 
@@ -227,7 +227,7 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
             Number of samples since the start of the device.
         """
         axes = {
-            axis: {symbol: CoefficientHistory.of_coefficient(past, f"{axis}.{symbol}") for symbol in query.letters}
+            axis: {symbol: CoefficientHistory.of_coefficient(past, f"{axis}.{symbol}") for symbol in query.symbols}
             for axis in query.axes
             if axis in past.axes()
         }

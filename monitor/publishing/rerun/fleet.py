@@ -56,7 +56,7 @@ class FleetView:
 
     Parameters
     ----------
-    arriving
+    subscriber
         Subscriber, including the topics of devices shown in detail.
     viewer
         Viewer whose devices are those shown in detail, named by their keys.
@@ -64,8 +64,8 @@ class FleetView:
         Keys of the devices shown in detail.
     """
 
-    def __init__(self, arriving: ZenohSubscriber, viewer: RerunView, detail: Sequence[str]) -> None:
-        self._arriving = arriving
+    def __init__(self, subscriber: ZenohSubscriber, viewer: RerunView, detail: Sequence[str]) -> None:
+        self._subscriber = subscriber
         self._viewer = viewer
         self._detail = frozenset(detail)
         self.board = DeviceStates()
@@ -84,9 +84,9 @@ class FleetView:
             Longest duration [s]; None: no limit.
         """
         end_s = None if seconds is None else time.monotonic() + seconds
-        table_s, told = 0.0, ""
+        table_s, reported = 0.0, ""
         while not stop.is_set() and (end_s is None or time.monotonic() < end_s):
-            for message in self._arriving.take(RECEIVE_TIMEOUT_S):
+            for message in self._subscriber.take(RECEIVE_TIMEOUT_S):
                 self.take(message)
             now_s = time.monotonic()
             if now_s - table_s < TABLE_PERIOD_S:
@@ -94,10 +94,10 @@ class FleetView:
             table_s = now_s
             self.draw(time.time(), now_s)
             page = self._viewer.url if self._viewer.url.startswith("http") else ""
-            said = "; ".join(part for part in (page, self._trouble()) if part)
-            if said != told:
-                told = said
-                tell(said)
+            report = "; ".join(part for part in (page, self._problems()) if part)
+            if report != reported:
+                reported = report
+                tell(report)
 
     def take(self, message: Message) -> None:
         """Process a message: update the table, and the viewer if the device is shown in detail."""
@@ -130,7 +130,7 @@ class FleetView:
             Current time on the clock of the messages [s].
         """
         devices = self.board.devices(now_s)
-        note = connection_note(self.board, self._arriving)
+        note = connection_note(self.board, self._subscriber)
         self._viewer.put("", wall_s, OverviewText(fleet_text(devices, now_s, MAX_ROWS, note)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
@@ -145,10 +145,10 @@ class FleetView:
                 estimate = message.to_estimate(known.coefficients, known.k_or_r)
                 self._viewer.put(device, estimate.t_ns / 1e9, estimate)
 
-    def _trouble(self) -> str:
+    def _problems(self) -> str:
         """Return the problems of the viewer and of the subscriber."""
         viewer = self._viewer.state
-        said = [] if viewer in ("ok", "starting") else [f"viewer: {viewer}"]
-        if self._arriving.state != "ok":
-            said.append(self._arriving.state)
-        return "; ".join(said)
+        problems = [] if viewer in ("ok", "starting") else [f"viewer: {viewer}"]
+        if self._subscriber.state != "ok":
+            problems.append(self._subscriber.state)
+        return "; ".join(problems)

@@ -116,19 +116,19 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
     """Return the row of one device."""
     state, status = one.state(now_s), one.status
     name = _escape_cell(one.key)
-    word = f"**{state.upper()}**" if one.rank(now_s) == 0 else _escape_cell(state)
+    state_text = f"**{state.upper()}**" if one.rank(now_s) == 0 else _escape_cell(state)
     noise = [
         "" if one.coefficients is None else format_coefficient(one.coefficients.coefficients, "N", axis).value
         for axis in FLEET_AXES
     ]
     if status is None:
-        return f"| **{name}** | {word} | | | | | {' | '.join(noise)} | nothing known yet |"
+        return f"| **{name}** | {state_text} | | | | | {' | '.join(noise)} | nothing known yet |"
     rate = format_sample_rate(status.rate_hz)
-    trouble = _escape_cell(one.problems()) or (
+    problems = _escape_cell(one.problems()) or (
         f"no data for {now_s - one.last_message_s:.1f} s" if state in ("gone", "silent") else ""
     )
     counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"
-    return f"| **{name}** | {word} | {rate} | {counts} | {' | '.join(noise)} | {trouble} |"
+    return f"| **{name}** | {state_text} | {rate} | {counts} | {' | '.join(noise)} | {problems} |"
 
 
 def _escape_cell(text: str) -> str:
@@ -147,16 +147,16 @@ def noise_text(estimate: Estimate) -> str:
     return "\n\n".join([head, *tables])
 
 
-def drift_text(look: DriftUpdate) -> str:
+def drift_text(update: DriftUpdate) -> str:
     """Return a table of the drift models of the gyroscopes and the drift that is currently removed."""
     unit = DEVIATION_UNITS["gyro"]
     rows = ["| axis | drift now | model | φ₁ | φ₂ | θ₁ |", "|---|---|---|---|---|---|"]
     for at, axis in enumerate(axes_of("gyro")):
-        expected, model = float(look.expected[at]), look.models[at]
+        expected, model = float(update.expected[at]), update.models[at]
         if not math.isfinite(expected):
             rows.append(f"| {axis} | not known yet | | | | |")
             continue
-        error = format_number(1.96 * unit.factor * float(look.error[at]), 2)
+        error = format_number(1.96 * unit.factor * float(update.error[at]), 2)
         now = f"{format_number(unit.factor * expected)} ± {error} {unit.name}"
         if model is None:
             rows.append(f"| {axis} | {now} | learning | | | |")
@@ -166,7 +166,7 @@ def drift_text(look: DriftUpdate) -> str:
             for x, there in zip((*model.phi, model.theta), _coefficients_in_model(model), strict=True)
         ]
         rows.append(f"| {axis} | {now} | {model.name} | {' | '.join(parts)} |")
-    interval = format_duration(look.interval_s)
+    interval = format_duration(update.interval_s)
     head = f"Learned at rest, from means of {interval}; what each of them brought anew is the innovation."
     return "\n".join([head, "", *rows])
 
@@ -180,11 +180,11 @@ def _noise_table(estimate: Estimate, kind: Kind) -> str:
     """Return the table of coefficients of one kind of sensor."""
     axes = axes_of(kind)
     lines = [f"| {KIND_NAMES[kind]} | {' | '.join(axes)} |", "|:--|" + "--:|" * len(axes)]
-    for letter in SYMBOLS:
-        unit = COEFFICIENT_UNITS[kind][letter].name
-        cells = [format_coefficient(estimate.coefficients, letter, axis) for axis in axes]
+    for symbol in SYMBOLS:
+        unit = COEFFICIENT_UNITS[kind][symbol].name
+        cells = [format_coefficient(estimate.coefficients, symbol, axis) for axis in axes]
         values = " | ".join(f"**{c.value}**" if c.value != "—" else "—" for c in cells)
-        lines.append(f"| **{letter}** {unit} | {values} |")
+        lines.append(f"| **{symbol}** {unit} | {values} |")
         if any(c.interval for c in cells):
             lines.append("| | " + " | ".join(c.interval for c in cells) + " |")
     return "\n".join(lines)

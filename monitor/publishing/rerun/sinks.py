@@ -123,9 +123,9 @@ class Output:
         Raises
         ------
         ViewerClosed
-            A user closed the window.
+            If a user closed the window.
         ViewerError
-            The viewer ended for another reason.
+            If the viewer ended for another reason.
         """
         if self.child is not None and self.child.exited_normally():
             raise ViewerClosed(CLOSED)
@@ -229,7 +229,7 @@ def free_port(wanted: int, taken: int | None = None) -> int:
     Raises
     ------
     ViewerError
-        PORTS_TRIED ports are in use.
+        If PORTS_TRIED ports are in use.
     """
     for port in range(wanted, min(wanted + PORTS_TRIED, 65536)):
         if port != taken and _bindable(port):
@@ -264,9 +264,9 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
     Raises
     ------
     ViewerError
-        The output cannot be opened.
+        If the output cannot be opened.
     ViewerClosed
-        Only an open viewer may be joined, and there is none.
+        If only an open viewer may be joined, and there is none.
     """
     if settings.mode.endswith(".rrd"):
         return _open_file(Path(settings.mode), recording_id)

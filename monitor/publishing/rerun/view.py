@@ -51,7 +51,7 @@ class RerunView:
         Settings of the viewer.
     devices
         Devices to show in detail.
-    recall
+    history_source
         Function that returns the stored history of a device. It is called in the viewer's thread when the viewer opens.
     fleet
         True if there are many more devices, which are shown in the table given to ``overview``.
@@ -61,12 +61,12 @@ class RerunView:
         self,
         settings: ViewerSettings,
         devices: Sequence[DeviceInfo],
-        recall: HistorySource | None = None,
+        history_source: HistorySource | None = None,
         fleet: bool = False,
     ) -> None:
         """Store the settings; the viewer is opened by ``start``."""
         self._settings = settings
-        self._recall = recall or _no_history
+        self._history_source = history_source or _no_history
         self._fleet = fleet
         self._devices = tuple(devices)
         self._backlog: BoundedQueue[tuple[str, float, Any]] = BoundedQueue(BACKLOG_BYTES)
@@ -199,7 +199,7 @@ class RerunView:
     def _draw_history(self, scene: "Scene", device: str) -> None:
         """Draw the stored history of a device before its live data."""
         self._inside_since = None  # a slow disk must not count as a stalled viewer
-        past = self._recall(device)
+        past = self._history_source(device)
         self._inside_since = time.monotonic()
         if past is not None:
             scene.draw_history(device, past)

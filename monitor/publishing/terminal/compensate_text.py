@@ -34,9 +34,9 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
         f"{format_duration(result.evaluated_rest_s)} at rest, after {format_duration(result.learning_rest_s)}",
         highlight=False,
     )
-    rows = plain_table()
-    for head in ("axis", "drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S)):
-        rows.add_column(head, no_wrap=head == "axis")
+    rows = plain_table(
+        "axis", wrapped=("drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S))
+    )
     for axis, one in result.axes.items():
         pairs = [
             (one.uncompensated.rms, one.compensated.rms),
