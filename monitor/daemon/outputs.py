@@ -97,7 +97,7 @@ class ViewerOutput(Output):
         self._view.put(device, unix_s, event)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Show the status, once the time of the first sample is known: the viewer has a single time axis."""
+        """Show the status, once the time of the first sample is known, because the viewer has a single time axis."""
         if unix_s is not None:
             self._view.put(device, unix_s, health)
 
@@ -134,7 +134,7 @@ class HistoryOutput(Output):
         self._writer.put_event(device, StoredEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma))
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Aggregate counts and state, once the time of the first sample is known: rows are minutes of sample time."""
+        """Aggregate counts and state, once the time of the first sample is known."""
         self.received[device] = health.received
         if unix_s is not None:
             self._writer.put_row(device, self._minutes_of(device).add_health(unix_s, health))
@@ -180,7 +180,7 @@ class LogOutput(Output):
 
 
 class TableOutput(Output):
-    """Output for the table in the terminal, the same table that ``watch`` shows for other processes.
+    """Output for the table in the terminal. ``watch`` shows the same table for other processes.
 
     Parameters
     ----------

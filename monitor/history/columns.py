@@ -58,7 +58,7 @@ class ColumnConverter:
         self._coefficient_count = len(self._coefficient_indices)
 
     def is_compatible(self, estimate: Estimate) -> bool:
-        """Return True if an estimate has the same measured axes and averaging times as the first one."""
+        """Return True if an estimate has the measured axes and averaging times of the first estimate."""
         tau_s = estimate.curve.tau_s
         same = tau_s is self._tau_s or np.array_equal(tau_s, self._tau_s)
         return same and bool((_measured(estimate) == self._measured).all())

@@ -43,7 +43,8 @@ class HistoryQuery:
     def selects(self, name: str) -> bool:
         """Return True if the query requests the column ``name`` (see ``columns``).
 
-        >>> HistoryQuery(axes=("gz",)).selects("gz.N.lo"), HistoryQuery(axes=("gz",)).selects("gx.N"), HistoryQuery().selects("rate")
+        >>> query = HistoryQuery(axes=("gz",))
+        >>> query.selects("gz.N.lo"), query.selects("gx.N"), query.selects("rate")
         (True, False, True)
         """
         axis, _, rest = name.partition(".")

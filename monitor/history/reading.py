@@ -124,7 +124,7 @@ def read_history(
     held = reader.stored_range(device)
     if held is None:
         raise NotReady(f"{device}: no history yet")
-    span = clip_to_stored(span or TimeRange(held[1] - 86_400.0, held[1]), held)
+    span = _clip_to_stored(span or TimeRange(held[1] - 86_400.0, held[1]), held)
     step_s = bucket_width_s(
         replace(span, start_s=max(span.start_s, held[0]), end_s=min(span.end_s, held[1])), step_s, points
     )
@@ -191,8 +191,10 @@ def build_table(
 def bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
     """Return the bucket width [s]: the smallest permitted one for this number of points, at least ``step_s``.
 
-    >>> bucket_width_s(TimeRange(0.0, 86_400.0)), bucket_width_s(TimeRange(0.0, 5 * 31_536_000.0)), bucket_width_s(TimeRange(0.0, 3600.0), 900)
-    (300, 172800, 900)
+    >>> bucket_width_s(TimeRange(0.0, 86_400.0)), bucket_width_s(TimeRange(0.0, 5 * 31_536_000.0))
+    (300, 172800)
+    >>> bucket_width_s(TimeRange(0.0, 3600.0), 900)
+    900
 
     Parameters
     ----------
@@ -210,16 +212,8 @@ def bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEF
     )
 
 
-def clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
-    """Clip a time range to the stored one, extended by one day, because events may lie outside the rows.
-
-    Parameters
-    ----------
-    span
-        Time range.
-    held
-        Start and end of the stored rows, Unix time [s].
-    """
+def _clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
+    """Clip a time range to the stored one, extended by one day, because events may lie outside the rows."""
     start_s, end_s = max(span.start_s, held[0] - 86_400.0), min(span.end_s, held[1] + 86_400.0)
     return replace(span, start_s=min(start_s, end_s), end_s=max(start_s, end_s))
 

@@ -119,10 +119,10 @@ class HistoryStore:
 
     def _prepare(self) -> None:
         """Create the tables if the file is empty, and set the options of the connection."""
-        if not is_history(self._db, self.path):
+        if not _is_history(self._db, self.path):
             self._db.execute("PRAGMA journal_mode = WAL")
             with self._transaction():
-                if not is_history(self._db, self.path):  # another process may have created the tables meanwhile
+                if not _is_history(self._db, self.path):  # another process may have created the tables meanwhile
                     for statement in SCHEMA.split(";"):
                         self._db.execute(statement)
                     self._db.execute(f"PRAGMA application_id = {APPLICATION}")
@@ -189,7 +189,7 @@ class HistoryStore:
         return done
 
     def external_change(self) -> str:
-        """Return what another program has done to the file since its last use by this store; "" if nothing.
+        """Return how another program has changed the file since this store last used the file; "" if unchanged.
 
         SQLite does not detect such changes: it would continue to write to a file that has been deleted.
         """
@@ -260,7 +260,7 @@ class HistoryStore:
         return {device: -math.inf if span is None else span[1] for device, span in spans.items()}
 
     def _merge_oldest(self, device: int, width_s: int, wider_s: int, limit_s: float) -> bool:
-        """Merge the rows of the oldest wider bucket that ends by ``limit_s``; False if there is no such bucket."""
+        """Merge the oldest rows into a wider bucket that ends by ``limit_s``; return True if rows were merged."""
         oldest = self._db.execute(
             "SELECT min(start) FROM row WHERE device = ? AND width = ?", (device, width_s)
         ).fetchone()[0]
@@ -412,7 +412,7 @@ def open_history(path: Path) -> Iterator[HistoryReader]:
         raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     try:
         with _damage_as_unusable(path), contextlib.closing(_open_read_only(path)) as db:
-            if not is_history(db, path):
+            if not _is_history(db, path):
                 raise RecordingError(f"{path}: nothing is in it yet")
             db.execute("BEGIN")
             yield HistoryReader(db, path)
@@ -433,23 +433,8 @@ def _stored_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | N
     return (float(min(starts)), float(max(ends))) if starts else None
 
 
-def is_history(db: sqlite3.Connection, path: Path) -> bool:
-    """Return True if the database is a history, and False if it is empty.
-
-    Parameters
-    ----------
-    db
-        Connection to the database.
-    path
-        Path of the file, for the message.
-
-    Raises
-    ------
-    UnusableHistory
-        If the database is not a history or lacks a table.
-    RecordingError
-        If the history was written by a newer version.
-    """
+def _is_history(db: sqlite3.Connection, path: Path) -> bool:
+    """Return True if the database is a history and False if it is empty; raise an error for any other database."""
     (version,), (application,) = (
         db.execute(f"PRAGMA {what}").fetchone() for what in ("user_version", "application_id")
     )

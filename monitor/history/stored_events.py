@@ -131,7 +131,7 @@ def clamp_time(t_s: float) -> float:
 
 
 def _encode_values(what: Mapping[str, Mapping[str, float]]) -> str:
-    """Encode event values as JSON, NaN as null; ``{}`` if they are longer than those of any event of this program."""
+    """Encode event values as JSON, NaN as null. Values that are too long for an event are replaced by ``{}``."""
     text = msgspec.json.encode(what).decode()
     return text if len(text) <= MAX_TEXT_LENGTH else "{}"
 

@@ -36,7 +36,7 @@ SMALL_RESULT_BYTES: Final = 1000
 TimedResult = tuple[float, Any]
 """Unix time of a result [s], and the result."""
 Merge = Callable[[list[TimedResult], TimedResult], None]
-"""Function that adds a result to those that wait for a drawing."""
+"""Function that adds a new result to the results that wait for a drawing."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -186,8 +186,7 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Comparison of one axis with its model."""
 
     agrees: bool | None = None
-    """Current decision; None if there is none yet. It has hysteresis: it changes later than ``gap`` crosses
-    ``threshold``."""
+    """Current decision, with hysteresis: it changes later than ``gap`` crosses ``threshold``. None: not decided yet."""
     gap: float
     where: TauRange
     ratio: float | None = None
@@ -199,8 +198,7 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 
 class GapMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
-    """Message ``imu/<device>/gap``: measured deviations and those of the model in force, on the axes that can be
-    compared."""
+    """Message ``imu/<device>/gap``: comparison of the measured deviations with the model in force."""
 
     topic = topics.GAP
     tau_s: Floats | None = None
@@ -300,7 +298,7 @@ class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()
 
     @classmethod
     def of(cls, device: str, t: float | None, samples: int, result: SlowStatistics) -> Self:
-        """Build the message from both curves."""
+        """Build the message from the total and Hadamard deviations."""
         total, hadamard = DeviationTable.of(result.total), DeviationTable.of(result.hadamard)
         return cls(device=device, t=t, samples=samples, total=total, hadamard=hadamard)
 

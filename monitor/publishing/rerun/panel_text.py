@@ -86,7 +86,7 @@ def overview_text(healths: Mapping[str, Health]) -> str:
 
 
 def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: str = "") -> str:
-    """Return a table of many devices, those with problems first, with the number of devices in each state above it.
+    """Return a table of many devices, below a line with the number of devices in each state.
 
     Parameters
     ----------
@@ -177,7 +177,7 @@ def _coefficients_in_model(model: ArmaModel) -> tuple[bool, bool, bool]:
 
 
 def _noise_table(estimate: Estimate, kind: Kind) -> str:
-    """Return the table of coefficients of one kind of sensor."""
+    """Return the table of the coefficients of all axes of one kind of sensor."""
     axes = axes_of(kind)
     lines = [f"| {KIND_NAMES[kind]} | {' | '.join(axes)} |", "|:--|" + "--:|" * len(axes)]
     for symbol in SYMBOLS:

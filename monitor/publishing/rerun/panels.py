@@ -46,6 +46,7 @@ MAX_INTERMEDIATE_POINTS: Final = 20
 """Number of coefficient points between two estimates, if the estimator provides values for every sample. More could not
 be distinguished and would overload the viewer."""
 Z95: Final = 1.959964
+"""Two-sided 95 % quantile of the standard normal distribution."""
 MAX_PAST_EVENTS: Final = 200
 """Largest number of stored events that are shown."""
 MAX_INTERVAL_RATIO: Final = 1.5
@@ -80,7 +81,7 @@ class Panel:
         self.device = device
 
     def style(self) -> None:
-        """Log what does not change: names, colours and widths of the lines."""
+        """Log the names, colours and widths of the lines, which do not change."""
 
     def draw(self, unix_s: Floats, results: Sequence[Any]) -> None:
         """Draw results.
@@ -106,31 +107,13 @@ class Panel:
         """Return the path of an entity of the device."""
         return f"{self.device}/{name}"
 
-    def style_lines(self, name: str, lines: Sequence[tuple[str, Colour, float]]) -> None:
-        """Log the names, colours and widths of the time series of an entity.
-
-        Parameters
-        ----------
-        name
-            Name of the entity.
-        lines
-            Name, colour and width of each series.
-        """
+    def _style_lines(self, name: str, lines: Sequence[tuple[str, Colour, float]]) -> None:
+        """Log the name, colour and width of each time series of an entity."""
         names, line_colours, widths = zip(*lines, strict=True)
         self.scene.log(self.path(name), rr.SeriesLines(colors=line_colours, widths=widths, names=names), static=True)
 
-    def log_text(self, name: str, unix_s: float, text: str) -> None:
-        """Log a Markdown text.
-
-        Parameters
-        ----------
-        name
-            Name of the entity.
-        unix_s
-            Unix time of the text [s].
-        text
-            Text as Markdown.
-        """
+    def _log_text(self, name: str, unix_s: float, text: str) -> None:
+        """Log a Markdown text at a Unix time [s]."""
         self.scene.set_time(unix_s)
         self.scene.log(self.path(name), rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
@@ -142,8 +125,8 @@ class SamplesPanel(Panel):
         """Log the styles of the lines."""
         for axis in AXES:
             unit = SAMPLE_UNITS[sensor_kind(axis)].name
-            self.style_lines(f"samples/{axis}", [(f"{axis}, {unit}", colours.AXIS_COLOURS[axis], 1.0)])
-        self.style_lines("temperature", [("temperature, °C", colours.TEMPERATURE, 1.5)])
+            self._style_lines(f"samples/{axis}", [(f"{axis}, {unit}", colours.AXIS_COLOURS[axis], 1.0)])
+        self._style_lines("temperature", [("temperature, °C", colours.TEMPERATURE, 1.5)])
 
     def draw(self, unix_s: Floats, results: "Sequence[SampleRows]") -> None:
         """Draw the results."""
@@ -169,7 +152,7 @@ class CompensatedPanel(Panel):
         """Log the styles of the lines."""
         for axis in axes_of("gyro"):
             line = (f"{axis}, {SAMPLE_UNITS['gyro'].name}", colours.AXIS_COLOURS[axis], 1.0)
-            self.style_lines(f"compensated/{axis}", [line])
+            self._style_lines(f"compensated/{axis}", [line])
 
     def draw(self, unix_s: Floats, results: "Sequence[CompensatedRows]") -> None:
         """Draw the results."""
@@ -189,8 +172,8 @@ class DriftPanel(Panel):
             colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
             lines = [(f"{axis} at rest, {unit}", dim, 0.75), (f"{axis} expected", colours.TEXT, 1.5)]
             lines += [(f"{axis} 95 % low", colour, 1.0), (f"{axis} 95 % high", colour, 1.0)]
-            self.style_lines(f"drift/{axis}", lines)
-            self.style_lines(f"innovation/{axis}", [(f"{axis}, σ", colour, 1.0)])
+            self._style_lines(f"drift/{axis}", lines)
+            self._style_lines(f"innovation/{axis}", [(f"{axis}, σ", colour, 1.0)])
 
     def draw(self, unix_s: Floats, results: Sequence[DriftUpdate]) -> None:
         """Draw the results."""
@@ -203,7 +186,7 @@ class DriftPanel(Panel):
                 self.scene.log_scalars(self.path(f"drift/{axis}"), unix_s, rows * DEVIATION_UNITS["gyro"].factor)
                 innovation = np.array([one.innovation[i] for one in results])
                 self.scene.log_scalars(self.path(f"innovation/{axis}"), unix_s, innovation)
-        self.log_text("drift", float(unix_s[-1]), drift_text(results[-1]))
+        self._log_text("drift", float(unix_s[-1]), drift_text(results[-1]))
 
     @classmethod
     def tab(cls, device: DeviceInfo) -> rrb.Container | None:
@@ -234,7 +217,7 @@ class ThermalPanel(Panel):
             colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
             unit = DEVIATION_UNITS[sensor_kind(axis)].name
             lines = [(f"{axis} bias, {unit}", colour, 2.0), (f"{axis} expected", colours.TEXT, 1.0)]
-            self.style_lines(
+            self._style_lines(
                 f"thermal/{axis}", [*lines, (f"{axis} 95 % low", dim, 0.75), (f"{axis} 95 % high", dim, 0.75)]
             )
 
@@ -275,8 +258,8 @@ class GapPanel(Panel):
     def style(self) -> None:
         """Log the styles of the lines."""
         for axis in AXES:
-            self.style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", colours.AXIS_COLOURS[axis], 1.5)])
-        self.style_lines("gap/threshold", [("threshold", colours.blend(colours.TEXT, 0.6), 1.0)])
+            self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", colours.AXIS_COLOURS[axis], 1.5)])
+        self._style_lines("gap/threshold", [("threshold", colours.blend(colours.TEXT, 0.6), 1.0)])
 
     def draw(self, unix_s: Floats, results: Sequence[ModelGap]) -> None:
         """Draw the results."""
@@ -300,7 +283,7 @@ class AllanPanel(Panel):
     def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
         """Draw the results."""
         at_s, estimate = float(unix_s[-1]), results[-1]
-        self.log_text("coefficients", at_s, noise_text(estimate))
+        self._log_text("coefficients", at_s, noise_text(estimate))
         self._plot.draw(estimate, self.scene.panel(self.device, GapPanel).newest)
         if self._surface.add(at_s, estimate):
             dynamic_surface.draw(self.scene.log, self.path("dynamic"), self._surface)
@@ -316,7 +299,7 @@ class CoefficientsPanel(Panel):
             for symbol in SYMBOLS:
                 unit = COEFFICIENT_UNITS[sensor_kind(axis)][symbol].name
                 lines = [(f"{axis}, {unit}", colour, 2.0), (f"{axis} 95 % low", dim, 0.75)]
-                self.style_lines(f"coefficients/{symbol}/{axis}", [*lines, (f"{axis} 95 % high", dim, 0.75)])
+                self._style_lines(f"coefficients/{symbol}/{axis}", [*lines, (f"{axis} 95 % high", dim, 0.75)])
                 mark = rr.SeriesPoints(
                     colors=[colour], markers=["diamond"], marker_sizes=[7.0], names=[f"{axis} changed"]
                 )
@@ -402,7 +385,7 @@ class HealthPanel(Panel):
         if self.device in devices:
             self.scene.healths[self.device] = health
         about = devices[self.device].about if self.device in devices else ""
-        self.log_text("status", at_s, health_text(self.device, health, about))
+        self._log_text("status", at_s, health_text(self.device, health, about))
         if len(devices) > 1 and not self.scene.fleet:
             self.scene.panel("", OverviewPanel).log_overview(at_s, overview_text(self.scene.healths))
 

@@ -41,7 +41,7 @@ class Scene:
     def __init__(self, stream: rr.RecordingStream, fleet: bool = False) -> None:
         self.fleet = fleet
         self.devices: dict[str, DeviceInfo] = {}  # devices that are shown
-        self.healths: dict[str, Health] = {}  # newest health of each of these devices
+        self.healths: dict[str, Health] = {}  # newest health of each shown device
         self._stream = stream
         self._panels: dict[tuple[str, type[Panel]], Panel] = {}
 

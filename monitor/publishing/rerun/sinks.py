@@ -114,7 +114,7 @@ class Output:
     url: str = ""  # address of the page or of the Rerun server
     child: ViewerProcess | None = None
     port: int | None = None  # port of the Rerun server; None for a file
-    note: str = ""  # which ports were in use, and which are used instead
+    note: str = ""  # configured ports that were in use, and their replacements
     lock: IO[bytes] | None = None  # open while a file is written, so that no other process writes it
 
     def check(self) -> None:
@@ -144,7 +144,7 @@ class Output:
             self.stream.flush(timeout_sec=patience_s)
         except RuntimeError:  # Rerun raises it for "timed out" and for "connection lost"
             return False
-        return self.port is None or grpc_call(self.port, "/imu.monitor/Ping", patience_s) is not None
+        return self.port is None or _grpc_call(self.port, "/imu.monitor/Ping", patience_s) is not None
 
     def close(self) -> None:
         """End the viewer if it was started here; a file is complete afterwards."""
@@ -189,22 +189,12 @@ def is_rerun(port: int) -> bool:
 
     Other gRPC servers answer "unimplemented" (status 12), and other servers do not answer with gRPC.
     """
-    reply = grpc_call(port, PROBE_METHOD, 1.0)
+    reply = _grpc_call(port, PROBE_METHOD, 1.0)
     return reply is not None and "grpc" in reply.get("content-type", "") and reply.get("grpc-status") != "12"
 
 
-def grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
-    """Return the headers of the reply to an empty gRPC call; None if there is no reply in time.
-
-    Parameters
-    ----------
-    port
-        Port on the loopback interface.
-    path
-        Path of the gRPC method.
-    timeout_s
-        Timeout [s].
-    """
+def _grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
+    """Return the headers of the reply to an empty gRPC call on the loopback interface; None without a reply in time."""
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=timeout_s)
     headers = {"content-type": "application/grpc-web+proto", "x-grpc-web": "1"}
     try:

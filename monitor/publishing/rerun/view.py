@@ -81,7 +81,7 @@ class RerunView:
 
     @property
     def state(self) -> str:
-        """``ok``, or a short description of what is wrong; part of the status message."""
+        """``ok``, or a short description of the problem; part of the status message."""
         inside = self._inside_since
         if self._stalled or (inside is not None and time.monotonic() - inside > STALL_TIMEOUT_S):
             return f"stalled ({self._backlog.dropped} dropped)"

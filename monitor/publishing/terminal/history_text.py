@@ -60,7 +60,7 @@ def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str,
             console.print(Padding(_summary(past, kind, shown, symbols), (1, 0, 0, 0)))
     for line in status_lines(past):
         console.print(line, highlight=False)
-    print_events(past, console)
+    _print_events(past, console)
 
 
 def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], console: Console) -> None:
@@ -96,16 +96,8 @@ def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], 
     console.print(Padding(table, (1, 0, 0, 0)))
 
 
-def print_events(past: HistoryTable, console: Console) -> None:
-    """Print the newest MAX_EVENTS events.
-
-    Parameters
-    ----------
-    past
-        The history.
-    console
-        Destination.
-    """
+def _print_events(past: HistoryTable, console: Console) -> None:
+    """Print the newest MAX_EVENTS events."""
     if not past.events:
         return
     shown = past.events[-MAX_EVENTS:]

@@ -41,7 +41,7 @@ MAX_QUEUED_QUERIES: Final = 64
 REFUSAL_CHECK_S: Final = 3.0
 """Interval between two checks of why a router refuses the connection."""
 DUPLICATE_REPORT_S: Final = 10.0
-"""Time during which a status that another program published under the same key is reported."""
+"""Time for which another program that publishes under the key of a device is reported after its last message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,7 +97,7 @@ class ZenohPublisher:
 
     @property
     def state(self) -> str:
-        """``ok``, or a description of what is wrong; part of the status message."""
+        """``ok``, or a description of the problem; part of the status message."""
         session = self._session
         if self._unsent or session is None:
             return self._unsent or self._session_state
@@ -267,7 +267,7 @@ class ZenohPublisher:
         self._update_token(device)
 
     def _open_session(self) -> tuple["zenoh.Session", str]:
-        """Open the session, on a free port if the configured one is in use; return it with the state to report."""
+        """Open the session, on a free port if the configured port is in use. Return the session and its state."""
         import zenoh
 
         listen = self.settings.listen
@@ -283,7 +283,7 @@ class ZenohPublisher:
             return session, f"ok, but {', '.join(listen)} is busy: listening on {', '.join(free)}"
 
     def _configuration(self, listen: tuple[str, ...] | None) -> "zenoh.Config":
-        """Return the configuration: these settings override the file, and the file overrides the closed defaults."""
+        """Return the configuration of zenoh. The settings override the file, and the file overrides the defaults."""
         own = self.settings
         keys: dict[str, Any] = {
             "mode": own.mode,
