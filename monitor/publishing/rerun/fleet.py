@@ -138,7 +138,8 @@ class FleetView:
         if topic is topics.SAMPLES:
             rows = decode_samples(payload).block
             unix_s = rows.t_ns / 1e9
-            self._viewer.put(device, float(unix_s[-1]), SampleRows(unix_s, rows.values, rows.temperature_c))
+            if unix_s.size:
+                self._viewer.put(device, float(unix_s[-1]), SampleRows(unix_s, rows.values, rows.temperature_c))
         elif topic is topics.ALLAN:
             message, known = decode_message(AllanMessage, payload), self.board.coefficients(device)
             if known is not None:
