@@ -1,13 +1,9 @@
 """Base class of the receivers of the results: zenoh, viewer, history, log, table, metrics and hooks."""
 
+from typing import Any
+
 from drivers.sample import Event, Ints, SampleBlock
 from monitor.common.health import Health
-from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
-from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.detection.model_gap import ModelGap
-from monitor.estimation.estimate import Estimate
 
 
 class Output:
@@ -36,45 +32,23 @@ class Output:
             Offset that converts the times to Unix time, in nanoseconds.
         """
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Receive a new estimate.
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        """Receive a result of one of the kinds in ``monitor.publishing.result_kinds``.
+
+        Estimates arrive at the configured rate. A device without a model in force has no ``ModelGap``, and a device
+        without a thermal model has no ``ThermalUpdate``. A ``DriftUpdate`` arrives every second of drift compensation.
+        ``SlowStatistics`` arrive when their step by step computation is complete.
 
         Parameters
         ----------
         device : str
             Name of the device.
         unix_s : float
-            Time of the newest sample in the window.
-        estimate : Estimate
-            Allan curve and noise coefficients.
-        """
-
-    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """Receive the comparison of the window with the model in force. Not called for a device without a model.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float
-            Time of the newest sample in the window.
-        gap : ModelGap
-            Comparison of the window with the model.
-        """
-
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
-        """Receive the mean of an interval and its prediction from temperature. Not called without a thermal model.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float
-            Time of the interval.
+            Time of the result: of the newest sample in the window, or of the end of the interval.
         received : int
             Number of samples of the device since the start.
-        look : ThermalUpdate
-            Mean of the interval and its prediction.
+        result : object
+            The result.
         """
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
@@ -90,36 +64,6 @@ class Output:
             Compensated samples in SI units, with times in nanoseconds.
         offset_ns : array of int64, shape (n,), or int
             Offset that converts the times to Unix time, in nanoseconds.
-        """
-
-    def drift(self, device: str, unix_s: float, look: DriftUpdate) -> None:
-        """Receive the state of the drift compensation after an interval of one second.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float
-            Time of the interval.
-        look : DriftUpdate
-            Drift, innovations and models.
-        """
-
-    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
-        """Receive the total and Hadamard deviations, which are computed step by step and published when complete.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float
-            Time of the newest sample.
-        received : int
-            Number of samples of the device since the start.
-        total : TotalCurve
-            Total deviations.
-        hadamard : HadamardCurve
-            Hadamard deviations.
         """
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:

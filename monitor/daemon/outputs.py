@@ -1,10 +1,11 @@
 """Outputs of the daemon: zenoh messages, viewer, history file, log lines and the table in the terminal. None blocks.
 
-The parameters of all methods are described in ``monitor.daemon.output.Output``.
+The parameters of all methods are described in ``monitor.daemon.output.Output``. The messages and drawings of each kind
+of result are listed in ``monitor.publishing.result_kinds``.
 """
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import structlog
 
@@ -13,27 +14,21 @@ from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.common.health import Health
 from monitor.daemon.output import Output
-from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
-from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.history.minute_aggregation import MinuteAggregator
-from monitor.history.sqlite_store import StoredEvent
+from monitor.history.stored_events import StoredEvent
 from monitor.history.writer import HistoryWriter
+from monitor.publishing.messages.message import Message
 from monitor.publishing.messages.results import (
-    AllanMessage,
     CoefficientsMessage,
     EventMessage,
     GapMessage,
-    SlowStatistics,
     StatusMessage,
-    ThermalMessage,
-    TotalMessage,
     event_start_s,
 )
 from monitor.publishing.remote_devices import DeviceStates
+from monitor.publishing.result_kinds import CompensatedRows, SampleRows, kind_of
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 
 if TYPE_CHECKING:
@@ -54,38 +49,27 @@ class ZenohOutput(Output):
         """Publish a block as one msgpack batch."""
         self._zenoh.put(topics.SAMPLES, device, encode_samples(device, received, samples, offset_ns))
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Publish the Allan curve and the coefficients."""
-        self._zenoh.put(topics.ALLAN, device, AllanMessage.of(device, unix_s, 0, estimate).encode())
-        self._zenoh.put(topics.COEFFICIENTS, device, CoefficientsMessage.of(device, unix_s, 0, estimate).encode())
-
-    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """Publish the comparison of the window with the model in force."""
-        self._zenoh.put(topics.GAP, device, GapMessage.of(device, unix_s, 0, gap).encode())
-
-    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
-        """Publish the total and Hadamard deviations."""
-        self._zenoh.put(
-            topics.TOTAL, device, TotalMessage.of(device, unix_s, received, SlowStatistics(total, hadamard)).encode()
-        )
-
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Publish a block of compensated samples as one msgpack batch."""
         schema = topics.COMPENSATED.schema()
         self._zenoh.put(topics.COMPENSATED, device, encode_samples(device, received, samples, offset_ns, schema))
 
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
-        """Publish the mean of an interval and its prediction from temperature."""
-        self._zenoh.put(topics.THERMAL, device, ThermalMessage.of(device, unix_s, received, look).encode())
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        """Publish the messages of a result."""
+        self._publish(device, unix_s, received, result)
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Publish an event."""
-        payload = EventMessage.of(device, unix_s, received, event).encode()
-        self._zenoh.put(topics.EVENT, device, payload)
+        self._publish(device, unix_s, received, event)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Publish the status."""
-        self._zenoh.put(topics.STATUS, device, StatusMessage.of(device, unix_s, 0, health).encode())
+        self._publish(device, unix_s, health.received, health)
+
+    def _publish(self, device: str, unix_s: float | None, received: int, result: Any) -> None:
+        """Publish the messages of a result."""
+        for message in kind_of(result).messages:
+            self._zenoh.put(message.topic, device, message.of(device, unix_s, received, result).encode())
 
 
 class ViewerOutput(Output):
@@ -95,37 +79,27 @@ class ViewerOutput(Output):
         self._view = view
 
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
-        """Show raw samples."""
-        self._view.samples(device, (samples.t_ns + offset_ns) / 1e9, samples.values, samples.temperature_c)
-
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Show the Allan curve and the coefficients."""
-        self._view.estimate(device, unix_s, estimate)
-
-    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """Show the time series of the gaps, and the model's curves with the measured curves."""
-        self._view.gap(device, unix_s, gap)
+        """Show samples."""
+        unix_s = (samples.t_ns + offset_ns) / 1e9
+        self._view.put(device, float(unix_s[-1]), SampleRows(unix_s, samples.values, samples.temperature_c))
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Show compensated rates together with the measured rates."""
-        self._view.compensated(device, (samples.t_ns + offset_ns) / 1e9, samples.values[:, :3])
+        unix_s = (samples.t_ns + offset_ns) / 1e9
+        self._view.put(device, float(unix_s[-1]), CompensatedRows(unix_s, samples.values[:, :3]))
 
-    def drift(self, device: str, unix_s: float, look: DriftUpdate) -> None:
-        """Show the time series of the drift and of its innovations, and the drift models."""
-        self._view.drift(device, unix_s, look)
-
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
-        """Show the time series of the interval means and their predictions."""
-        self._view.thermal(device, unix_s, look)
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        """Show a result in the panels of its kind."""
+        self._view.put(device, unix_s, result)
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Show an event as one line of the log."""
-        self._view.event(device, unix_s, event)
+        self._view.put(device, unix_s, event)
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Show the status, once the time of the first sample is known: the viewer has a single time axis."""
+        """Show the status, once the time of the first sample is known, because the viewer has a single time axis."""
         if unix_s is not None:
-            self._view.health(device, unix_s, health)
+            self._view.put(device, unix_s, health)
 
 
 class HistoryOutput(Output):
@@ -133,7 +107,7 @@ class HistoryOutput(Output):
 
     Parameters
     ----------
-    writer : Writer
+    writer : HistoryWriter
         Writer of the history file.
     """
 
@@ -147,25 +121,23 @@ class HistoryOutput(Output):
         unix_s = float((samples.t_ns + offset_ns)[-1]) / 1e9
         self._writer.put_row(device, self._minutes_of(device).add_temperature(unix_s, samples.temperature_c))
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Aggregate the coefficients, and the deviations on a coarse grid."""
-        self._writer.put_row(device, self._minutes_of(device).add_estimate(unix_s, estimate))
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        """Aggregate the coefficients of an estimate, and its deviations on a coarse grid."""
+        if isinstance(result, Estimate):
+            self._writer.put_row(device, self._minutes_of(device).add_estimate(unix_s, result))
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Store an event."""
-        since_s = event_start_s(unix_s, event)
         # SQLite does not accept NumPy scalars, so they are converted to plain numbers
         what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.values.items()}
-        sigma = None if event.sigma is None else float(event.sigma)
-        told = StoredEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma)
-        self._writer.put_event(device, told)
+        sigma, since_s = None if event.sigma is None else float(event.sigma), event_start_s(unix_s, event)
+        self._writer.put_event(device, StoredEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma))
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Aggregate counts and state, once the time of the first sample is known: rows are minutes of sample time."""
+        """Aggregate counts and state, once the time of the first sample is known."""
         self.received[device] = health.received
-        if unix_s is None:
-            return
-        self._writer.put_row(device, self._minutes_of(device).add_health(unix_s, health))
+        if unix_s is not None:
+            self._writer.put_row(device, self._minutes_of(device).add_health(unix_s, health))
 
     def device_removed(self, device: str) -> None:
         """Store the last minute of a device that was removed."""
@@ -199,8 +171,8 @@ class LogOutput(Output):
         now = (health.state, health.text)
         if self._last_status.get(device) != now:
             self._last_status[device] = now
-            say = _log.info if health.state in ("running", "ended") and not health.text else _log.warning
-            say("status", device=device, state=health.state, text=health.text, received=health.received)
+            write = _log.info if health.state in ("running", "ended") and not health.text else _log.warning
+            write("status", device=device, state=health.state, text=health.text, received=health.received)
 
     def device_removed(self, device: str) -> None:
         """Forget the state of a removed device, so that it is logged if the device is added again."""
@@ -208,60 +180,48 @@ class LogOutput(Output):
 
 
 class TableOutput(Output):
-    """Output for the table in the terminal, the same table that ``watch`` shows for other processes.
+    """Output for the table in the terminal. ``watch`` shows the same table for other processes.
 
     Parameters
     ----------
-    board : Board
+    states : DeviceStates
         Content of the table.
     redraw : callable, optional
         Called once a second for each device; asks another thread to draw the table.
     """
 
-    def __init__(self, board: DeviceStates, redraw: Callable[[], None] | None = None) -> None:
-        self.board = board
+    def __init__(self, states: DeviceStates, redraw: Callable[[], None] | None = None) -> None:
+        self.states = states
         self._redraw = redraw
-        self._latest: dict[str, tuple[float, Estimate]] = {}
-        self._gaps: dict[str, tuple[float, ModelGap]] = {}
+        self._newest: dict[str, dict[type[Message], tuple[float, int, Any]]] = {}  # results since the last status
 
     def viewer_at(self, url: str) -> None:
         """Set the line above the table, which shows the address of the viewer's web page; "" removes it."""
-        self.board.note = f"viewer: {url}" if url else ""
+        self.states.note = f"viewer: {url}" if url else ""
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        """Keep an estimate until the row of the device is updated."""
-        self._latest[device] = (unix_s, estimate)
-
-    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        """Keep a comparison with the model until the row of the device is updated."""
-        self._gaps[device] = (unix_s, gap)
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        """Keep the newest estimate and the newest comparison with the model until the next status."""
+        if isinstance(result, Estimate | ModelGap):
+            message: type[Message] = CoefficientsMessage if isinstance(result, Estimate) else GapMessage
+            self._newest.setdefault(device, {})[message] = (unix_s, received, result)
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Add an event to the lines below the table."""
-        self.board.process_message(
-            topics.EVENT.key(PREFIX, device), EventMessage.of(device, unix_s, received, event).encode()
-        )
+        self._process(EventMessage.of(device, unix_s, received, event))
 
     def health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Update the row of a device."""
-        self.board.process_message(
-            topics.STATUS.key(PREFIX, device), StatusMessage.of(device, unix_s, 0, health).encode()
-        )
-        if device in self._latest:
-            at_s, estimate = self._latest.pop(device)
-            self.board.process_message(
-                topics.COEFFICIENTS.key(PREFIX, device), CoefficientsMessage.of(device, at_s, 0, estimate).encode()
-            )
-        if device in self._gaps:
-            self.board.process_message(
-                topics.GAP.key(PREFIX, device),
-                GapMessage.of(device, self._gaps[device][0], 0, self._gaps.pop(device)[1]).encode(),
-            )
+        self._process(StatusMessage.of(device, unix_s, health.received, health))
+        for message, newest in self._newest.pop(device, {}).items():
+            self._process(message.of(device, *newest))
         if self._redraw is not None:
             self._redraw()
 
     def device_removed(self, device: str) -> None:
         """Remove the row of a device."""
-        self._latest.pop(device, None)
-        self._gaps.pop(device, None)
-        self.board.remove(topics.STATUS.key(PREFIX, device))
+        self._newest.pop(device, None)
+        self.states.remove(topics.STATUS.key(PREFIX, device))
+
+    def _process(self, message: Message) -> None:
+        """Pass a message to the table."""
+        self.states.process_message(message.topic.key(PREFIX, message.device), message.encode())

@@ -6,7 +6,7 @@ The main loop calls the outputs in order. No output blocks: each has a queue, or
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.estimation.detection.model_agreement import ModelAgreement
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
+from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings.loading import Device
 
 MAX_BATCH_S: Final = 0.1
@@ -105,8 +106,7 @@ class ResultPublisher:
         if self.latest is None or not self._refitted or not self.schedule.claim("publish", self.device.publish_s):
             return False
         self._refitted = False
-        for output in self.outputs:
-            output.estimate(self.device.name, self._unix_s(self.latest.t_ns), self.latest)
+        self._result(self.latest.t_ns, self.latest)
         if self.pipeline.model_in_force is not None:
             self._model_gap(self.pipeline.model_in_force.compare(self.latest))
         self.events(self.limits.update(self.latest))
@@ -122,15 +122,12 @@ class ResultPublisher:
         used_s = time.perf_counter() - begun_s
         self.schedule.postpone("total", max(TOTAL_INTERVAL_S, used_s / TOTAL_CPU_SHARE))
         if deviations is not None:
-            unix_s = self._unix_s(self.pipeline.newest_ns)
-            for output in self.outputs:
-                output.total(self.device.name, unix_s, self._received, *deviations)
+            self._result(self.pipeline.newest_ns, SlowStatistics(*deviations))
 
     def thermal_intervals(self) -> None:
         """Publish the thermal intervals that were completed since the last call."""
         for interval in self.pipeline.take_thermal_intervals():
-            for output in self.outputs:
-                output.thermal(self.device.name, self._unix_s(interval.t_ns), self._received, interval)
+            self._result(interval.t_ns, interval)
 
     @property
     def _received(self) -> int:
@@ -138,6 +135,11 @@ class ResultPublisher:
 
     def _unix_s(self, t_ns: int) -> float:
         return self.timeline.unix_s(t_ns)
+
+    def _result(self, t_ns: int, result: Any) -> None:
+        """Publish a result that belongs to the host time ``t_ns``."""
+        for output in self.outputs:
+            output.result(self.device.name, self._unix_s(t_ns), self._received, result)
 
     def _compensated(self, live: LiveCompensation, samples: SampleBlock) -> None:
         """Publish the samples without gyroscope drift, and the state of the drift compensation."""
@@ -151,8 +153,7 @@ class ResultPublisher:
             for output in self.outputs:
                 output.compensated(self.device.name, self.published - len(samples) + at, compensated, offsets_ns)
         for drift in live.take():
-            for output in self.outputs:
-                output.drift(self.device.name, self._unix_s(drift.t_ns), drift)
+            self._result(drift.t_ns, drift)
 
     def _refit(self) -> None:
         """Update the fit and the newest estimate, if a refit is due."""
@@ -179,6 +180,5 @@ class ResultPublisher:
             gap = replace(gap, axes={})
         events = self._agreement.update(gap)
         gap = replace(gap, agrees=self._agreement.verdicts)
-        for output in self.outputs:
-            output.model_gap(self.device.name, self._unix_s(gap.t_ns), gap)
+        self._result(gap.t_ns, gap)
         self.events(events)

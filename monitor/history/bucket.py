@@ -200,7 +200,7 @@ def unpack_statistics(data: bytes, count: int) -> tuple[Ints, Singles, Singles, 
     Raises
     ------
     RecordingError
-        The bytes cannot be decompressed or do not hold ``count`` columns.
+        If the bytes cannot be decompressed or do not hold ``count`` columns.
     """
     size = 16 * count
     try:

@@ -1,6 +1,6 @@
 """Columns of a history row, and the conversion of an estimate into column values.
 
-Each measured axis and letter has four columns. ``gz.N`` is the value, if it is estimated. ``gz.N.lo`` and ``gz.N.hi``
+Each measured axis and symbol has four columns. ``gz.N`` is the value, if it is estimated. ``gz.N.lo`` and ``gz.N.hi``
 are the ends of its interval. ``gz.N.bound`` is the upper bound, if the data only bound the value. The set of present
 columns encodes the status, so a value is never stored without its status. Deviations are stored at the averaging times
 1, 3, 10 … s (``gz.sigma.0.3``). The grid of the curve depends on the measured rate, so the deviations are interpolated
@@ -47,28 +47,30 @@ class ColumnConverter:
         self._below, self._above = np.array(below, np.intp), np.array(above, np.intp)
         self._share = share[:, None]
         columns, rows = len(AXES), len(SYMBOLS)
-        self._letters = np.array([row * columns + axis for row in range(rows) for axis in self._axes], np.intp)
+        self._coefficient_indices = np.array(
+            [row * columns + axis for row in range(rows) for axis in self._axes], np.intp
+        )
         axes = [AXES[i] for i in self._axes]
         self.names = (
-            *(f"{axis}.{letter}{part}" for part in VALUE_SUFFIXES for letter in SYMBOLS for axis in axes),
+            *(f"{axis}.{symbol}{part}" for part in VALUE_SUFFIXES for symbol in SYMBOLS for axis in axes),
             *(f"{axis}.sigma.{TAU_S[i]:g}" for i in at for axis in axes),
         )
-        self._letter_count = len(self._letters)
+        self._coefficient_count = len(self._coefficient_indices)
 
     def is_compatible(self, estimate: Estimate) -> bool:
-        """Return True if an estimate has the same measured axes and averaging times as the first one."""
+        """Return True if an estimate has the measured axes and averaging times of the first estimate."""
         tau_s = estimate.curve.tau_s
         same = tau_s is self._tau_s or np.array_equal(tau_s, self._tau_s)
         return same and bool((_measured(estimate) == self._measured).all())
 
     def convert(self, estimate: Estimate) -> Floats:
         """Return the column values of an estimate ([k], SI) in the order of ``names``; NaN marks a missing value."""
-        c, m = estimate.coefficients, self._letter_count
-        status, hi = c.status.take(self._letters), c.hi.take(self._letters)
+        c, m = estimate.coefficients, self._coefficient_count
+        status, hi = c.status.take(self._coefficient_indices), c.hi.take(self._coefficient_indices)
         estimated = status == Status.ESTIMATED.value
         numbers = np.full(len(self.names), np.nan)
-        np.copyto(numbers[:m], c.value.take(self._letters), where=estimated)
-        np.copyto(numbers[m : 2 * m], c.lo.take(self._letters), where=estimated)
+        np.copyto(numbers[:m], c.value.take(self._coefficient_indices), where=estimated)
+        np.copyto(numbers[m : 2 * m], c.lo.take(self._coefficient_indices), where=estimated)
         np.copyto(numbers[2 * m : 3 * m], hi, where=estimated)
         np.copyto(numbers[3 * m : 4 * m], hi, where=status == Status.UPPER_BOUND.value)
         numbers[4 * m :] = self._deviations(estimate).ravel()

@@ -32,13 +32,13 @@ _PART: Final = re.compile(r"([^=;]+)(?:=((?:[\[\]][^\[\]]*[\[\]])|[^;]*))?(?:;|$
 
 @dataclass(frozen=True, slots=True)
 class HistoryQuery:
-    """A query: time range, bucket width and the requested parts, axes and letters."""
+    """A query: time range, bucket width and the requested parts, axes and coefficients."""
 
     span: TimeRange | None = None  # None: the last day of the stored history
     step_s: int | None = None  # None: chosen by the reader
     what: tuple[str, ...] = DEFAULT_PARTS
     axes: tuple[str, ...] = AXES
-    letters: tuple[str, ...] = SYMBOLS
+    symbols: tuple[str, ...] = SYMBOLS
 
     def selects(self, name: str) -> bool:
         """Return True if the query requests the column ``name`` (see ``columns``).
@@ -52,8 +52,8 @@ class HistoryQuery:
             return STATUS in self.what and name in (*HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
         if axis not in self.axes:
             return False
-        letter = rest.split(".")[0]
-        return DEVIATIONS in self.what if letter == "sigma" else COEFFICIENTS in self.what and letter in self.letters
+        symbol = rest.split(".")[0]
+        return DEVIATIONS in self.what if symbol == "sigma" else COEFFICIENTS in self.what and symbol in self.symbols
 
     def parameters(self) -> str:
         """Format the query as the parameters of a zenoh selector.
@@ -66,7 +66,7 @@ class HistoryQuery:
             "step": "" if self.step_s is None else f"{self.step_s}s",
             "what": ",".join(self.what),
             "axis": ",".join(self.axes),
-            "letter": ",".join(self.letters),
+            "letter": ",".join(self.symbols),
         }
         return ";".join(f"{key}={value}" for key, value in parts.items() if value)
 
@@ -87,7 +87,7 @@ def parse_query(parameters: str, now_s: float) -> HistoryQuery:
     Raises
     ------
     ConfigError
-        A parameter is unknown, or its value is not valid.
+        If a parameter is unknown, or its value is not valid.
     """
     given = _split(parameters)
     for key in given:

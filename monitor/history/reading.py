@@ -18,7 +18,8 @@ from drivers.quantities import DAY_S
 from drivers.sample import Floats, Ints
 from monitor.common.units import format_utc
 from monitor.history.bucket import HistoryRow, Singles, merge_rows, select_columns
-from monitor.history.sqlite_store import HistoryReader, StoredEvent
+from monitor.history.sqlite_store import HistoryReader
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 
 DEFAULT_POINTS: Final = 1000
@@ -116,14 +117,14 @@ def read_history(
     Raises
     ------
     NotReady
-        The time range contains no rows and no events.
+        If the time range contains no rows and no events.
     RecordingError
-        A row cannot be read.
+        If a row cannot be read.
     """
     held = reader.stored_range(device)
     if held is None:
         raise NotReady(f"{device}: no history yet")
-    span = clip_to_stored(span or TimeRange(held[1] - DAY_S, held[1]), held)
+    span = _clip_to_stored(span or TimeRange(held[1] - DAY_S, held[1]), held)
     step_s = bucket_width_s(
         replace(span, start_s=max(span.start_s, held[0]), end_s=min(span.end_s, held[1])), step_s, points
     )
@@ -211,16 +212,8 @@ def bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEF
     )
 
 
-def clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
-    """Clip a time range to the stored one, extended by one day, because events may lie outside the rows.
-
-    Parameters
-    ----------
-    span
-        Time range.
-    held
-        Start and end of the stored rows, Unix time [s].
-    """
+def _clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
+    """Clip a time range to the stored one, extended by one day, because events may lie outside the rows."""
     start_s, end_s = max(span.start_s, held[0] - DAY_S), min(span.end_s, held[1] + DAY_S)
     return replace(span, start_s=min(start_s, end_s), end_s=max(start_s, end_s))
 

@@ -6,10 +6,6 @@ from a device's newest row, or from the current time if the newest row lies in t
 one row even if the process is killed. A row for an existing bucket is merged with the stored row. Restarts, late rows
 and repeated replays therefore leave one row per bucket.
 
-All events are kept up to EVENTS_AT_MOST per device. Beyond that limit, only the first, the last and the most
-significant event of each kind, axis and day are kept. If this is not sufficient, the same is done per month and then
-per year. ``represented_events`` of the last event counts the deleted ones.
-
 A file that is damaged, was written by a newer version, or is not a history is never modified. RecordingError names the
 cause. Errors of a full or read-only disk are raised as ``sqlite3.Error``. A transaction is complete or has no effect.
 """
@@ -19,8 +15,7 @@ import errno
 import math
 import os
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Final
@@ -31,6 +26,16 @@ from drivers.errors import RecordingError
 from drivers.file_access import check_folder, check_regular
 from drivers.quantities import DAY_S
 from monitor.history.bucket import MAX_COLUMNS, STATES, HistoryRow, merge_rows, pack_statistics, unpack_statistics
+from monitor.history.stored_events import (
+    MAX_EVENTS,
+    THINNING_SPANS_S,
+    StoredEvent,
+    clamp_time,
+    count_events,
+    insert_event,
+    read_events,
+    thin_events,
+)
 from monitor.history.time_ranges import TimeRange
 
 FILE_NAME: Final = "history.sqlite"
@@ -38,10 +43,6 @@ VERSION: Final = 1
 APPLICATION: Final = 0x494D5548  # "IMUH"
 LEVELS: Final = ((60, 7 * DAY_S), (900, 90 * DAY_S), (21_600, None))
 """Width of the rows of a level [s], and the age at which they are merged into the next level [s]; None: never."""
-MAX_EVENTS: Final = 20_000
-"""Largest number of events per device."""
-EVENT_THINNING_SPANS_S: Final = (DAY_S, 30 * DAY_S, 365 * DAY_S)
-MAX_TEXT_LENGTH: Final = 2000
 BUSY_TIMEOUT_S: Final = 5.0
 CACHE_KIB: Final = 2048
 SCHEMA: Final = """
@@ -74,20 +75,6 @@ _FileState = tuple[int, int, int, int]
 """Device number, inode, size and modification time of a file."""
 
 
-@dataclass(frozen=True, slots=True)
-class StoredEvent:
-    """An event of a device, as it is stored."""
-
-    t_s: float  # Unix time
-    kind: str
-    text: str
-    axis: str | None = None
-    what: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    since_s: float | None = None  # Unix time at which the reported condition began
-    sigma: float | None = None
-    represented_events: int = 1  # number of events it represents: itself, and deleted earlier events of its kind
-
-
 class UnusableHistory(RecordingError):
     """Error: the history file is damaged or holds something else."""
 
@@ -103,9 +90,9 @@ class HistoryStore:
     Raises
     ------
     RecordingError
-        The file is not a history, is damaged, or was written by a newer version.
+        If the file is not a history, is damaged, or was written by a newer version.
     sqlite3.Error, OSError
-        The file cannot be opened now.
+        If the file cannot be opened now.
     """
 
     def __init__(self, path: Path) -> None:
@@ -132,10 +119,10 @@ class HistoryStore:
 
     def _prepare(self) -> None:
         """Create the tables if the file is empty, and set the options of the connection."""
-        if not is_history(self._db, self.path):
+        if not _is_history(self._db, self.path):
             self._db.execute("PRAGMA journal_mode = WAL")
             with self._transaction():
-                if not is_history(self._db, self.path):  # another process may have created the tables meanwhile
+                if not _is_history(self._db, self.path):  # another process may have created the tables meanwhile
                     for statement in SCHEMA.split(";"):
                         self._db.execute(statement)
                     self._db.execute(f"PRAGMA application_id = {APPLICATION}")
@@ -157,15 +144,15 @@ class HistoryStore:
         Raises
         ------
         UnusableHistory
-            The file is damaged.
+            If the file is damaged.
         sqlite3.OperationalError
-            The file cannot be written now.
+            If the file cannot be written now.
         """
         with _damage_as_unusable(self.path), self._transaction():
             for device, row in rows:
                 self._put(self._device_id(device), row)
             for device, event in events:
-                self._put_event(self._device_id(device), event)
+                insert_event(self._db, self._device_id(device), event)
         self._files = _file_states(self.path)
 
     def merge_old_rows(self, now_s: float, at_most: int = 100) -> int:
@@ -181,14 +168,16 @@ class HistoryStore:
         Raises
         ------
         UnusableHistory
-            The file is damaged.
+            If the file is damaged.
         sqlite3.OperationalError
-            The file cannot be written now.
+            If the file cannot be written now.
         """
         done = 0
         with _damage_as_unusable(self.path):
             for device, newest_s in self._newest_end_s().items():
-                done += self._thin_events(device)
+                if count_events(self._db, device) > MAX_EVENTS:
+                    self._thin_events(device)
+                    done += 1
                 age_from_s = min(newest_s, now_s)
                 for (width_s, age_s), (wider_s, _) in pairwise(LEVELS):
                     assert age_s is not None
@@ -200,7 +189,7 @@ class HistoryStore:
         return done
 
     def external_change(self) -> str:
-        """Return what another program has done to the file since its last use by this store; "" if nothing.
+        """Return how another program has changed the file since this store last used the file; "" if unchanged.
 
         SQLite does not detect such changes: it would continue to write to a file that has been deleted.
         """
@@ -271,7 +260,7 @@ class HistoryStore:
         return {device: -math.inf if span is None else span[1] for device, span in spans.items()}
 
     def _merge_oldest(self, device: int, width_s: int, wider_s: int, limit_s: float) -> bool:
-        """Merge the rows of the oldest wider bucket that ends by ``limit_s``; False if there is no such bucket."""
+        """Merge the oldest rows into a wider bucket that ends by ``limit_s``; return True if rows were merged."""
         oldest = self._db.execute(
             "SELECT min(start) FROM row WHERE device = ? AND width = ?", (device, width_s)
         ).fetchone()[0]
@@ -290,58 +279,13 @@ class HistoryStore:
             self._db.execute(f"DELETE FROM row WHERE {where}", bucket)
         return True
 
-    # --- events
-
-    def _put_event(self, device: int, event: StoredEvent) -> None:
-        """Insert an event."""
-        self._db.execute(
-            "INSERT INTO event (device, t, kind, axis, since, sigma, stands_for, what, text)"
-            " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (
-                device,
-                event.t_s,
-                event.kind,
-                event.axis,
-                event.since_s,
-                event.sigma,
-                event.represented_events,
-                _encode_values(event.what),
-                event.text[:MAX_TEXT_LENGTH],
-            ),
-        )
-
-    def _thin_events(self, device: int) -> int:
-        """Thin the events of a device by day, month and year until half of the limit remains; 0 if they are few."""
-        if self._count_events(device) <= MAX_EVENTS:
-            return 0
-        for span_s in EVENT_THINNING_SPANS_S:
+    def _thin_events(self, device: int) -> None:
+        """Thin the events of a device by day, month and year until half of the limit remains."""
+        for span_s in THINNING_SPANS_S:
             with self._transaction():
-                self._thin_events_by_span(device, span_s)
-            if self._count_events(device) <= MAX_EVENTS // 2:
+                thin_events(self._db, device, span_s)
+            if count_events(self._db, device) <= MAX_EVENTS // 2:
                 break
-        return 1
-
-    def _count_events(self, device: int) -> int:
-        """Return the number of stored events of a device."""
-        return int(self._db.execute("SELECT count(*) FROM event WHERE device = ?", (device,)).fetchone()[0])
-
-    def _thin_events_by_span(self, device: int, span_s: int) -> None:
-        """Keep the first, last and most significant event per kind, axis and time span; the last counts the others."""
-        keep: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
-        rows = self._db.execute(
-            "SELECT id, t, kind, axis, sigma, stands_for FROM event WHERE device = ? ORDER BY t, id", (device,)
-        )
-        for one in rows:
-            keep.setdefault((int(one[1] // span_s), one[2], one[3]), []).append(one)
-        for group in keep.values():
-            surest = max(group, key=lambda one: -math.inf if one[4] is None else one[4])
-            stay = {group[0][0], surest[0], group[-1][0]}
-            gone = [one for one in group if one[0] not in stay]
-            if not gone:
-                continue
-            self._db.executemany("DELETE FROM event WHERE id = ?", [(one[0],) for one in gone])
-            more = sum(one[5] for one in gone)
-            self._db.execute("UPDATE event SET stands_for = stands_for + ? WHERE id = ?", (more, group[-1][0]))
 
     # --- internal
 
@@ -423,7 +367,7 @@ class HistoryReader:
         for width_s, _ in LEVELS[::-1]:
             found = self._db.execute(
                 f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start > ? AND start <= ? ORDER BY start",
-                (self._id(device), width_s, _clamp_time(span.start_s - width_s), _clamp_time(span.end_s)),
+                (self._id(device), width_s, clamp_time(span.start_s - width_s), clamp_time(span.end_s)),
             )
             for one in found:
                 row = self._layouts.row(one)
@@ -442,20 +386,7 @@ class HistoryReader:
         at_most
             Largest number of events to return.
         """
-        where = "device = ? AND t >= ? AND t <= ?"
-        bounds = (self._id(device), _clamp_time(span.start_s), _clamp_time(span.end_s))
-        found = self._db.execute(
-            f"SELECT t, kind, text, axis, what, since, sigma, stands_for FROM event WHERE {where}"
-            " ORDER BY t DESC, id DESC LIMIT ?",
-            (*bounds, at_most + 2),  # events exactly at the ends may be excluded by the time range
-        ).fetchall()
-        events = [
-            StoredEvent(t, kind, text, axis, _decode_values(what), since, sigma, stands_for)
-            for t, kind, text, axis, what, since, sigma, stands_for in found
-            if span.contains(t)
-        ]
-        (count,) = self._db.execute(f"SELECT count(*) FROM event WHERE {where}", bounds).fetchone()
-        return events[:at_most][::-1], max(int(count), len(events[:at_most]))
+        return read_events(self._db, self._id(device), span, at_most)
 
     def _id(self, device: str) -> int:
         """Return the identifier of a device; -1 if the file does not contain the device."""
@@ -470,7 +401,7 @@ def open_history(path: Path) -> Iterator[HistoryReader]:
     Raises
     ------
     RecordingError
-        The file does not exist or cannot be read.
+        If the file does not exist or cannot be read.
     """
     try:
         os.stat(path)
@@ -481,7 +412,7 @@ def open_history(path: Path) -> Iterator[HistoryReader]:
         raise RecordingError(f"{error.filename or path}: cannot be read: {error.strerror or error}") from error
     try:
         with _damage_as_unusable(path), contextlib.closing(_open_read_only(path)) as db:
-            if not is_history(db, path):
+            if not _is_history(db, path):
                 raise RecordingError(f"{path}: nothing is in it yet")
             db.execute("BEGIN")
             yield HistoryReader(db, path)
@@ -502,23 +433,8 @@ def _stored_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | N
     return (float(min(starts)), float(max(ends))) if starts else None
 
 
-def is_history(db: sqlite3.Connection, path: Path) -> bool:
-    """Return True if the database is a history, and False if it is empty.
-
-    Parameters
-    ----------
-    db
-        Connection to the database.
-    path
-        Path of the file, for the message.
-
-    Raises
-    ------
-    UnusableHistory
-        The database is not a history or lacks a table.
-    RecordingError
-        The history was written by a newer version.
-    """
+def _is_history(db: sqlite3.Connection, path: Path) -> bool:
+    """Return True if the database is a history and False if it is empty; raise an error for any other database."""
     (version,), (application,) = (
         db.execute(f"PRAGMA {what}").fetchone() for what in ("user_version", "application_id")
     )
@@ -629,22 +545,3 @@ def _damage_as_unusable(path: Path) -> Iterator[None]:
         raise UnusableHistory(f"{path}: damaged: {error}; {MOVE_HINT}") from error
     except (sqlite3.DatabaseError, msgspec.DecodeError, UnicodeDecodeError) as error:
         raise UnusableHistory(f"{path}: damaged: {error}; {MOVE_HINT}") from error
-
-
-def _clamp_time(t_s: float) -> float:
-    """Clamp a time to the range that SQLite can compare."""
-    return max(min(t_s, 1e18), -1e18)
-
-
-def _encode_values(what: Mapping[str, Mapping[str, float]]) -> str:
-    """Encode event values as JSON, NaN as null; ``{}`` if they are longer than those of any event of this program."""
-    text = msgspec.json.encode(what).decode()
-    return text if len(text) <= MAX_TEXT_LENGTH else "{}"
-
-
-def _decode_values(text: str) -> dict[str, dict[str, float]]:
-    """Decode event values from JSON, null as NaN."""
-    found = msgspec.json.decode(text, type=dict[str, dict[str, float | None]])
-    return {
-        name: {key: math.nan if one is None else one for key, one in sides.items()} for name, sides in found.items()
-    }

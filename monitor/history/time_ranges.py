@@ -97,7 +97,7 @@ def parse_zenoh_range(text: str, now_s: float) -> TimeRange:
     Raises
     ------
     ConfigError
-        The text is not a time range, or the range ends before it begins.
+        If the text is not a time range, or the range ends before it begins.
     """
     text = text.strip()
     if len(text) < 2 or text[0] not in "[]" or text[-1] not in "[]":
@@ -134,7 +134,7 @@ def parse_time(text: str, now_s: float) -> float:
     Raises
     ------
     ConfigError
-        The text is not a time.
+        If the text is not a time.
     """
     text = text.strip()
     if text == "now":
@@ -155,7 +155,7 @@ def parse_duration_s(text: str) -> float:
     Raises
     ------
     ConfigError
-        The text is not a duration, or the duration is zero or too long.
+        If the text is not a duration, or the duration is zero or too long.
     """
     seconds = _duration_s(text)
     if seconds <= 0.0:

@@ -37,9 +37,9 @@ from monitor.history.sqlite_store import (
     REPLACED,
     SQLITE_SUFFIXES,
     HistoryStore,
-    StoredEvent,
     UnusableHistory,
 )
+from monitor.history.stored_events import StoredEvent
 
 QUEUE_CAPACITY: Final = 4096
 """Capacity of the queue in rows and events: three days of a full disk with one device, about 12 MB."""
@@ -89,7 +89,7 @@ class HistoryWriter:
 
     @property
     def state(self) -> str:
-        """``ok``, or a description of what is wrong; part of the status message."""
+        """``ok``, or a description of the problem; part of the status message."""
         dropped = f"{self.dropped} results not kept" if self.dropped else ""
         if self._error:
             return f"{self._error} ({dropped})" if dropped else self._error
@@ -216,7 +216,7 @@ class HistoryWriter:
         )
 
     def _resume(self) -> None:
-        """Continue after the other process has ended."""
+        """Continue to write after the process that held the lock has ended."""
         if self._excluded:
             with self._lock:
                 self._excluded, self._resumed_devices = False, set()
@@ -251,7 +251,7 @@ class HistoryWriter:
             for end in (
                 *SQLITE_SUFFIXES,
                 "",
-            ):  # SQLite would use the old companion files for a new database of the same name
+            ):  # SQLite would apply the old companion files to the new database
                 with contextlib.suppress(FileNotFoundError):
                     os.rename(f"{self.path}{end}", self.path.with_name(f"{name}{end}"))
         except OSError as failed:

@@ -69,12 +69,12 @@ class DeviceCoefficients:
         """
         axes = tuple(axis for axis in AXES if axis in message.axes)
         k_or_r = frozenset(axis for axis in axes if any(one.other for one in message.axes[axis].values()))
-        return cls(message.to_coefficients(), axes, k_or_r, message.filled)
+        return cls(message.to_coefficients(), axes, k_or_r, message.filled_s)
 
 
 @dataclass(slots=True)
 class RemoteDevice:
-    """State of a remote device; times are those of the receiver's monotonic clock."""
+    """State of a remote device. All times are of the receiver's monotonic clock."""
 
     key: str  # key of the device, without the topic
     last_message_s: float  # time of the newest message of any topic
@@ -168,7 +168,7 @@ class DeviceStates:
         device, topic = split_key(key) or ("", topics.ALIVE)
         with self._lock:
             try:
-                message = decode_for_table(topic, payload)
+                message = _decode_for_table(topic, payload)
                 if message is None:
                     return None
                 known = self._devices.get(device) or RemoteDevice(device, 0.0)
@@ -210,7 +210,7 @@ class DeviceStates:
                 self._events.remove(one)
 
     def devices(self, now_s: float) -> list[RemoteDevice]:
-        """Return copies of the states of all devices at time ``now_s`` [s], those with problems first."""
+        """Return copies of the states of all devices. Devices with problems at time ``now_s`` [s] come first."""
         with self._lock:
             found = [copy.copy(one) for one in self._devices.values()]
         return sorted(found, key=lambda one: (one.rank(now_s), one.key))
@@ -255,21 +255,8 @@ def split_key(key: str) -> tuple[str, topics.Topic] | None:
     return None
 
 
-def decode_for_table(topic: topics.Topic, payload: bytes) -> Message | None:
-    """Decode a message that tables of devices show; None for all other topics.
-
-    Parameters
-    ----------
-    topic
-        Topic of the message.
-    payload
-        Encoded message.
-
-    Raises
-    ------
-    ValueError
-        If the payload is not a message of this topic.
-    """
+def _decode_for_table(topic: topics.Topic, payload: bytes) -> Message | None:
+    """Decode a message that tables of devices show; None for all other topics."""
     if topic is topics.STATUS:
         return StatusMessage.decode(payload)
     if topic is topics.EVENT:

@@ -39,7 +39,8 @@ from monitor.common import config_files
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history.minute_aggregation import MinuteAggregator
-from monitor.history.sqlite_store import FILE_NAME, HistoryStore, StoredEvent
+from monitor.history.sqlite_store import FILE_NAME, HistoryStore
+from monitor.history.stored_events import StoredEvent
 from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
 from monitor.publishing.plots.diagnostic_figure import diagnostic_svg

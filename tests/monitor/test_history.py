@@ -19,7 +19,8 @@ from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history import reading as past
 from monitor.history.reading import HistoryTable
-from monitor.history.sqlite_store import FILE_NAME, StoredEvent, open_history
+from monitor.history.sqlite_store import FILE_NAME, open_history
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.noise.catalogue import read_model
 from monitor.publishing.messages.history import decode_history
@@ -59,8 +60,9 @@ class Told(Output):
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         self.received = received
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        self.estimates.append((unix_s, estimate))
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        if isinstance(result, Estimate):
+            self.estimates.append((unix_s, result))
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.events.append((unix_s, event))

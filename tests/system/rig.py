@@ -7,6 +7,7 @@ import tty
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,10 +18,9 @@ from monitor.daemon.output import Output
 from monitor.daemon.service import Service
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalUpdate
-from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
+from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings import loading
 from tests.support.waiting import PATIENCE_S
 
@@ -31,7 +31,7 @@ class Caught(Output):
     def __init__(self) -> None:
         self.blocks: dict[str, list[SampleBlock]] = {}
         self.estimates: dict[str, Estimate] = {}
-        self.totals: dict[str, tuple[TotalCurve, HadamardCurve]] = {}
+        self.totals: dict[str, SlowStatistics] = {}
         self.gaps: dict[str, ModelGap] = {}
         self.thermals: dict[str, list[ThermalUpdate]] = {}
         self.rates: dict[str, list[SampleBlock]] = {}
@@ -42,23 +42,21 @@ class Caught(Output):
     def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         self.blocks.setdefault(device, []).append(samples)
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        self.estimates[device] = estimate
-
-    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        self.gaps[device] = gap
-
-    def thermal(self, device: str, unix_s: float, received: int, look: ThermalUpdate) -> None:
-        self.thermals.setdefault(device, []).append(look)
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        match result:
+            case Estimate():
+                self.estimates[device] = result
+            case ModelGap():
+                self.gaps[device] = result
+            case ThermalUpdate():
+                self.thermals.setdefault(device, []).append(result)
+            case DriftUpdate():
+                self.drifts.setdefault(device, []).append(result)
+            case SlowStatistics():
+                self.totals[device] = result
 
     def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         self.rates.setdefault(device, []).append(samples)
-
-    def drift(self, device: str, unix_s: float, look: DriftUpdate) -> None:
-        self.drifts.setdefault(device, []).append(look)
-
-    def total(self, device: str, unix_s: float, received: int, total: TotalCurve, hadamard: HadamardCurve) -> None:
-        self.totals[device] = (total, hadamard)
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.events.append((device, event))

@@ -6,6 +6,7 @@ curve of the whole record shows neither the one sensor nor the other.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -46,10 +47,10 @@ class Kept(Caught):
         super().__init__()
         self.course: list[CoefficientHistory] = []
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        super().estimate(device, unix_s, estimate)
-        if estimate.history is not None:
-            self.course.append(estimate.history)
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        super().result(device, unix_s, received, result)
+        if isinstance(result, Estimate) and result.history is not None:
+            self.course.append(result.history)
 
 
 def sensor(k: dict[str, float]) -> NoiseModel:

@@ -1236,7 +1236,8 @@ def test_watching_listens_nowhere() -> None:
 def histories(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with what was kept of two devices for two hours."""
     from monitor.history.bucket import HistoryRow
-    from monitor.history.sqlite_store import FILE_NAME, HistoryStore, StoredEvent
+    from monitor.history.sqlite_store import FILE_NAME, HistoryStore
+    from monitor.history.stored_events import StoredEvent
 
     folder = tmp_path_factory.mktemp("kept")
     store = HistoryStore(folder / FILE_NAME)

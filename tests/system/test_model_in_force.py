@@ -55,11 +55,12 @@ class Watching(Caught):
     told_s = 0.0  # of the sensor's time
     looked = 0  # samples that have been looked at
 
-    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        super().gap(device, unix_s, gap)
-        self.looked = gap.samples
-        if gap.samples / RATE_HZ < AT_S:
-            self.before = gap
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        super().result(device, unix_s, received, result)
+        if isinstance(result, ModelGap):
+            self.looked = result.samples
+            if result.samples / RATE_HZ < AT_S:
+                self.before = result
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         super().event(device, unix_s, received, event)

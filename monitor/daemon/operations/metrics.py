@@ -99,9 +99,10 @@ class MetricsOutput(Output):
 
     # --- called by the main loop
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         """Keep the newest estimate of a device."""
-        self._estimates[device] = estimate
+        if isinstance(result, Estimate):
+            self._estimates[device] = result
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Count an event."""

@@ -17,7 +17,7 @@ from monitor.estimation.analysis import Analysis
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
-from monitor.publishing.messages.message import encode_json
+from monitor.publishing.messages.message import encode_json, shared_fields
 from monitor.publishing.messages.results import (
     CoefficientValue,
     coefficient_values,
@@ -42,14 +42,14 @@ class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
         return cls(curve.tau_s, *deviation_columns(curve, axis))
 
 
-class TemperatureValues(msgspec.Struct, frozen=True):
+class TemperatureValues(msgspec.Struct, frozen=True, rename={"interval_s": "interval"}):
     """Measures of how strongly the bias of an axis depends on temperature."""
 
     share: float
     p_value: float
     form: str
     one_way: bool
-    interval: float
+    interval_s: float
 
 
 class WithoutTemperature(msgspec.Struct, frozen=True):
@@ -250,5 +250,4 @@ def _temperature_values(
     """Return the dependence of an axis on temperature, if temperature explains most of its slow variance."""
     if temperature is None or axis not in result.axes_of_temperature:
         return UNSET
-    one = temperature.dependences[axis]
-    return TemperatureValues(one.share, one.p_value, one.form, one.one_way, one.interval_s)
+    return TemperatureValues(**shared_fields(TemperatureValues, temperature.dependences[axis]))

@@ -20,9 +20,9 @@ from monitor.history.bucket import COUNTS, STATES
 from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
 from monitor.history.query import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, HistoryQuery
 from monitor.history.reading import MAX_EVENTS, ColumnStatistics, HistoryTable
-from monitor.history.sqlite_store import StoredEvent
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
-from monitor.publishing.messages.message import Message, decode_message, remove_control_characters
+from monitor.publishing.messages.message import Message, decode_message, remove_control_characters, shared_fields
 
 MAX_BUCKETS: Final = 1_000_000
 """Largest number of buckets accepted in a message."""
@@ -159,31 +159,27 @@ class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return {name: one.to_column(buckets) for name, one in numbers.items() if isinstance(one, NumberHistory)}
 
 
-class PastEvent(msgspec.Struct, frozen=True, kw_only=True):
+class PastEvent(
+    msgspec.Struct,
+    frozen=True,
+    kw_only=True,
+    rename={"t_s": "t", "since_s": "since", "represented_events": "stands_for"},
+):
     """Stored event of the device; ``stands_for`` counts the event and the deleted earlier ones of its kind."""
 
-    t: float
+    t_s: float
     kind: str
     axis: str | None = None
     what: dict[str, dict[str, float | None]] = {}
-    since: float | None = None
+    since_s: float | None = None
     sigma: float | None = None
     text: str
-    stands_for: int = 1
+    represented_events: int = 1
 
     @classmethod
     def of(cls, event: StoredEvent) -> Self:
         """Return a stored event."""
-        return cls(
-            t=event.t_s,
-            kind=event.kind,
-            axis=event.axis,
-            what={name: dict(sides) for name, sides in event.what.items()},
-            since=event.since_s,
-            sigma=event.sigma,
-            text=event.text,
-            stands_for=event.represented_events,
-        )
+        return cls(**shared_fields(cls, event) | {"what": {name: dict(sides) for name, sides in event.what.items()}})
 
     def to_event(self) -> StoredEvent:
         """Return the stored event, without control characters in its texts."""
@@ -191,9 +187,13 @@ class PastEvent(msgspec.Struct, frozen=True, kw_only=True):
             name: {side: np.nan if one is None else one for side, one in sides.items()}
             for name, sides in self.what.items()
         }
-        kind, text = remove_control_characters(self.kind), remove_control_characters(self.text)
-        axis = self.axis if self.axis in AXES else None
-        return StoredEvent(self.t, kind, text, axis, what, self.since, self.sigma, self.stands_for)
+        known = {name: getattr(self, name) for name in self.__struct_fields__} | {
+            "kind": remove_control_characters(self.kind),
+            "text": remove_control_characters(self.text),
+            "axis": self.axis if self.axis in AXES else None,
+            "what": what,
+        }
+        return StoredEvent(**known)
 
 
 class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.schema()):
@@ -227,7 +227,7 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
             Number of samples since the start of the device.
         """
         axes = {
-            axis: {symbol: CoefficientHistory.of_coefficient(past, f"{axis}.{symbol}") for symbol in query.letters}
+            axis: {symbol: CoefficientHistory.of_coefficient(past, f"{axis}.{symbol}") for symbol in query.symbols}
             for axis in query.axes
             if axis in past.axes()
         }

@@ -1,8 +1,9 @@
 """Base class of the messages, and their encoding as JSON.
 
 Each message is one ``msgspec.Struct``. The publisher, ``watch``, ``view`` and the history queries use the same structs.
-The fields have the names of the JSON keys and the order in which the keys are written. Numbers are in SI units. NaN is
-written as null, because JSON cannot represent it. In an array, null is read as NaN.
+The fields have the order in which the JSON keys are written, and the names of the keys or of the attributes of the
+result (see ``rename``). Numbers are in SI units. NaN is written as null, because JSON cannot represent it. In an array,
+null is read as NaN.
 
 Unknown keys are ignored, so messages of newer daemons can be read. Any payload that is not the expected message raises
 ``ValueError``. The module does no I/O.
@@ -89,6 +90,19 @@ def decode_message(kind: type[M], payload: bytes, max_bytes: int = MAX_PAYLOAD_B
 def encode_json(value: Any) -> bytes:
     """Encode structs, arrays and built-in types as JSON."""
     return _ENCODER.encode(value)
+
+
+def shared_fields(kind: type[msgspec.Struct], source: object) -> dict[str, Any]:
+    """Return the attributes of an object that have the name of a field of a struct.
+
+    Parameters
+    ----------
+    kind
+        Class of the struct.
+    source
+        The object.
+    """
+    return {name: getattr(source, name) for name in kind.__struct_fields__ if hasattr(source, name)}
 
 
 def remove_control_characters(text: str) -> str:

@@ -1,6 +1,7 @@
 """Messages with the results, events and status of a device."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any, Final, NamedTuple, Self
 
 import msgspec
@@ -20,7 +21,7 @@ from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 from monitor.noise.standard_terms import UNIT_SOURCES
-from monitor.publishing.messages.message import Count, Message, decode_message, remove_control_characters
+from monitor.publishing.messages.message import Count, Message, decode_message, remove_control_characters, shared_fields
 
 MAX_AVERAGING_TIMES: Final = 1000
 """Largest accepted number of averaging times."""
@@ -62,22 +63,26 @@ class CoefficientValue(msgspec.Struct, frozen=True):
     """The other symbol of K and R, if the data do not show which of the two is present."""
 
 
-class WindowMessage(Message, frozen=True, kw_only=True):
+class WindowMessage(
+    Message,
+    frozen=True,
+    kw_only=True,
+    rename={"rate_hz": "rate", "window_s": "window", "filled_s": "filled", "tau_s": "tau"},
+):
     """Message with results of the window."""
 
-    rate: float | None = None
-    """Sample rate [Hz]."""
-    window: float | None = None
-    """Length of the full window [s]."""
-    filled: float | None = None
-    """Filled part of the window [s]."""
+    rate_hz: float | None = None
+    window_s: float | None = None
+    """Length of the full window."""
+    filled_s: float | None = None
+    """Filled part of the window."""
 
 
 class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema()):
     """Message ``imu/<device>/allan``: Allan deviations of each measured axis."""
 
     topic = topics.ALLAN
-    tau: Floats
+    tau_s: Floats
     axes: dict[str, AllanAxis]
 
     @classmethod
@@ -91,7 +96,8 @@ class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.sc
             )
             for i, axis in measured_axes(result.curve)
         }
-        return cls(device=device, t=t, tau=result.curve.tau_s, axes=axes, **_window(result))
+        filled_s, shared = result.curve.n / result.rate_hz, shared_fields(cls, result)
+        return cls(device=device, t=t, filled_s=filled_s, tau_s=result.curve.tau_s, axes=axes, **shared)
 
     def to_estimate(self, coefficients: Coefficients, k_or_r: frozenset[str]) -> Estimate:
         """Build an estimate. Degrees of freedom and numbers of terms are not part of the message and are unknown.
@@ -108,8 +114,8 @@ class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.sc
         ValueError
             If the averaging times do not increase from above zero, or if a curve has another length.
         """
-        tau_s, m = self.tau, self.tau.size
-        rate_hz, window_s, filled_s = self.rate or 0.0, self.window or 0.0, self.filled or 0.0
+        tau_s, m = self.tau_s, self.tau_s.size
+        rate_hz, window_s, filled_s = self.rate_hz or 0.0, self.window_s or 0.0, self.filled_s or 0.0
         rising = tau_s.ndim == 1 and bool(np.all(tau_s > 0.0) and np.all(np.diff(tau_s) > 0.0))
         if not 0 < m <= MAX_AVERAGING_TIMES or not rising or not rate_hz > 0.0 or self.t is None:
             raise ValueError("the averaging times must increase from above zero")
@@ -146,7 +152,8 @@ class CoefficientsMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.C
             axis: coefficient_values(result.coefficients, i, bool(result.k_or_r[i]))
             for i, axis in measured_axes(result.curve)
         }
-        return cls(device=device, t=t, axes=axes, **_window(result))
+        filled_s = result.curve.n / result.rate_hz
+        return cls(device=device, t=t, filled_s=filled_s, axes=axes, **shared_fields(cls, result))
 
     def to_coefficients(self) -> Coefficients:
         """Return the coefficients of all axes.
@@ -179,8 +186,7 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Comparison of one axis with its model."""
 
     agrees: bool | None = None
-    """Current decision; None if there is none yet. It has hysteresis: it changes later than ``gap`` crosses
-    ``threshold``."""
+    """Current decision, with hysteresis: it changes later than ``gap`` crosses ``threshold``. None: not decided yet."""
     gap: float
     where: TauRange
     ratio: float | None = None
@@ -192,11 +198,10 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 
 class GapMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
-    """Message ``imu/<device>/gap``: measured deviations and those of the model in force, on the axes that can be
-    compared."""
+    """Message ``imu/<device>/gap``: comparison of the measured deviations with the model in force."""
 
     topic = topics.GAP
-    tau: Floats | None = None
+    tau_s: Floats | None = None
     axes: dict[str, AxisGapValues]
 
     @classmethod
@@ -204,28 +209,12 @@ class GapMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.GAP.schema
         """Build the message from a comparison with the model."""
         axes = {
             axis: AxisGapValues(
-                agrees=result.agrees.get(axis),
-                gap=one.gap,
-                where=TauRange(one.tau_s),
-                ratio=one.ratio,
-                null95=one.null95,
-                threshold=one.threshold,
-                measured=one.measured,
-                model=one.model,
-                z=one.z,
+                agrees=result.agrees.get(axis), where=TauRange(one.tau_s), **shared_fields(AxisGapValues, one)
             )
             for axis, one in result.axes.items()
         }
-        return cls(
-            device=device,
-            t=t,
-            samples=result.samples,
-            rate=result.rate_hz,
-            window=result.window_s,
-            filled=result.n / result.rate_hz,
-            tau=result.tau_s,
-            axes=axes,
-        )
+        known = shared_fields(cls, result) | {"filled_s": result.n / result.rate_hz, "axes": axes}
+        return cls(device=device, t=t, **known)
 
 
 class PredictedBias(msgspec.Struct, frozen=True):
@@ -255,12 +244,18 @@ class AxisThermalValues(msgspec.Struct, frozen=True):
     text: str
 
 
-class ThermalMessage(Message, frozen=True, kw_only=True, tag=topics.THERMAL.schema()):
+class ThermalMessage(
+    Message,
+    frozen=True,
+    kw_only=True,
+    tag=topics.THERMAL.schema(),
+    rename={"interval_s": "interval", "temperature_c": "temperature"},
+):
     """Message ``imu/<device>/thermal``: mean biases of an interval, which ends at ``t``, and their predictions."""
 
     topic = topics.THERMAL
-    interval: float
-    temperature: float | None
+    interval_s: float
+    temperature_c: float | None
     axes: dict[str, AxisThermalValues]
 
     @classmethod
@@ -268,24 +263,17 @@ class ThermalMessage(Message, frozen=True, kw_only=True, tag=topics.THERMAL.sche
         """Build the message from the result of the thermal model for an interval."""
         axes = {
             axis: AxisThermalValues(
-                one.bias,
-                one.error,
-                PredictedBias.of(one.multi_step),
-                PredictedBias.of(one.one_step),
-                one.model or None,
-                one.slope,
-                one.text,
+                bias=one.bias,
+                error=one.error,
+                multi_step=PredictedBias.of(one.multi_step),
+                one_step=PredictedBias.of(one.one_step),
+                model=one.model or None,
+                slope=one.slope,
+                text=one.text,
             )
             for axis, one in result.axes.items()
         }
-        return cls(
-            device=device,
-            t=t,
-            samples=samples,
-            interval=result.interval_s,
-            temperature=result.temperature_c,
-            axes=axes,
-        )
+        return cls(device=device, t=t, samples=samples, **shared_fields(cls, result) | {"axes": axes})
 
 
 class DeviationTable(msgspec.Struct, frozen=True, eq=False):
@@ -310,7 +298,7 @@ class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()
 
     @classmethod
     def of(cls, device: str, t: float | None, samples: int, result: SlowStatistics) -> Self:
-        """Build the message from both curves."""
+        """Build the message from the total and Hadamard deviations."""
         total, hadamard = DeviationTable.of(result.total), DeviationTable.of(result.hadamard)
         return cls(device=device, t=t, samples=samples, total=total, hadamard=hadamard)
 
@@ -375,20 +363,26 @@ class Latency(msgspec.Struct, frozen=True):
     p99: float | None = None
 
 
-class StatusMessage(Message, frozen=True, kw_only=True, tag=topics.STATUS.schema()):
+class StatusMessage(
+    Message,
+    frozen=True,
+    kw_only=True,
+    tag=topics.STATUS.schema(),
+    rename={"rate_hz": "rate", "memory_bytes": "memory", "uptime_s": "uptime"},
+):
     """Message ``imu/<device>/status``; see ``Health`` for the meaning of the fields."""
 
     topic = topics.STATUS
     state: str
-    rate: float | None = None
+    rate_hz: float | None = None
     received: Count
     lost: Count
     bad: Count
     overflowed: Count = 0
     latency: Latency = Latency()
-    memory: Count = 0
+    memory_bytes: Count = 0
     outputs: dict[str, str] = msgspec.field(default_factory=dict)
-    uptime: float = 0.0
+    uptime_s: float = 0.0
     repeated: Count = 0
     late: Count = 0
     moving: bool = False
@@ -399,27 +393,12 @@ class StatusMessage(Message, frozen=True, kw_only=True, tag=topics.STATUS.schema
     @classmethod
     def of(cls, device: str, t: float | None, samples: int, result: Health) -> Self:
         """Build the message from the health of a device."""
-        return cls(
-            device=device,
-            t=t,
-            samples=result.received,
-            state=result.state,
-            rate=result.rate_hz,
-            received=result.received,
-            lost=result.lost,
-            bad=result.bad,
-            overflowed=result.overflowed,
-            latency=Latency(result.latency_p50_s, result.latency_p99_s),
-            memory=result.memory_bytes,
-            outputs={name: mask_secrets(state) for name, state in result.outputs.items()},
-            uptime=result.uptime_s,
-            repeated=result.repeated,
-            late=result.late,
-            moving=result.moving,
-            moved=result.moved,
-            crossed=result.crossed,
-            text=mask_secrets(result.text),
-        )
+        changed = {
+            "latency": Latency(result.latency_p50_s, result.latency_p99_s),
+            "outputs": {name: mask_secrets(state) for name, state in result.outputs.items()},
+            "text": mask_secrets(result.text),
+        }
+        return cls(device=device, t=t, samples=result.received, **shared_fields(cls, result) | changed)
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
@@ -439,20 +418,8 @@ class StatusMessage(Message, frozen=True, kw_only=True, tag=topics.STATUS.schema
 
     def to_health(self) -> Health:
         """Build the health of the device."""
-        return Health(
-            state=self.state,
-            rate_hz=self.rate,
-            received=self.received,
-            lost=self.lost,
-            bad=self.bad,
-            overflowed=self.overflowed,
-            latency_p50_s=self.latency.p50,
-            latency_p99_s=self.latency.p99,
-            memory_bytes=self.memory,
-            outputs=self.outputs,
-            text=self.text,
-            uptime_s=self.uptime,
-        )
+        known = {field.name: getattr(self, field.name) for field in fields(Health) if hasattr(self, field.name)}
+        return Health(**known, latency_p50_s=self.latency.p50, latency_p99_s=self.latency.p99)
 
 
 class ResetMessage(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
@@ -568,16 +535,6 @@ def deviation_columns(curve: AllanCurve | TotalCurve | HadamardCurve, axis: int)
 def measured_axes(curve: AllanCurve) -> list[tuple[int, str]]:
     """Return the column and name of each axis that has a curve."""
     return [(i, axis) for i, axis in enumerate(AXES) if not np.isnan(curve.avar[:, i]).all()]
-
-
-def _window(estimate: Estimate) -> dict[str, Any]:
-    """Return the fields that describe the window of an estimate."""
-    return {
-        "samples": estimate.samples,
-        "rate": estimate.rate_hz,
-        "window": estimate.window_s,
-        "filled": estimate.curve.n / estimate.rate_hz,
-    }
 
 
 def _clean(text: str) -> str:

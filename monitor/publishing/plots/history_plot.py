@@ -19,7 +19,7 @@ from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAME
 from monitor.estimation.fit.coefficients import SYMBOLS
 from monitor.history.bucket import COUNTS, STATES
 from monitor.history.reading import HistoryTable
-from monitor.history.sqlite_store import StoredEvent
+from monitor.history.stored_events import StoredEvent
 from monitor.publishing.plots import style
 from monitor.publishing.terminal.history_text import summary_line
 

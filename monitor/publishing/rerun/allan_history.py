@@ -25,7 +25,7 @@ class AllanHistory:
         self._reset(np.empty(0), 0.0)
 
     def _reset(self, tau_s: Floats, wall_s: float) -> None:
-        """Start a new history with these averaging times."""
+        """Start a new, empty history."""
         self.column_s = self._first_s
         self.tau_s = tau_s  # [m]
         self.ends_s: list[float] = []  # Unix time of the newest estimate in each column

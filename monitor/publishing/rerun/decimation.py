@@ -39,7 +39,7 @@ def decimate_extremes(wall_s: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def average_buckets(wall_s: Floats, values: Floats, per_s: float) -> tuple[Floats, Floats]:
-    """Return the mean time and mean value of each time bucket, for a slow quantity such as temperature.
+    """Return the mean time and mean value of each time bucket. Temperature, a slow quantity, is reduced this way.
 
     Parameters
     ----------

@@ -15,7 +15,9 @@ import rerun as rr
 from PIL import Image  # installed with rerun-sdk
 
 from drivers.sample import AXES, Floats
+from monitor.common.units import format_utc
 from monitor.publishing.plots import colours
+from monitor.publishing.rerun.allan_drawing import Log, label_points
 from monitor.publishing.rerun.allan_history import COLUMNS, AllanHistory
 
 HEIGHT: Final = 60  # approximate height of an image [pixels]; with COLUMNS the shape of a third of a tab
@@ -34,15 +36,15 @@ def bounds(taus: int) -> tuple[tuple[float, float], tuple[float, float]]:
     return (-left, COLUMNS + right), (-above, _rows(taus) * taus + below)
 
 
-def draw(stream: rr.RecordingStream, device: str, surface: AllanHistory) -> None:
+def draw(log: Log, path: str, surface: AllanHistory) -> None:
     """Log the images and labels of all measured axes at the current time of the stream.
 
     Parameters
     ----------
-    stream
-        Stream of the viewer.
-    device
-        Name of the device.
+    log
+        Function that logs an entity.
+    path
+        Path of the surfaces.
     surface
         Deviations over time.
     """
@@ -52,11 +54,14 @@ def draw(stream: rr.RecordingStream, device: str, surface: AllanHistory) -> None
     for i, axis in enumerate(AXES):
         if not np.isfinite(whole[:, :, i]).any():
             continue
-        path, height = f"{device}/dynamic/{axis}", _rows(surface.tau_s.size) * surface.tau_s.size
-        stream.log(path, rr.EncodedImage(contents=picture(whole[:, :, i]), media_type="image/png", draw_order=-20.0))
+        height = _rows(surface.tau_s.size) * surface.tau_s.size
+        log(
+            f"{path}/{axis}",
+            rr.EncodedImage(contents=picture(whole[:, :, i]), media_type="image/png", draw_order=-20.0),
+        )
         labels = _tau_labels(surface.tau_s, height) + _time_labels(surface, height) + _bar_labels(height)
-        stream.log(f"{path}/labels", _label_points(labels))
-        stream.log(f"{path}/scale", _bar(height))
+        log(f"{path}/{axis}/labels", label_points(labels))
+        log(f"{path}/{axis}/scale", _bar(height))
 
 
 def picture(relative: Floats) -> bytes:
@@ -98,7 +103,7 @@ def _tau_labels(tau_s: Floats, height: int) -> list[tuple[float, float, str]]:
 def _time_labels(surface: AllanHistory, height: int) -> list[tuple[float, float, str]]:
     """Return labels with the time of day in UTC of the oldest and newest column."""
     at = ((12.0, surface.ends_s[0]), (COLUMNS - 1.0, surface.ends_s[-1]))
-    return [(x, height + 6.0, _clock_time(t)) for x, t in at]
+    return [(x, height + 6.0, format_utc(t)[-8:]) for x, t in at]
 
 
 def _bar_labels(height: int) -> list[tuple[float, float, str]]:
@@ -117,23 +122,3 @@ def _bar(height: int) -> rr.LineStrips2D:
     tints = [PALETTE[round(i * 2 * SHADES / (BAR_STEPS - 1))] for i in range(BAR_STEPS)]
     strips = [np.array([[BAR_X, a], [BAR_X, b]]) for a, b in pairwise(edges)]
     return rr.LineStrips2D(strips, colors=tints, radii=[2.0])
-
-
-def _label_points(labels: list[tuple[float, float, str]]) -> rr.Points2D:
-    """Return labels as points."""
-    return rr.Points2D(
-        [(x, y) for x, y, _ in labels],
-        labels=[text for _, _, text in labels],
-        colors=[colours.TEXT],
-        radii=[0.0],
-        show_labels=True,
-    )
-
-
-def _clock_time(wall_s: float) -> str:
-    """Format the time of day in UTC.
-
-    >>> _clock_time(1.76e9)
-    '08:53:20'
-    """
-    return str(np.datetime64(round(wall_s), "s"))[-8:]

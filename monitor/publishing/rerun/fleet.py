@@ -17,8 +17,9 @@ from monitor.common import topics
 from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import AllanMessage, EventMessage, StatusMessage
 from monitor.publishing.remote_devices import DeviceStates, split_key
-from monitor.publishing.rerun.panels import fleet_text
+from monitor.publishing.rerun.panel_text import fleet_text
 from monitor.publishing.rerun.view import RerunView
+from monitor.publishing.result_kinds import OverviewText, SampleRows
 from monitor.publishing.terminal.watch import connection_note
 from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
 
@@ -55,7 +56,7 @@ class FleetView:
 
     Parameters
     ----------
-    arriving
+    subscriber
         Subscriber, including the topics of devices shown in detail.
     viewer
         Viewer whose devices are those shown in detail, named by their keys.
@@ -63,8 +64,8 @@ class FleetView:
         Keys of the devices shown in detail.
     """
 
-    def __init__(self, arriving: ZenohSubscriber, viewer: RerunView, detail: Sequence[str]) -> None:
-        self._arriving = arriving
+    def __init__(self, subscriber: ZenohSubscriber, viewer: RerunView, detail: Sequence[str]) -> None:
+        self._subscriber = subscriber
         self._viewer = viewer
         self._detail = frozenset(detail)
         self.board = DeviceStates()
@@ -83,9 +84,9 @@ class FleetView:
             Longest duration [s]; None: no limit.
         """
         end_s = None if seconds is None else time.monotonic() + seconds
-        table_s, told = 0.0, ""
+        table_s, reported = 0.0, ""
         while not stop.is_set() and (end_s is None or time.monotonic() < end_s):
-            for message in self._arriving.take(RECEIVE_TIMEOUT_S):
+            for message in self._subscriber.take(RECEIVE_TIMEOUT_S):
                 self.take(message)
             now_s = time.monotonic()
             if now_s - table_s < TABLE_PERIOD_S:
@@ -93,10 +94,10 @@ class FleetView:
             table_s = now_s
             self.draw(time.time(), now_s)
             page = self._viewer.url if self._viewer.url.startswith("http") else ""
-            said = "; ".join(part for part in (page, self._trouble()) if part)
-            if said != told:
-                told = said
-                tell(said)
+            report = "; ".join(part for part in (page, self._problems()) if part)
+            if report != reported:
+                reported = report
+                tell(report)
 
     def take(self, message: Message) -> None:
         """Process a message: update the table, and the viewer if the device is shown in detail."""
@@ -106,12 +107,12 @@ class FleetView:
         decoded = self.board.process_message(message.key, message.payload)
         device, topic = split_key(message.key) or ("", topics.ALIVE)
         if isinstance(decoded, EventMessage) and decoded.t is not None:
-            self._viewer.event(device, decoded.t, decoded.to_event())
+            self._viewer.put(device, decoded.t, decoded.to_event())
         elif device not in self._detail:
             return
         elif isinstance(decoded, StatusMessage):
             if decoded.t is not None:
-                self._viewer.health(device, decoded.t, decoded.to_health())
+                self._viewer.put(device, decoded.t, decoded.to_health())
         elif decoded is None:
             try:
                 self._show(device, topic, message.payload)
@@ -129,23 +130,26 @@ class FleetView:
             Current time on the clock of the messages [s].
         """
         devices = self.board.devices(now_s)
-        self._viewer.overview(wall_s, fleet_text(devices, now_s, MAX_ROWS, connection_note(self.board, self._arriving)))
+        note = connection_note(self.board, self._subscriber)
+        self._viewer.put("", wall_s, OverviewText(fleet_text(devices, now_s, MAX_ROWS, note)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
         """Pass samples or a curve of a device shown in detail to the viewer."""
         if topic is topics.SAMPLES:
             rows = decode_samples(payload).block
-            self._viewer.samples(device, rows.t_ns / 1e9, rows.values, rows.temperature_c)
+            unix_s = rows.t_ns / 1e9
+            if unix_s.size:
+                self._viewer.put(device, float(unix_s[-1]), SampleRows(unix_s, rows.values, rows.temperature_c))
         elif topic is topics.ALLAN:
             message, known = decode_message(AllanMessage, payload), self.board.coefficients(device)
             if known is not None:
                 estimate = message.to_estimate(known.coefficients, known.k_or_r)
-                self._viewer.estimate(device, estimate.t_ns / 1e9, estimate)
+                self._viewer.put(device, estimate.t_ns / 1e9, estimate)
 
-    def _trouble(self) -> str:
+    def _problems(self) -> str:
         """Return the problems of the viewer and of the subscriber."""
         viewer = self._viewer.state
-        said = [] if viewer in ("ok", "starting") else [f"viewer: {viewer}"]
-        if self._arriving.state != "ok":
-            said.append(self._arriving.state)
-        return "; ".join(said)
+        problems = [] if viewer in ("ok", "starting") else [f"viewer: {viewer}"]
+        if self._subscriber.state != "ok":
+            problems.append(self._subscriber.state)
+        return "; ".join(problems)

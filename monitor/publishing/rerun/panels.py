@@ -1,191 +1,427 @@
-"""Text of the viewer's panels as Markdown: health and current noise.
+"""Panels of the Rerun viewer: each draws one kind of result of one device, see ``monitor.publishing.result_kinds``.
 
-Functions convert a ``Health`` or an ``Estimate`` into text with the units of the field. They do no I/O, so the text
-can be tested without a viewer.
+Numbers are shown in the units of the field. Importing this module imports Rerun.
 """
 
-import math
-import re
-from collections import Counter
-from collections.abc import Mapping, Sequence
-from typing import Final
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Final
 
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+
+from drivers.sample import AXES, Event, Floats
 from monitor.common.distributions import Z95
 from monitor.common.health import Health
 from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEVIATION_UNITS,
-    KIND_NAMES,
     KINDS,
-    Kind,
+    SAMPLE_UNITS,
     axes_of,
-    format_duration,
-    format_milliseconds,
-    format_number,
-    format_sample_rate,
+    format_utc,
+    sensor_kind,
 )
-from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.live_compensation import DriftUpdate
+from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate
+from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import SYMBOLS
-from monitor.publishing.coefficient_cells import format_coefficient
-from monitor.publishing.messages.message import remove_control_characters
-from monitor.publishing.messages.results import measured_axes
-from monitor.publishing.remote_devices import RemoteDevice
+from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.history.reading import HistoryTable
+from monitor.publishing.plots import colours
+from monitor.publishing.plots.colours import Colour
+from monitor.publishing.rerun import allan_drawing, dynamic_surface, past_points
+from monitor.publishing.rerun.allan_history import AllanHistory
+from monitor.publishing.rerun.decimation import average_buckets, decimate_extremes
+from monitor.publishing.rerun.panel_text import drift_text, health_text, noise_text, overview_text
+from monitor.publishing.rerun.viewer_settings import DeviceInfo
+from monitor.publishing.rerun.views import RAW_SAMPLES_S, temperature_series, time_series
 
-FLEET_AXES: Final = ("gx", "gy", "gz")
-"""Axes whose white noise is shown in the table of all devices [°/√h]."""
-STATE_TEXTS: Final = {
-    "running": "RUNNING",
-    "waiting": "WAITING for the device",
-    "lost": "LOST: the device is gone, trying again",
-    "ended": "ENDED: the recording is at its end",
-}
+if TYPE_CHECKING:
+    from monitor.publishing.rerun.scene import Scene
+    from monitor.publishing.result_kinds import CompensatedRows, OverviewText, SampleRows
+
+TEMPERATURES_PER_S: Final = 5.0
+MAX_INTERMEDIATE_POINTS: Final = 20
+"""Number of coefficient points between two estimates, if the estimator provides values for every sample. More could not
+be distinguished and would overload the viewer."""
+MAX_PAST_EVENTS: Final = 200
+"""Largest number of stored events that are shown."""
+MAX_INTERVAL_RATIO: Final = 1.5
+"""Intervals whose ends differ from the value by more than this factor are not drawn. They occur in the first seconds of
+a device and would determine the scale of the plot."""
+WARNING_EVENTS: Final = frozenset({
+    "samples_lost",
+    "noise_changed",
+    "bias_stepped",
+    "limit_crossed",
+    "model_disagrees",
+    "temperature_unexplained",
+    "drift_unexplained",
+    "clock_jumped",
+})  # fmt: skip
+"""Kinds of events with the log level WARN."""
 
 
-def health_text(device: str, health: Health, about: str = "") -> str:
-    """Return the health panel of one device.
+class Panel:
+    """Part of the viewer that draws one kind of result of one device.
 
     Parameters
     ----------
+    scene
+        Scene to which the panel belongs.
     device
         Name of the device.
-    health
-        Health of the device.
-    about
-        Short description of the device.
     """
-    lines = [f"## {STATE_TEXTS.get(health.state, health.state)}"]
-    if health.text:
-        lines.append(f"**{health.text}**")
-    if health.crossed:
-        lines.append(f"beyond its limit: **{', '.join(health.crossed)}**")
-    rate = "rate not known yet" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
-    lines.append(f"**{device}** {about}".rstrip() + f", **{rate}**")
-    lines.append(
-        f"received **{health.received:,}**, lost **{health.lost:,}**, bad **{health.bad:,}**, "
-        f"overflowed **{health.overflowed:,}**"
-    )
-    outputs = "".join(f", {name} **{state}**" for name, state in health.outputs.items())
-    lines.append(f"up **{format_duration(health.uptime_s)}**{outputs}")
-    lines.append(
-        f"latency **{format_milliseconds(health.latency_p50_s)}** median, "
-        f"**{format_milliseconds(health.latency_p99_s)}** at 99 %, memory **{health.memory_bytes / 1e6:.0f} MB**"
-    )
-    return "\n\n".join(line for line in lines if line)
+
+    def __init__(self, scene: "Scene", device: str) -> None:
+        self.scene = scene
+        self.device = device
+
+    def style(self) -> None:
+        """Log the names, colours and widths of the lines, which do not change."""
+
+    def draw(self, unix_s: Floats, results: Sequence[Any]) -> None:
+        """Draw results.
+
+        Parameters
+        ----------
+        unix_s
+            Unix times of the results [s].
+        results
+            At least one result, in order of time.
+        """
+        raise NotImplementedError
+
+    def draw_history(self, history: HistoryTable) -> None:
+        """Draw the stored history of the device."""
+
+    @classmethod
+    def tab(cls, device: DeviceInfo) -> rrb.Container | None:
+        """Return the layout of a tab of its own; None if the panel is part of the tab Now or Dynamic."""
+        return None
+
+    def path(self, name: str) -> str:
+        """Return the path of an entity of the device."""
+        return f"{self.device}/{name}"
+
+    def _style_lines(self, name: str, lines: Sequence[tuple[str, Colour, float]]) -> None:
+        """Log the name, colour and width of each time series of an entity."""
+        names, line_colours, widths = zip(*lines, strict=True)
+        self.scene.log(self.path(name), rr.SeriesLines(colors=line_colours, widths=widths, names=names), static=True)
+
+    def _log_text(self, name: str, unix_s: float, text: str) -> None:
+        """Log a Markdown text at a Unix time [s]."""
+        self.scene.set_time(unix_s)
+        self.scene.log(self.path(name), rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
-def overview_text(healths: Mapping[str, Health]) -> str:
-    """Return a table of several devices, one line each."""
-    rows = [
-        f"| **{name}** | {h.state} | {format_sample_rate(h.rate_hz)} | {h.received:,} | {h.lost:,} | {h.bad:,} "
-        f"| {h.text or 'all well'} |"
-        for name, h in healths.items()
-    ]
-    head = "| device | state | rate | received | lost | bad | |\n|:--|:--|--:|--:|--:|--:|:--|"
-    return "\n".join([head, *rows])
+class SamplesPanel(Panel):
+    """Time series of the samples, at most 200 rows per second and axis, and of the temperature."""
+
+    def style(self) -> None:
+        """Log the styles of the lines."""
+        for axis in AXES:
+            unit = SAMPLE_UNITS[sensor_kind(axis)].name
+            self._style_lines(f"samples/{axis}", [(f"{axis}, {unit}", colours.AXIS_COLOURS[axis], 1.0)])
+        self._style_lines("temperature", [("temperature, °C", colours.TEMPERATURE, 1.5)])
+
+    def draw(self, unix_s: Floats, results: "Sequence[SampleRows]") -> None:
+        """Draw the results."""
+        times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
+        for i, axis in enumerate(AXES):
+            t, y = decimate_extremes(times, values[:, i])
+            self.scene.log_scalars(self.path(f"samples/{axis}"), t, y * SAMPLE_UNITS[sensor_kind(axis)].factor)
+        temperature_c = np.concatenate([one.temperature_c for one in results])
+        self.scene.log_scalars(self.path("temperature"), *average_buckets(times, temperature_c, TEMPERATURES_PER_S))
+
+    def draw_history(self, history: HistoryTable) -> None:
+        """Draw the stored history."""
+        temperature = history.column("temperature")
+        if np.isfinite(temperature.last).any():
+            at, values = past_points.history_points(history, temperature, temperature.last, temperature.last)
+            self.scene.log_scalars(self.path("temperature"), at, values[:, 0])
 
 
-def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: str = "") -> str:
-    """Return a table of many devices, those with problems first, with the number of devices in each state above it.
+class CompensatedPanel(Panel):
+    """Time series of the angular rates without their drift, thinned like the samples."""
 
-    Parameters
-    ----------
-    devices
-        Devices in the order of their rows.
-    now_s
-        Current time on the clock of the messages [s].
-    rows
-        Largest number of rows.
-    note
-        Line above the table.
-    """
-    counts = Counter(one.state(now_s) for one in devices)
-    states = ", ".join(f"**{count:,}** {_escape_cell(state)}" for state, count in counts.most_common())
-    head = [f"**{len(devices):,}** device{'' if len(devices) == 1 else 's'}{': ' if states else ''}{states}"]
-    head[0] += f"; N in {COEFFICIENT_UNITS['gyro']['N'].name}" if devices else ""
-    head += [f"**{remove_control_characters(note)}**"] if note else []
-    table = [_fleet_row(one, now_s) for one in devices[:rows]]
-    if table:
-        columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in FLEET_AXES), ""]
-        table = [f"| {' | '.join(columns)} |", "|:--|:--|" + "--:|" * (len(columns) - 3) + ":--|", *table]
-    left = [f"… and {len(devices) - rows:,} more with less trouble"] if len(devices) > rows else []
-    return "\n\n".join([*head, *(["\n".join(table)] if table else []), *left])
+    def style(self) -> None:
+        """Log the styles of the lines."""
+        for axis in axes_of("gyro"):
+            line = (f"{axis}, {SAMPLE_UNITS['gyro'].name}", colours.AXIS_COLOURS[axis], 1.0)
+            self._style_lines(f"compensated/{axis}", [line])
+
+    def draw(self, unix_s: Floats, results: "Sequence[CompensatedRows]") -> None:
+        """Draw the results."""
+        times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
+        for i, axis in enumerate(axes_of("gyro")):
+            t, y = decimate_extremes(times, values[:, i])
+            self.scene.log_scalars(self.path(f"compensated/{axis}"), t, y * SAMPLE_UNITS["gyro"].factor)
 
 
-def _fleet_row(one: RemoteDevice, now_s: float) -> str:
-    """Return the row of one device."""
-    state, status = one.state(now_s), one.status
-    name = _escape_cell(one.key)
-    word = f"**{state.upper()}**" if one.rank(now_s) == 0 else _escape_cell(state)
-    noise = [
-        "" if one.coefficients is None else format_coefficient(one.coefficients.coefficients, "N", axis).value
-        for axis in FLEET_AXES
-    ]
-    if status is None:
-        return f"| **{name}** | {word} | | | | | {' | '.join(noise)} | nothing known yet |"
-    rate = format_sample_rate(status.rate)
-    trouble = _escape_cell(one.problems()) or (
-        f"no data for {now_s - one.last_message_s:.1f} s" if state in ("gone", "silent") else ""
-    )
-    counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"
-    return f"| **{name}** | {word} | {rate} | {counts} | {' | '.join(noise)} | {trouble} |"
+class DriftPanel(Panel):
+    """Means at rest, predicted drift, innovations, and the table of the drift models."""
+
+    def style(self) -> None:
+        """Log the styles of the lines."""
+        unit = DEVIATION_UNITS["gyro"].name
+        for axis in axes_of("gyro"):
+            colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
+            lines = [(f"{axis} at rest, {unit}", dim, 0.75), (f"{axis} expected", colours.TEXT, 1.5)]
+            lines += [(f"{axis} 95 % low", colour, 1.0), (f"{axis} 95 % high", colour, 1.0)]
+            self._style_lines(f"drift/{axis}", lines)
+            self._style_lines(f"innovation/{axis}", [(f"{axis}, σ", colour, 1.0)])
+
+    def draw(self, unix_s: Floats, results: Sequence[DriftUpdate]) -> None:
+        """Draw the results."""
+        for i, axis in enumerate(axes_of("gyro")):
+            expected = np.array([one.expected[i] for one in results])
+            half = Z95 * np.array([one.error[i] for one in results])
+            mean = np.array([one.mean[i] for one in results])
+            rows = np.column_stack([mean, expected, expected - half, expected + half])
+            if np.isfinite(rows).any():
+                self.scene.log_scalars(self.path(f"drift/{axis}"), unix_s, rows * DEVIATION_UNITS["gyro"].factor)
+                innovation = np.array([one.innovation[i] for one in results])
+                self.scene.log_scalars(self.path(f"innovation/{axis}"), unix_s, innovation)
+        self._log_text("drift", float(unix_s[-1]), drift_text(results[-1]))
+
+    @classmethod
+    def tab(cls, device: DeviceInfo) -> rrb.Container | None:
+        """Return the tab, if the device has results of this kind."""
+        if not device.compensated:
+            return None
+        name = device.name
+        rows = []
+        for axis in axes_of("gyro"):
+            title = f"{axis}: rate as measured, and without drift, {SAMPLE_UNITS['gyro'].name}"
+            contents = (f"$origin/samples/{axis}", f"$origin/compensated/{axis}")
+            dimmed = {f"/{name}/samples/{axis}": rr.SeriesLines(colors=[colours.FRAME], widths=[0.75])}
+            rates = time_series(f"/{name}", title, contents, RAW_SAMPLES_S, styles=dimmed)
+            title = f"{axis}: means at rest, and the drift expected, {DEVIATION_UNITS['gyro'].name}"
+            drift = time_series(f"/{name}/drift/{axis}", title)
+            innovation = time_series(f"/{name}/innovation/{axis}", f"{axis}: innovation, σ")
+            rows.append(rrb.Horizontal(rates, drift, innovation, column_shares=[3, 3, 2]))
+        text = rrb.TextDocumentView(origin=f"/{name}/drift", contents="$origin", name="Drift of the gyros")
+        return rrb.Vertical(*rows, text, row_shares=[3, 3, 3, 2.5], name="Drift")
 
 
-def _escape_cell(text: str) -> str:
-    """Escape text of another process for a table cell, so that it cannot end the cell or form a link or an image."""
-    return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remove_control_characters(text))
+class ThermalPanel(Panel):
+    """Mean bias of each axis, and its one-step prediction with the interval that events are based on."""
+
+    def style(self) -> None:
+        """Log the styles of the lines."""
+        for axis in AXES:
+            colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
+            unit = DEVIATION_UNITS[sensor_kind(axis)].name
+            lines = [(f"{axis} bias, {unit}", colour, 2.0), (f"{axis} expected", colours.TEXT, 1.0)]
+            self._style_lines(
+                f"thermal/{axis}", [*lines, (f"{axis} 95 % low", dim, 0.75), (f"{axis} 95 % high", dim, 0.75)]
+            )
+
+    def draw(self, unix_s: Floats, results: Sequence[ThermalUpdate]) -> None:
+        """Draw the results."""
+        for axis in AXES:
+            rows = np.array([self._row(one.axes.get(axis)) for one in results])
+            if np.isfinite(rows).any():
+                factor = DEVIATION_UNITS[sensor_kind(axis)].factor
+                self.scene.log_scalars(self.path(f"thermal/{axis}"), unix_s, rows * factor)
+
+    @staticmethod
+    def _row(one: AxisThermalUpdate | None) -> tuple[float, float, float, float]:
+        """Return measured bias, predicted bias, and the ends of its interval."""
+        if one is None or one.one_step is None:
+            return (np.nan if one is None else one.bias), np.nan, np.nan, np.nan
+        return one.bias, one.one_step.bias, one.one_step.lo, one.one_step.hi
+
+    @classmethod
+    def tab(cls, device: DeviceInfo) -> rrb.Container | None:
+        """Return the tab, if the device has results of this kind."""
+        if not device.has_thermal:
+            return None
+        columns = []
+        for kind in KINDS:
+            title = f"bias, and what its temperature lets expect, {DEVIATION_UNITS[kind].name}"
+            views = [time_series(f"/{device.name}/thermal/{axis}", f"{axis}: {title}") for axis in axes_of(kind)]
+            columns.append(rrb.Vertical(*views))
+        temperature = temperature_series(device.name)
+        return rrb.Vertical(rrb.Horizontal(*columns), temperature, row_shares=[4, 1], name="Temperature")
 
 
-def noise_text(estimate: Estimate) -> str:
-    """Return the tables of Q, N, B, K and R, one for each kind of sensor of the device."""
-    present = [axis for _, axis in measured_axes(estimate.curve)]
-    tables = [_noise_table(estimate, kind) for kind in KINDS if set(axes_of(kind)) & set(present)]
-    if not tables:
-        return "Too few samples yet."
-    seen_s = estimate.curve.n / estimate.rate_hz
-    head = f"Last **{format_duration(min(seen_s, estimate.window_s))}**, 95 % intervals; ≤ bound; — too few data"
-    return "\n\n".join([head, *tables])
+class GapPanel(Panel):
+    """Gap to the model in force over time. The curve of the model is drawn with the next estimate."""
+
+    newest: ModelGap | None = None
+
+    def style(self) -> None:
+        """Log the styles of the lines."""
+        for axis in AXES:
+            self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", colours.AXIS_COLOURS[axis], 1.5)])
+        self._style_lines("gap/threshold", [("threshold", colours.blend(colours.TEXT, 0.6), 1.0)])
+
+    def draw(self, unix_s: Floats, results: Sequence[ModelGap]) -> None:
+        """Draw the results."""
+        self.newest = results[-1]
+        highest = [max((axis.threshold for axis in one.axes.values()), default=np.nan) for one in results]
+        self.scene.log_scalars(self.path("gap/threshold"), unix_s, np.array(highest))
+        for axis in AXES:
+            gap = np.array([one.axes[axis].gap if axis in one.axes else np.nan for one in results])
+            if np.isfinite(gap).any():
+                self.scene.log_scalars(self.path(f"gap/{axis}"), unix_s, gap)
 
 
-def drift_text(look: DriftUpdate) -> str:
-    """Return a table of the drift models of the gyroscopes and the drift that is currently removed."""
-    unit = DEVIATION_UNITS["gyro"]
-    rows = ["| axis | drift now | model | φ₁ | φ₂ | θ₁ |", "|---|---|---|---|---|---|"]
-    for at, axis in enumerate(axes_of("gyro")):
-        expected, model = float(look.expected[at]), look.models[at]
-        if not math.isfinite(expected):
-            rows.append(f"| {axis} | not known yet | | | | |")
-            continue
-        error = format_number(Z95 * unit.factor * float(look.error[at]), 2)
-        now = f"{format_number(unit.factor * expected)} ± {error} {unit.name}"
-        if model is None:
-            rows.append(f"| {axis} | {now} | learning | | | |")
-            continue
-        parts = [
-            f"{x:.4f}" if there else ""
-            for x, there in zip((*model.phi, model.theta), _coefficients_in_model(model), strict=True)
-        ]
-        rows.append(f"| {axis} | {now} | {model.name} | {' | '.join(parts)} |")
-    interval = format_duration(look.interval_s)
-    head = f"Learned at rest, from means of {interval}; what each of them brought anew is the innovation."
-    return "\n".join([head, "", *rows])
+class AllanPanel(Panel):
+    """Allan plots and table of an estimate, and the Allan surface over time when it has a new column."""
+
+    def __init__(self, scene: "Scene", device: str) -> None:
+        super().__init__(scene, device)
+        self._plot = allan_drawing.AllanPlot(scene.log, self.path("allan"))
+        self._surface = AllanHistory()
+
+    def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
+        """Draw the results."""
+        at_s, estimate = float(unix_s[-1]), results[-1]
+        self._log_text("coefficients", at_s, noise_text(estimate))
+        self._plot.draw(estimate, self.scene.panel(self.device, GapPanel).newest)
+        if self._surface.add(at_s, estimate):
+            dynamic_surface.draw(self.scene.log, self.path("dynamic"), self._surface)
 
 
-def _coefficients_in_model(model: ArmaModel) -> tuple[bool, bool, bool]:
-    """Return which of φ₁, φ₂ and θ₁ are part of the model."""
-    return model.order[0] > 0, model.order[0] > 1, model.order[1] > 0
+class CoefficientsPanel(Panel):
+    """Time series of the coefficients: a point with interval per estimate, and the values between the estimates."""
+
+    def style(self) -> None:
+        """Log the styles of the lines."""
+        for axis in AXES:
+            colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
+            for symbol in SYMBOLS:
+                unit = COEFFICIENT_UNITS[sensor_kind(axis)][symbol].name
+                lines = [(f"{axis}, {unit}", colour, 2.0), (f"{axis} 95 % low", dim, 0.75)]
+                self._style_lines(f"coefficients/{symbol}/{axis}", [*lines, (f"{axis} 95 % high", dim, 0.75)])
+                mark = rr.SeriesPoints(
+                    colors=[colour], markers=["diamond"], marker_sizes=[7.0], names=[f"{axis} changed"]
+                )
+                self.scene.log(self.path(f"coefficients/{symbol}/{axis}/changed"), mark, static=True)
+
+    def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
+        """Draw the results."""
+        parts = [_points_until(at_s, estimate) for at_s, estimate in zip(unix_s.tolist(), results, strict=True)]
+        times, values = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        for row, symbol in enumerate(SYMBOLS):
+            for column, axis in enumerate(AXES):
+                if np.isfinite(values[:, row, column]).any():
+                    self.log_coefficient(symbol, axis, times, values[:, row, column])
+
+    def draw_history(self, history: HistoryTable) -> None:
+        """Draw the stored history."""
+        for symbol in SYMBOLS:
+            for axis in history.axes():
+                value, lo, hi = (history.column(f"{axis}.{symbol}{end}") for end in ("", ".lo", ".hi"))
+                if np.isfinite(value.last).any():
+                    at, values = past_points.history_points(history, value, lo.last, hi.last)
+                    self.log_coefficient(symbol, axis, at, values)
+
+    def log_coefficient(self, symbol: str, axis: str, unix_s: Floats, values: Floats, name: str = "") -> None:
+        """Log a coefficient over time.
+
+        Parameters
+        ----------
+        symbol
+            Symbol of the coefficient.
+        axis
+            Name of the axis.
+        unix_s
+            Unix times [s], shape [n].
+        values
+            Values, shape [n], or values with the ends of their intervals, shape [n, 3]; SI.
+        name
+            End of the name of the entity.
+        """
+        factor = COEFFICIENT_UNITS[sensor_kind(axis)][symbol].factor
+        self.scene.log_scalars(self.path(f"coefficients/{symbol}/{axis}{name}"), unix_s, values * factor)
 
 
-def _noise_table(estimate: Estimate, kind: Kind) -> str:
-    """Return the table of coefficients of one kind of sensor."""
-    axes = axes_of(kind)
-    lines = [f"| {KIND_NAMES[kind]} | {' | '.join(axes)} |", "|:--|" + "--:|" * len(axes)]
-    for letter in SYMBOLS:
-        unit = COEFFICIENT_UNITS[kind][letter].name
-        cells = [format_coefficient(estimate.coefficients, letter, axis) for axis in axes]
-        values = " | ".join(f"**{c.value}**" if c.value != "—" else "—" for c in cells)
-        lines.append(f"| **{letter}** {unit} | {values} |")
-        if any(c.interval for c in cells):
-            lines.append("| | " + " | ".join(c.interval for c in cells) + " |")
-    return "\n".join(lines)
+class EventsPanel(Panel):
+    """Log of the events, of the device and of all devices; changed coefficients are marked at their new value."""
+
+    def draw(self, unix_s: Floats, results: Sequence[Event]) -> None:
+        """Draw the results."""
+        for at_s, event in zip(unix_s.tolist(), results, strict=True):
+            level = "ERROR" if event.kind == "link_lost" else "WARN" if event.kind in WARNING_EVENTS else "INFO"
+            clock_time = format_utc(at_s)[-8:]  # the date column of the viewer is too narrow to show the time
+            self.scene.set_time(at_s)
+            if self.scene.fleet or len(self.scene.devices) > 1:
+                line = rr.TextLog(f"{clock_time}  {self.device}: {event.text}", level=level)
+                self.scene.log("overview/events", line)
+            if self.device in self.scene.devices:
+                self.scene.log(self.path("events"), rr.TextLog(f"{clock_time}  {event.text}", level=level))
+                self._mark_changes(at_s, event)
+
+    def draw_history(self, history: HistoryTable) -> None:
+        """Draw the stored history."""
+        for one in history.events[-MAX_PAST_EVENTS:]:
+            text = f"{format_utc(one.t_s)[:10]}: {one.text}"  # the log line shows only the time of day
+            self.draw(np.array([one.t_s]), [Event(one.kind, round(one.t_s * 1e9), text, one.axis, one.what)])
+
+    def _mark_changes(self, unix_s: float, event: Event) -> None:
+        """Mark changed coefficients with a diamond at their new value."""
+        if event.axis is None:
+            return
+        coefficients = self.scene.panel(self.device, CoefficientsPanel)
+        for symbol, sides in event.values.items():
+            if symbol in SYMBOLS and "after" in sides:
+                at, after = np.array([unix_s]), np.array([sides["after"]])
+                coefficients.log_coefficient(symbol, event.axis, at, after, "/changed")
+
+
+class HealthPanel(Panel):
+    """Health of the device, and the overview of the devices."""
+
+    def draw(self, unix_s: Floats, results: Sequence[Health]) -> None:
+        """Draw the results."""
+        at_s, health, devices = float(unix_s[-1]), results[-1], self.scene.devices
+        if self.device in devices:
+            self.scene.healths[self.device] = health
+        about = devices[self.device].about if self.device in devices else ""
+        self._log_text("status", at_s, health_text(self.device, health, about))
+        if len(devices) > 1 and not self.scene.fleet:
+            self.scene.panel("", OverviewPanel).log_overview(at_s, overview_text(self.scene.healths))
+
+
+class OverviewPanel(Panel):
+    """Table of all devices."""
+
+    def draw(self, unix_s: Floats, results: "Sequence[OverviewText]") -> None:
+        """Draw the results."""
+        self.log_overview(float(unix_s[-1]), results[-1].text)
+
+    def log_overview(self, unix_s: float, text: str) -> None:
+        """Log the table.
+
+        Parameters
+        ----------
+        unix_s
+            Unix time of the table [s].
+        text
+            Table as Markdown.
+        """
+        self.scene.set_time(unix_s)
+        self.scene.log("overview", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+
+
+def _points_until(unix_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
+    """Return times [n] and coefficients [n, 5, 6, 3] since the previous estimate; only the last has intervals."""
+    c, history = estimate.coefficients, estimate.history
+    near = (c.lo * MAX_INTERVAL_RATIO > c.value) & (c.hi < c.value * MAX_INTERVAL_RATIO)
+    newest = np.stack([c.value, np.where(near, c.lo, np.nan), np.where(near, c.hi, np.nan)], axis=-1)
+    newest[c.status != Status.ESTIMATED] = np.nan
+    if history is None:
+        return np.array([unix_s]), newest[None]
+    step = -(-history.t_ns.size // MAX_INTERMEDIATE_POINTS)
+    rows = slice((history.t_ns.size - 1) % step, None, step)
+    before_s = (history.t_ns[-1] - history.t_ns[rows]) / 1e9
+    values = np.full((before_s.size, *newest.shape), np.nan)
+    values[..., 0] = history.value[rows]
+    values[-1] = newest
+    return unix_s - before_s, values

@@ -114,7 +114,7 @@ class Output:
     url: str = ""  # address of the page or of the Rerun server
     child: ViewerProcess | None = None
     port: int | None = None  # port of the Rerun server; None for a file
-    note: str = ""  # which ports were in use, and which are used instead
+    note: str = ""  # configured ports that were in use, and their replacements
     lock: IO[bytes] | None = None  # open while a file is written, so that no other process writes it
 
     def check(self) -> None:
@@ -123,9 +123,9 @@ class Output:
         Raises
         ------
         ViewerClosed
-            A user closed the window.
+            If a user closed the window.
         ViewerError
-            The viewer ended for another reason.
+            If the viewer ended for another reason.
         """
         if self.child is not None and self.child.exited_normally():
             raise ViewerClosed(CLOSED)
@@ -144,7 +144,7 @@ class Output:
             self.stream.flush(timeout_sec=patience_s)
         except RuntimeError:  # Rerun raises it for "timed out" and for "connection lost"
             return False
-        return self.port is None or grpc_call(self.port, "/imu.monitor/Ping", patience_s) is not None
+        return self.port is None or _grpc_call(self.port, "/imu.monitor/Ping", patience_s) is not None
 
     def close(self) -> None:
         """End the viewer if it was started here; a file is complete afterwards."""
@@ -189,22 +189,12 @@ def is_rerun(port: int) -> bool:
 
     Other gRPC servers answer "unimplemented" (status 12), and other servers do not answer with gRPC.
     """
-    reply = grpc_call(port, PROBE_METHOD, 1.0)
+    reply = _grpc_call(port, PROBE_METHOD, 1.0)
     return reply is not None and "grpc" in reply.get("content-type", "") and reply.get("grpc-status") != "12"
 
 
-def grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
-    """Return the headers of the reply to an empty gRPC call; None if there is no reply in time.
-
-    Parameters
-    ----------
-    port
-        Port on the loopback interface.
-    path
-        Path of the gRPC method.
-    timeout_s
-        Timeout [s].
-    """
+def _grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
+    """Return the headers of the reply to an empty gRPC call on the loopback interface; None without a reply in time."""
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=timeout_s)
     headers = {"content-type": "application/grpc-web+proto", "x-grpc-web": "1"}
     try:
@@ -229,7 +219,7 @@ def free_port(wanted: int, taken: int | None = None) -> int:
     Raises
     ------
     ViewerError
-        PORTS_TRIED ports are in use.
+        If PORTS_TRIED ports are in use.
     """
     for port in range(wanted, min(wanted + PORTS_TRIED, 65536)):
         if port != taken and _bindable(port):
@@ -264,9 +254,9 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
     Raises
     ------
     ViewerError
-        The output cannot be opened.
+        If the output cannot be opened.
     ViewerClosed
-        Only an open viewer may be joined, and there is none.
+        If only an open viewer may be joined, and there is none.
     """
     if settings.mode.endswith(".rrd"):
         return _open_file(Path(settings.mode), recording_id)

@@ -17,20 +17,13 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
 
-import numpy as np
-
-from drivers.sample import Event, Floats
-from monitor.common.health import Health
-from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
-from monitor.estimation.detection.model_gap import ModelGap
-from monitor.estimation.estimate import Estimate, concatenate_histories
 from monitor.history.reading import HistoryTable
 from monitor.publishing.bounded_queue import BoundedQueue
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerClosed, ViewerError, ViewerSettings
+from monitor.publishing.result_kinds import RESULT_KINDS, Drawing, TimedResult, kind_of
 
 if TYPE_CHECKING:
     from monitor.publishing.rerun.scene import Scene
@@ -42,87 +35,11 @@ PATIENCE_S: Final = 1.0  # timeout of this check
 STALL_TIMEOUT_S: Final = 2.0  # duration of one Rerun call above which the viewer counts as stalled
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
 PLOTS_PER_S: Final = 8.0  # rate of Allan plots, shared by all devices; at most one per second and device
-POINTS_PERIOD_S: Final = 5.0  # interval at which collected coefficient points are sent
-POINT_INTERVAL_S: Final = 1.0  # interval between two coefficient points, in sample time
 MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes sooner is taken as not working
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
-Recall = Callable[[str], HistoryTable | None]
+HistorySource = Callable[[str], HistoryTable | None]
 """Function that returns the stored history of a device, or None."""
-Message = tuple[str, "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health | _Overview"]
-
-
-@dataclass(frozen=True, slots=True)
-class _Samples:
-    """Samples of a batch."""
-
-    wall_s: Floats
-    values: Floats
-    temperature_c: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class _Estimate:
-    """Estimate with its time."""
-
-    wall_s: float
-    estimate: Estimate
-
-
-@dataclass(frozen=True, slots=True)
-class _Gap:
-    """Comparison with the model, with its time."""
-
-    wall_s: float
-    gap: ModelGap
-
-
-@dataclass(frozen=True, slots=True)
-class _Rates:
-    """Drift-compensated rates of a batch."""
-
-    wall_s: Floats
-    values: Floats
-
-
-@dataclass(frozen=True, slots=True)
-class _Drift:
-    """State of the drift compensation, with its time."""
-
-    wall_s: float
-    look: DriftUpdate
-
-
-@dataclass(frozen=True, slots=True)
-class _Thermal:
-    """Result of the thermal model, with its time."""
-
-    wall_s: float
-    look: ThermalUpdate
-
-
-@dataclass(frozen=True, slots=True)
-class _Event:
-    """Event with its time."""
-
-    wall_s: float
-    event: Event
-
-
-@dataclass(frozen=True, slots=True)
-class _Health:
-    """Health report with its time."""
-
-    wall_s: float
-    health: Health
-
-
-@dataclass(frozen=True, slots=True)
-class _Overview:
-    """Table of all devices as Markdown, with its time."""
-
-    wall_s: float
-    text: str
 
 
 class RerunView:
@@ -134,7 +51,7 @@ class RerunView:
         Settings of the viewer.
     devices
         Devices to show in detail.
-    recall
+    history_source
         Function that returns the stored history of a device. It is called in the viewer's thread when the viewer opens.
     fleet
         True if there are many more devices, which are shown in the table given to ``overview``.
@@ -144,15 +61,15 @@ class RerunView:
         self,
         settings: ViewerSettings,
         devices: Sequence[DeviceInfo],
-        recall: Recall | None = None,
+        history_source: HistorySource | None = None,
         fleet: bool = False,
     ) -> None:
         """Store the settings; the viewer is opened by ``start``."""
         self._settings = settings
-        self._recall = recall or _no_history
+        self._history_source = history_source or _no_history
         self._fleet = fleet
         self._devices = tuple(devices)
-        self._backlog: BoundedQueue[Message] = BoundedQueue(BACKLOG_BYTES)
+        self._backlog: BoundedQueue[tuple[str, float, Any]] = BoundedQueue(BACKLOG_BYTES)
         self._closing = threading.Event()
         self._thread: threading.Thread | None = None
         self._phase = "off"
@@ -164,7 +81,7 @@ class RerunView:
 
     @property
     def state(self) -> str:
-        """``ok``, or a short description of what is wrong; part of the status message."""
+        """``ok``, or a short description of the problem; part of the status message."""
         inside = self._inside_since
         if self._stalled or (inside is not None and time.monotonic() - inside > STALL_TIMEOUT_S):
             return f"stalled ({self._backlog.dropped} dropped)"
@@ -193,132 +110,20 @@ class RerunView:
         """
         self._devices = tuple(devices)
 
-    def samples(self, device: str, wall_s: Floats, values: Floats, temperature_c: Floats) -> None:
-        """Draw samples.
+    def put(self, device: str, unix_s: float, result: Any) -> None:
+        """Draw a result.
 
         Parameters
         ----------
         device
             Name of the device.
-        wall_s
-            Unix times [s], shape [n].
-        values
-            Rates [rad/s] and accelerations [m/s²], shape [n, 6]; NaN if not measured.
-        temperature_c
-            Temperatures [°C], shape [n]; NaN if not measured.
+        unix_s
+            Unix time of the result [s].
+        result
+            Result of one of the kinds in ``monitor.publishing.result_kinds``.
         """
-        weight = wall_s.nbytes + values.nbytes + temperature_c.nbytes
-        self._put(device, _Samples(wall_s, values, temperature_c), weight)
-
-    def estimate(self, device: str, wall_s: float, estimate: Estimate) -> None:
-        """Draw an estimate; if estimates arrive faster than once a second, plots show the newest one.
-
-        Parameters
-        ----------
-        device
-            Name of the device.
-        wall_s
-            Unix time of the newest sample [s].
-        estimate
-            The estimate.
-        """
-        self._put(device, _Estimate(wall_s, estimate), estimate.curve.avar.nbytes * 8)
-
-    def gap(self, device: str, wall_s: float, gap: ModelGap) -> None:
-        """Draw a comparison of the window with the model in use.
-
-        Parameters
-        ----------
-        device
-            Name of the device.
-        wall_s
-            Unix time of the newest sample [s].
-        gap
-            Result of the comparison.
-        """
-        self._put(device, _Gap(wall_s, gap), 6 * 4 * gap.tau_s.nbytes)
-
-    def compensated(self, device: str, wall_s: Floats, values: Floats) -> None:
-        """Draw drift-compensated rates.
-
-        Parameters
-        ----------
-        device
-            Name of the device.
-        wall_s
-            Unix times [s], shape [n].
-        values
-            Rates [rad/s], shape [n, 3].
-        """
-        self._put(device, _Rates(wall_s, values), wall_s.nbytes + values.nbytes)
-
-    def drift(self, device: str, wall_s: float, look: DriftUpdate) -> None:
-        """Draw the state of the drift compensation after an interval.
-
-        Parameters
-        ----------
-        device
-            Name of the device.
-        wall_s
-            Unix time of the end of the interval [s].
-        look
-            State of the drift compensation.
-        """
-        self._put(device, _Drift(wall_s, look), 1000)
-
-    def thermal(self, device: str, wall_s: float, look: ThermalUpdate) -> None:
-        """Draw the mean bias of an interval and its prediction from the temperature.
-
-        Parameters
-        ----------
-        device
-            Name of the device.
-        wall_s
-            Unix time of the end of the interval [s].
-        look
-            Result of the thermal model.
-        """
-        self._put(device, _Thermal(wall_s, look), 1000)
-
-    def event(self, device: str, wall_s: float, event: Event) -> None:
-        """Draw an event.
-
-        Parameters
-        ----------
-        device
-            Name of the device.
-        wall_s
-            Unix time of the event [s].
-        event
-            The event.
-        """
-        self._put(device, _Event(wall_s, event), 1000)
-
-    def health(self, device: str, wall_s: float, health: Health) -> None:
-        """Draw a health report, about once a second.
-
-        Parameters
-        ----------
-        device
-            Name of the device.
-        wall_s
-            Unix time of the report [s].
-        health
-            Health of the device.
-        """
-        self._put(device, _Health(wall_s, health), 1000)
-
-    def overview(self, wall_s: float, text: str) -> None:
-        """Draw the table of all devices.
-
-        Parameters
-        ----------
-        wall_s
-            Unix time of the table [s].
-        text
-            Table as Markdown.
-        """
-        self._put("", _Overview(wall_s, text), len(text))
+        if self._thread is not None:
+            self._backlog.push((device, unix_s, result), kind_of(result).size_bytes(result))
 
     def close(self, timeout_s: float = 2.0) -> None:
         """Draw the remaining data for at most ``timeout_s`` seconds, then end the viewer if it was started here."""
@@ -333,16 +138,6 @@ class RerunView:
             child.kill()  # releases the thread from a viewer that does not respond
         thread.join(0.25 * timeout_s)
         self._phase = "closed"
-
-    def _put(
-        self,
-        device: str,
-        message: "_Samples | _Estimate | _Gap | _Thermal | _Rates | _Drift | _Event | _Health | _Overview",
-        weight: int,
-    ) -> None:
-        """Add a message to the queue if the thread has been started."""
-        if self._thread is not None:
-            self._backlog.push((device, message), weight)
 
     # ---- methods of the thread ----
 
@@ -387,7 +182,7 @@ class RerunView:
         output = sinks.open_output(settings, self._recording_id, self._closing.is_set)
         self._child, self._url = output.child, output.url
         try:
-            scene = rerun_scene.Scene(output.stream, fleet=self._fleet)
+            scene = rerun_scene.Scene(output.stream, self._fleet)
             self._draw(output, scene)
         finally:
             self._child = None
@@ -397,43 +192,36 @@ class RerunView:
         """Send the layout for the devices and create their entities."""
         from monitor.publishing.rerun import blueprint
 
-        blueprint.send(
-            output.stream,
-            [d.name for d in devices],
-            [d.name for d in devices if d.has_model],
-            [d.name for d in devices if d.has_thermal],
-            [d.name for d in devices if d.compensated],
-            self._fleet,
-        )
-        scene.show([(d.name, d.about) for d in devices])
+        blueprint.send(output.stream, devices, self._fleet)
+        scene.show(devices)
         self._phase = f"ok, but {output.note}" if output.note else "ok"
 
     def _draw_history(self, scene: "Scene", device: str) -> None:
         """Draw the stored history of a device before its live data."""
         self._inside_since = None  # a slow disk must not count as a stalled viewer
-        past = self._recall(device)
+        past = self._history_source(device)
         self._inside_since = time.monotonic()
         if past is not None:
-            scene.past(device, past)
+            scene.draw_history(device, past)
 
     def _draw(self, output: "Output", scene: "Scene") -> None:
         """Draw new data until closed; raise ViewerError if the viewer has ended."""
-        queue = _Pending(plot_every_s=1.0)
+        waiting = _WaitingResults()
         shown: tuple[DeviceInfo, ...] | None = None
         begun: set[str] = set()
         checked = time.monotonic()
         while True:
             closing = self._closing.is_set()
-            queue.add(self._backlog.take(0.0))  # before the devices are read, so that each message has a known device
+            waiting.add(self._backlog.take(0.0))  # before the devices are read, so that each message has a known device
             self._inside_since = time.monotonic()
             if self._devices is not shown:
                 shown = self._devices
-                queue.plot_every_s = max(1.0, len(shown) / PLOTS_PER_S)
+                waiting.period_factor = max(1.0, len(shown) / PLOTS_PER_S)
                 self._send_layout(output, scene, shown)
                 for device in [one.name for one in shown if one.name not in begun]:
                     begun.add(device)
                     self._draw_history(scene, device)
-            queue.draw(scene, everything=closing)
+            waiting.draw(scene, everything=closing)
             now = time.monotonic()
             if closing or now - checked > CONFIRM_PERIOD_S:
                 self._confirm(output)
@@ -459,115 +247,31 @@ def _no_history(_device: str) -> HistoryTable | None:
     return None
 
 
-@dataclass
-class _Pending:
-    """Data received since the last drawing, by device."""
+class _WaitingResults:
+    """Results that wait for their next drawing."""
 
-    plot_every_s: float
-    samples: dict[str, list[_Samples]] = field(default_factory=dict)
-    newest: dict[str, _Estimate] = field(default_factory=dict)  # newest estimate, for the Allan plots
-    course: dict[str, list[_Estimate]] = field(default_factory=dict)
-    gaps: dict[str, list[_Gap]] = field(default_factory=dict)
-    thermals: dict[str, list[_Thermal]] = field(default_factory=dict)
-    rates: dict[str, list[_Rates]] = field(default_factory=dict)
-    drifts: dict[str, list[_Drift]] = field(default_factory=dict)
-    healths: dict[str, _Health] = field(default_factory=dict)
-    events: list[tuple[str, _Event]] = field(default_factory=list)
-    overview: _Overview | None = None
-    drawn: dict[tuple[str, str], float] = field(default_factory=dict)  # monotonic time of (plot, device) [s]
+    def __init__(self) -> None:
+        self.period_factor = 1.0  # factor of the periods of drawings whose rate the devices share
+        self._waiting: dict[Drawing, dict[str, list[TimedResult]]] = {
+            drawing: {} for kind in RESULT_KINDS for drawing in kind.drawings
+        }
+        self._drawn_s: dict[tuple[Drawing, str], float] = {}  # monotonic time of the last drawing of a device [s]
 
-    def add(self, messages: Sequence[Message]) -> None:
-        """Sort messages by device and kind; only the newest health report and plot of a device are kept."""
-        for device, message in messages:
-            match message:
-                case _Samples():
-                    self.samples.setdefault(device, []).append(message)
-                case _Estimate():
-                    self.newest[device] = message
-                    self._add_to_course(device, message)
-                case _Gap():
-                    self._add_gap(device, message)
-                case _Rates():
-                    self.rates.setdefault(device, []).append(message)
-                case _Drift():
-                    self.drifts.setdefault(device, []).append(message)
-                case _Thermal():
-                    self.thermals.setdefault(device, []).append(message)
-                case _Event():
-                    self.events.append((device, message))
-                case _Health():
-                    self.healths[device] = message
-                case _Overview():
-                    self.overview = message
+    def add(self, results: Sequence[tuple[str, float, Any]]) -> None:
+        """Add results, given by device, Unix time [s] and result."""
+        for device, unix_s, result in results:
+            for drawing in kind_of(result).drawings:
+                drawing.merge(self._waiting[drawing].setdefault(device, []), (unix_s, result))
 
     def draw(self, scene: "Scene", everything: bool) -> None:
-        """Pass the data to the scene; plots and coefficient points only when they are due, or if ``everything``."""
-        for device, parts in self.samples.items():
-            scene.samples(
-                device,
-                np.concatenate([p.wall_s for p in parts]),
-                np.concatenate([p.values for p in parts]),
-                np.concatenate([p.temperature_c for p in parts]),
-            )
-        self.samples.clear()
-        for device, happened in self.events:
-            scene.event(device, happened.wall_s, happened.event)
-        self.events.clear()
-        for device, seen in self.healths.items():
-            scene.health(device, seen.wall_s, seen.health)
-        self.healths.clear()
-        if self.overview is not None:
-            scene.overview(self.overview.wall_s, self.overview.text)
-            self.overview = None
-        for device, rates in self.rates.items():
-            scene.compensated(
-                device, np.concatenate([one.wall_s for one in rates]), np.concatenate([one.values for one in rates])
-            )
-        self.rates.clear()
-        for device, drifts in self.drifts.items():
-            scene.drift(device, np.array([one.wall_s for one in drifts]), [one.look for one in drifts])
-        self.drifts.clear()
-        for device, means in self.thermals.items():
-            scene.thermal(device, np.array([one.wall_s for one in means]), [one.look for one in means])
-        self.thermals.clear()
-        for device in list(self.gaps):  # before the plot, which also shows the curve of the model
-            if everything or self._due("gap", device, POINT_INTERVAL_S):
-                looks = self.gaps.pop(device)
-                scene.gaps(device, np.array([g.wall_s for g in looks]), [g.gap for g in looks])
-        for device in list(self.newest):
-            if everything or self._due("plot", device, self.plot_every_s):
-                newest = self.newest.pop(device)
-                scene.estimate(device, newest.wall_s, newest.estimate)
-        for device in list(self.course):
-            if everything or self._due("course", device, POINTS_PERIOD_S):
-                points = self.course.pop(device)
-                scene.coefficients(device, np.array([p.wall_s for p in points]), [p.estimate for p in points])
-
-    def _add_to_course(self, device: str, message: _Estimate) -> None:
-        """Add a coefficient point; replace the previous one if it is younger than POINT_INTERVAL_S."""
-        points = self.course.setdefault(device, [])
-        if len(points) > 1 and message.wall_s - points[-2].wall_s < POINT_INTERVAL_S:
-            # The per-sample values between the points are kept.
-            course = concatenate_histories(
-                [part for part in (points.pop().estimate.history, message.estimate.history) if part]
-            )
-            message = _Estimate(message.wall_s, replace(message.estimate, history=course))
-        points.append(message)
-
-    def _add_gap(self, device: str, message: _Gap) -> None:
-        """Add a comparison; replace the previous one if it is younger than POINT_INTERVAL_S."""
-        looks = self.gaps.setdefault(device, [])
-        if len(looks) > 1 and message.wall_s - looks[-2].wall_s < POINT_INTERVAL_S:
-            looks.pop()
-        looks.append(message)
-
-    def _due(self, what: str, device: str, every_s: float) -> bool:
-        """Return True at most once per ``every_s`` seconds for each plot and device."""
-        now = time.monotonic()
-        if now - self.drawn.get((what, device), -np.inf) < every_s:
-            return False
-        self.drawn[what, device] = now
-        return True
+        """Draw the results that are due, or all results if ``everything``."""
+        for drawing, devices in self._waiting.items():
+            period_s = drawing.period_s * (self.period_factor if drawing.shares_rate else 1.0)
+            for device in list(devices):
+                now_s = time.monotonic()
+                if everything or now_s - self._drawn_s.get((drawing, device), float("-inf")) >= period_s:
+                    self._drawn_s[drawing, device] = now_s
+                    scene.draw(device, drawing.panel, devices.pop(device))
 
 
 def _load_rerun() -> None:

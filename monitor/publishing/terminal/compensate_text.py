@@ -2,16 +2,16 @@
 
 from typing import Any, Final
 
-import msgspec
 import numpy as np
 from rich.console import Console
 from rich.padding import Padding
-from rich.table import Table
 
 from monitor.common.units import DEVIATION_UNITS, format_duration, format_number
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.compensation_score import SPANS_S, RestScore
+from monitor.publishing.messages.message import encode_json
+from monitor.publishing.terminal.tables import plain_table
 
 SCHEMA: Final = "imu-monitor/compensate/1"
 UNIT: Final = DEVIATION_UNITS["gyro"]
@@ -34,9 +34,9 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
         f"{format_duration(result.evaluated_rest_s)} at rest, after {format_duration(result.learning_rest_s)}",
         highlight=False,
     )
-    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
-    for head in ("axis", "drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S)):
-        rows.add_column(head, no_wrap=head == "axis")
+    rows = plain_table(
+        "axis", wrapped=("drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S))
+    )
     for axis, one in result.axes.items():
         pairs = [
             (one.uncompensated.rms, one.compensated.rms),
@@ -72,7 +72,7 @@ def encode_compensation(result: CompensationResult) -> bytes:
         "axes": {axis: _axis(at, one, result) for at, (axis, one) in enumerate(result.axes.items())},
         "notes": list(result.notes),
     }
-    return msgspec.json.encode(whole, enc_hook=_encode_array)
+    return encode_json(whole)
 
 
 def _axis(at: int, one: AxisCompensation, result: CompensationResult) -> dict[str, Any]:
@@ -114,8 +114,8 @@ def _rest(one: RestScore) -> dict[str, Any]:
     """Return the statistics at rest."""
     return {
         "deviation": one.rms,
-        "worst_minute": _number(one.worst_minute),
-        "drift": {f"{span:g}": _number(x) for span, x in zip(SPANS_S, one.drift, strict=True)},
+        "worst_minute": one.worst_minute,
+        "drift": {f"{span:g}": x for span, x in zip(SPANS_S, one.drift, strict=True)},
         "allan": {"tau": one.tau_s, "deviation": one.allan},
     }
 
@@ -135,15 +135,3 @@ def _describe_exceptions(one: AxisCompensation, interval_s: float) -> str:
     if one.steps:
         parts.append(f"{one.steps} step{'s' if one.steps > 1 else ''} of the bias")
     return "; ".join(parts)
-
-
-def _number(x: float) -> float | None:
-    """Return the value, or None if it is not finite."""
-    return float(x) if np.isfinite(x) else None
-
-
-def _encode_array(value: Any) -> Any:
-    """Convert an array for JSON; values that are not finite become null."""
-    if isinstance(value, np.ndarray):
-        return [_number(x) for x in value]
-    raise TypeError(f"{type(value).__name__} has no JSON")

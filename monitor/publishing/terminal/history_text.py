@@ -13,11 +13,21 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from drivers.quantities import DAY_S, HOUR_S
 from drivers.sample import Floats
-from monitor.common.units import KIND_NAMES, KINDS, Kind, axes_of, format_number, format_utc, unit_of
+from monitor.common.units import (
+    KIND_NAMES,
+    KINDS,
+    NO_VALUE,
+    Kind,
+    axes_of,
+    format_number,
+    format_utc,
+    format_whole_duration,
+    unit_of,
+)
 from monitor.history.bucket import COUNTS, STATES
 from monitor.history.reading import ColumnStatistics, HistoryTable
+from monitor.publishing.terminal.tables import plain_table
 
 LETTERS: Final = ("N", "B", "K")
 """Coefficients shown for all axes; for a single axis all five are shown."""
@@ -27,13 +37,10 @@ SPARKLINE_WIDTH: Final = 32
 """Width of a sparkline [characters]."""
 MAX_EVENTS: Final = 20
 """Largest number of events that are printed."""
-NO_VALUE: Final = "—"
-WIDTH_UNITS: Final = ((DAY_S, "d"), (HOUR_S, "h"), (60, "min"), (1, "s"))
-"""Units of bucket widths, the largest first."""
 
 
-def print_history(past: HistoryTable, axes: tuple[str, ...], letters: tuple[str, ...], console: Console) -> None:
-    """Print the summary of a history: one line per axis and letter, then status and events.
+def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str, ...], console: Console) -> None:
+    """Print the summary of a history: one line per axis and symbol, then status and events.
 
     Parameters
     ----------
@@ -41,7 +48,7 @@ def print_history(past: HistoryTable, axes: tuple[str, ...], letters: tuple[str,
         The history.
     axes
         Axes to print.
-    letters
+    symbols
         Coefficients to print.
     console
         Destination.
@@ -50,13 +57,13 @@ def print_history(past: HistoryTable, axes: tuple[str, ...], letters: tuple[str,
     for kind in KINDS:
         shown = [axis for axis in axes_of(kind) if axis in axes and axis in past.axes()]
         if shown:
-            console.print(Padding(_summary(past, kind, shown, letters), (1, 0, 0, 0)))
+            console.print(Padding(_summary(past, kind, shown, symbols), (1, 0, 0, 0)))
     for line in status_lines(past):
         console.print(line, highlight=False)
-    print_events(past, console)
+    _print_events(past, console)
 
 
-def print_axis_history(past: HistoryTable, axis: str, letters: tuple[str, ...], console: Console) -> None:
+def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], console: Console) -> None:
     """Print one axis over time: one line per bucket, with the extremes of each coefficient.
 
     Parameters
@@ -65,20 +72,19 @@ def print_axis_history(past: HistoryTable, axis: str, letters: tuple[str, ...], 
         The history.
     axis
         Axis to print.
-    letters
+    symbols
         Coefficients to print.
     console
         Destination.
     """
-    table = _table()
-    table.add_column("UTC", no_wrap=True)
-    for letter in letters:
-        table.add_column(f"{letter} {unit_of(letter, axis).name}", justify="right", no_wrap=True)
+    table = plain_table("UTC")
+    for symbol in symbols:
+        table.add_column(f"{symbol} {unit_of(symbol, axis).name}", justify="right", no_wrap=True)
     for name in ("°C", "lost", "state"):
         table.add_column(name, justify="right")
     temperature = past.column("temperature")
     for p in range(len(past)):
-        cells = [_cell(past, axis, letter, p) for letter in letters]
+        cells = [_cell(past, axis, symbol, p) for symbol in symbols]
         lost = int(past.counts[p, COUNTS.index("lost")])
         table.add_row(
             format_utc(float(past.start_s[p]))[:16],
@@ -90,16 +96,8 @@ def print_axis_history(past: HistoryTable, axis: str, letters: tuple[str, ...], 
     console.print(Padding(table, (1, 0, 0, 0)))
 
 
-def print_events(past: HistoryTable, console: Console) -> None:
-    """Print the newest MAX_EVENTS events.
-
-    Parameters
-    ----------
-    past
-        The history.
-    console
-        Destination.
-    """
+def _print_events(past: HistoryTable, console: Console) -> None:
+    """Print the newest MAX_EVENTS events."""
     if not past.events:
         return
     shown = past.events[-MAX_EVENTS:]
@@ -118,7 +116,9 @@ def summary_line(past: HistoryTable) -> str:
     if not len(past):
         return f"{past.device}: no rows between {format_utc(past.span.start_s)} and {format_utc(past.span.end_s)} UTC"
     widths = sorted({int(one) for one in past.width_s})
-    rows = (" and " if len(widths) < 3 else " to ").join(_format_width(one) for one in (*widths[:1], *widths[1:][-1:]))
+    rows = (" and " if len(widths) < 3 else " to ").join(
+        format_whole_duration(one) for one in (*widths[:1], *widths[1:][-1:])
+    )
     return (
         f"{past.device}: {format_utc(float(past.start_s[0]))[:16]} to {format_utc(float(past.end_s[-1]))[:16]} UTC, "
         f"{len(past):,} rows of {rows}, {samples:,} samples"
@@ -173,63 +173,47 @@ def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int =
     return "".join(next(marks) if some else GAP for some in count)
 
 
-def _summary(past: HistoryTable, kind: Kind, axes: list[str], letters: tuple[str, ...]) -> Table:
+def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str, ...]) -> Table:
     """Return a table with first, last, lowest and highest value and a sparkline for each axis and coefficient."""
-    table = _table()
-    table.add_column(KIND_NAMES[kind], no_wrap=True)
+    table = plain_table(KIND_NAMES[kind])
     for name in ("first", "last", "lowest", "highest"):
         table.add_column(name, justify="right", no_wrap=True)
     table.add_column("course", no_wrap=True)
     span = (float(past.start_s[0]), float(past.end_s[-1])) if len(past) else (0.0, 0.0)
     middle_s = past.start_s + 0.5 * past.width_s
     for axis in axes:
-        for letter in letters:
-            course, unit = past.column(f"{axis}.{letter}"), unit_of(letter, axis)
-            label = Text.assemble((f"{axis} {letter}", "bold"), f"  {unit.name}")
-            there = course.last[np.isfinite(course.last)]
+        for symbol in symbols:
+            column, unit = past.column(f"{axis}.{symbol}"), unit_of(symbol, axis)
+            label = Text.assemble((f"{axis} {symbol}", "bold"), f"  {unit.name}")
+            there = column.last[np.isfinite(column.last)]
             if not there.size:
-                table.add_row(label, NO_VALUE, *_bound(past, axis, letter), "")
+                table.add_row(label, NO_VALUE, *_bound(past, axis, symbol), "")
                 continue
-            numbers = [float(one) * unit.factor for one in (there[0], there[-1], *_extremes(course))]
-            table.add_row(label, *(format_number(one) for one in numbers), sparkline(course.last, middle_s, span))
+            numbers = [float(one) * unit.factor for one in (there[0], there[-1], *_extremes(column))]
+            table.add_row(label, *(format_number(one) for one in numbers), sparkline(column.last, middle_s, span))
     return table
 
 
-def _bound(past: HistoryTable, axis: str, letter: str) -> tuple[str, str, str]:
+def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
     """Return the cells of a coefficient that was never estimated: its last upper bound and two dashes."""
-    bound, unit = past.column(f"{axis}.{letter}.bound"), unit_of(letter, axis)
+    bound, unit = past.column(f"{axis}.{symbol}.bound"), unit_of(symbol, axis)
     there = bound.last[np.isfinite(bound.last)]
     if not there.size:
         return NO_VALUE, NO_VALUE, NO_VALUE
     return f"≤ {format_number(float(there[-1]) * unit.factor)}", NO_VALUE, NO_VALUE
 
 
-def _cell(past: HistoryTable, axis: str, letter: str, p: int) -> str:
+def _cell(past: HistoryTable, axis: str, symbol: str, p: int) -> str:
     """Format a coefficient in one bucket: its last value, and its extremes if they differ, or its upper bound."""
-    course, unit = past.column(f"{axis}.{letter}"), unit_of(letter, axis)
-    low, high, last = (float(part[p]) * unit.factor for part in (course.low, course.high, course.last))
+    column, unit = past.column(f"{axis}.{symbol}"), unit_of(symbol, axis)
+    low, high, last = (float(part[p]) * unit.factor for part in (column.low, column.high, column.last))
     if math.isfinite(last):
         alike = format_number(low) == format_number(high)
         return format_number(last) if alike else f"{format_number(last)} [{format_number(low)} … {format_number(high)}]"
-    bound = float(past.column(f"{axis}.{letter}.bound").last[p]) * unit.factor
+    bound = float(past.column(f"{axis}.{symbol}.bound").last[p]) * unit.factor
     return f"≤ {format_number(bound)}" if math.isfinite(bound) else NO_VALUE
 
 
-def _format_width(seconds: int) -> str:
-    """Format the width of a bucket, given in seconds.
-
-    >>> _format_width(300), _format_width(21_600), _format_width(604_800)
-    ('5 min', '6 h', '7 d')
-    """
-    unit_s, unit = next((size, name) for size, name in WIDTH_UNITS if seconds % size == 0)
-    return f"{seconds // unit_s} {unit}"
-
-
-def _extremes(course: ColumnStatistics) -> tuple[float, float]:
+def _extremes(column: ColumnStatistics) -> tuple[float, float]:
     """Return the minimum and maximum over all buckets."""
-    return float(np.nanmin(course.low)), float(np.nanmax(course.high))
-
-
-def _table() -> Table:
-    """Return an empty table without borders."""
-    return Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
+    return float(np.nanmin(column.low)), float(np.nanmax(column.high))

@@ -154,7 +154,7 @@ class FittedDeviceRows:
         """Yield the table, and a line with the number of devices that are not shown."""
         for layout in (*LAYOUTS, NARROW_LAYOUT):
             count = self._visible_rows(layout, console)
-            table = device_rows(self._devices[:count], self._now_s, layout)
+            table = _device_rows(self._devices[:count], self._now_s, layout)
             if layout is NARROW_LAYOUT or table_width(table, console, options) <= options.max_width:
                 break
         yield table
@@ -169,18 +169,8 @@ class FittedDeviceRows:
         return max(lines // (3 if layout.stacked else 1), MIN_ROWS)
 
 
-def device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) -> Table:
-    """Return the table of devices, one row per device.
-
-    Parameters
-    ----------
-    devices
-        Devices in the order of their rows.
-    now_s
-        Current time on the clock of the messages [s].
-    layout
-        Level of detail.
-    """
+def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) -> Table:
+    """Return the table of devices, one row per device, in a level of detail."""
     table = plain_table("device", "state", gap=layout.gap)
     shown = [pair for pair in TABLE_COEFFICIENTS if any(_measures(one, pair[0]) for one in devices)]
     columns = [_coefficient_column(devices, kind, symbol, layout) for kind, symbol in shown]
@@ -229,7 +219,7 @@ def _count_cells(one: RemoteDevice, layout: Layout) -> list[Text]:
     """Return the cells of the rate and of the sample counters."""
     if one.status is None:
         return [Text(NO_VALUE, style="dim")] * 4
-    rate = NO_VALUE if one.status.rate is None else format_number(one.status.rate, 4)
+    rate = NO_VALUE if one.status.rate_hz is None else format_number(one.status.rate_hz, 4)
     write = "{:,}".format if layout.full_counts else format_short_count
     lost, bad = (Text(write(count), style="yellow" if count else "dim") for count in (one.status.lost, one.status.bad))
     return [Text(rate), Text(write(one.status.received)), lost, bad]

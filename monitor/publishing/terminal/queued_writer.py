@@ -96,7 +96,7 @@ class QueuedWriter:
 
     @property
     def state(self) -> str:
-        """``ok``, or what is wrong and how much was dropped since the start: for the status of the devices."""
+        """``ok``, or a description of the problem, with the number of lines and frames dropped since the start."""
         blocked_s = self._blocked_s()
         frames = self._lost_frames + self._frames_in(blocked_s)
         counts = ((frames, "frame"), (self._dropped_lines(), "log line"))

@@ -17,6 +17,7 @@ from drivers.sample import AXES
 from monitor.common.units import format_duration
 from monitor.publishing.reports import comparison_sentences
 from monitor.publishing.reports import reconcile_sentences as words
+from monitor.publishing.terminal.tables import plain_table
 from monitor.reconcile.result import AxisResult, Reconciliation, ReconciliationStep
 from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect
 
@@ -48,9 +49,9 @@ def print_report(r: Reconciliation, console: Console) -> None:
 
 def table(r: Reconciliation) -> RenderableType:
     """Return a table with a row per axis, followed by its steps and its unexplained remainder."""
-    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
-    for head, justify in (("axis", "left"), ("verdict", "left"), ("gap", "right"), ("conf.", "right")):
-        rows.add_column(head, justify=justify, no_wrap=True)  # type: ignore[arg-type]
+    rows = plain_table("axis", "verdict")
+    for head in ("gap", "conf."):
+        rows.add_column(head, justify="right", no_wrap=True)
     rows.add_column("what", overflow="fold")
     for axis in (axis for axis in AXES if axis in r.axes):
         _add(rows, r, r.axes[axis])
@@ -107,8 +108,7 @@ def print_comparison(c: Comparison, console: Console) -> None:
 
 def _axes_by_runs(c: Comparison) -> Table:
     """Return a table of the results by axis and recording."""
-    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
-    rows.add_column("axis", no_wrap=True)
+    rows = plain_table("axis")
     for run in c.runs:
         rows.add_column(Text(run.name), overflow="fold")
     for axis, one in c.axes.items():
@@ -130,7 +130,7 @@ def _cell(result: AxisResult | None) -> Text:
 
 def _lines(found: list[tuple[str, Text]]) -> Table:
     """Return a table of axes and lines."""
-    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, show_header=False)
+    rows = plain_table(show_header=False)
     rows.add_column(no_wrap=True, style="bold")
     rows.add_column(overflow="fold")
     for axis, said in found:

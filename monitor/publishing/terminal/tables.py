@@ -1,18 +1,22 @@
 """Helpers for tables in the terminal."""
 
+from collections.abc import Sequence
+
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
 
 UNLIMITED_WIDTH = 10_000
 
 
-def plain_table(*heads: str, gap: int = 2, show_header: bool = True) -> Table:
+def plain_table(*heads: str, wrapped: Sequence[str] = (), gap: int = 2, show_header: bool = True) -> Table:
     """Return an empty table without borders.
 
     Parameters
     ----------
     *heads
         Headers of the first columns, whose cells are not wrapped.
+    wrapped
+        Headers of the next columns, whose cells may be wrapped.
     gap
         Number of blanks between columns.
     show_header
@@ -21,6 +25,8 @@ def plain_table(*heads: str, gap: int = 2, show_header: bool = True) -> Table:
     table = Table(box=None, padding=(0, gap, 0, 0), pad_edge=False, header_style="bold", show_header=show_header)
     for head in heads:
         table.add_column(head, no_wrap=True)
+    for head in wrapped:
+        table.add_column(head)
     return table
 
 

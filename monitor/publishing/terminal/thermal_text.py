@@ -3,11 +3,9 @@
 import math
 from typing import Any, Final
 
-import msgspec
 import numpy as np
 from rich.console import Console
 from rich.padding import Padding
-from rich.table import Table
 
 from monitor.common.units import DEVIATION_UNITS, format_duration, format_rate, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
@@ -17,6 +15,8 @@ from monitor.drift.thermal.thermal_model import Prediction
 from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_study import ModelComparison, ThermalFitReport, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
+from monitor.publishing.messages.message import encode_json
+from monitor.publishing.terminal.tables import plain_table
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
@@ -38,7 +38,7 @@ def print_thermal_fit(study: ThermalFitReport, console: Console) -> None:
     """
     console.print(_summary_line(study.recording, study.interval_s, study.means), highlight=False)
     if study.fits:
-        rows = _table("axis", "model", "per °C", "late by", "loop", "leaves", "explains", "validated")
+        rows = plain_table("axis", "model", wrapped=("per °C", "late by", "loop", "leaves", "explains", "validated"))
         for axis, one in study.fits.items():
             rows.add_row(axis, *_fit_row(axis, one))
         console.print(Padding(rows, (1, 0)))
@@ -65,7 +65,9 @@ def print_thermal_prediction(outlook: ThermalPredictionReport, console: Console)
     """
     console.print(_summary_line(outlook.recording, outlook.interval_s, outlook.means), highlight=False)
     if outlook.judged:
-        rows = _table("axis", "rms alone", "multi-step", "offset out", "one-step", "offset", "within 95 %")
+        rows = plain_table(
+            "axis", wrapped=("rms alone", "multi-step", "offset out", "one-step", "offset", "within 95 %")
+        )
         for axis, one in outlook.judged.items():
             each = (one.rms_about_mean, one.rms, one.rms_without_offset, one.rms_one_step, one.offset)
             rows.add_row(axis, *(_format_deviation(axis, x) for x in each), f"{100.0 * one.coverage:.0f} %")
@@ -154,12 +156,12 @@ def _prediction_of_axis(means: IntervalMeans, one: ModelComparison) -> dict[str,
         "within": one.coverage,
         "temperature": means.temperature_c,
         "bias": means.bias,
-        "multi_step": _band(one.multi_step),
-        "one_step": _band(one.one_step),
+        "multi_step": _prediction(one.multi_step),
+        "one_step": _prediction(one.one_step),
     }
 
 
-def _band(one: Prediction) -> dict[str, Any]:
+def _prediction(one: Prediction) -> dict[str, Any]:
     """Return a predicted bias with its interval."""
     return {"bias": one.bias, "lo": one.lo, "hi": one.hi}
 
@@ -176,14 +178,7 @@ def _json(
         "refused": dict(refused),
         "notes": list(notes),
     }
-    return msgspec.json.encode(whole, enc_hook=_encode_array)
-
-
-def _encode_array(value: Any) -> Any:
-    """Convert an array for JSON; values that are not finite become null."""
-    if isinstance(value, np.ndarray):
-        return [float(x) if np.isfinite(x) else None for x in value]
-    raise TypeError(f"{type(value).__name__} has no JSON")
+    return encode_json(whole)
 
 
 def _summary_line(recording: str, interval_s: float, means: Any) -> str:
@@ -213,14 +208,6 @@ def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
 def _format_deviation(axis: str, si: float) -> str:
     """Format a rate or an acceleration in the unit of the axis."""
     return DEVIATION_UNITS[sensor_kind(axis)].text(si)
-
-
-def _table(*heads: str) -> Table:
-    """Return an empty table with these column headers."""
-    rows = Table(box=None, padding=(0, 2, 0, 0), pad_edge=False, header_style="bold")
-    for head in heads:
-        rows.add_column(head, no_wrap=head in ("axis", "model"))
-    return rows
 
 
 def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:

@@ -65,33 +65,25 @@ def watch(
         subscriber.start()
         if once_s is not None:
             stop.wait(once_s)
-            receive_messages(states, subscriber)
+            _receive_messages(states, subscriber)
             with QueuedWriter(stream, STDOUT, LiveTable(console, states).render) as writer:
                 writer.finish(stop)
         elif console.is_terminal:
             with QueuedWriter(stream, STDOUT, LiveTable(console, states).render, REFRESH_PERIOD_S) as writer:
                 while not stop.wait(REFRESH_PERIOD_S) and writer.error is None:
-                    receive_messages(states, subscriber)
+                    _receive_messages(states, subscriber)
                     writer.redraw()
         else:
             with QueuedWriter(stream, STDOUT, limit=1) as writer:  # at most one table is queued
                 while not stop.wait(PLAIN_PERIOD_S) and writer.error is None:
-                    receive_messages(states, subscriber)
+                    _receive_messages(states, subscriber)
                     with console.capture() as captured:
                         console.print(device_table(states, time.monotonic()))
                     writer.put(captured.get())
 
 
-def receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None:
-    """Process all received messages, and update the note about the connection.
-
-    Parameters
-    ----------
-    states
-        State of the devices.
-    subscriber
-        Source of the messages.
-    """
+def _receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None:
+    """Process all received messages, and update the note about the connection."""
     for message in subscriber.take(0.0):
         if message.payload is None:
             states.set_token(message.key, message.there)
@@ -101,7 +93,7 @@ def receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None:
 
 
 def connection_note(states: DeviceStates, subscriber: ZenohSubscriber) -> str:
-    """Return a description of what is wrong with the connection to the daemons; empty if nothing is.
+    """Return a description of the problems of the connection to the daemons; "" if there are none.
 
     Parameters
     ----------

@@ -45,11 +45,11 @@ def query_histories(
     Raises
     ------
     ConfigError
-        The endpoint, the file or the query is not valid.
+        If the endpoint, the file or the query is not valid.
     LinkUnavailable
-        No daemon is reachable, accepts the connection or replies.
+        If no daemon is reachable, accepts the connection or replies.
     NotReady
-        The time range contains no results.
+        If the time range contains no results.
     """
     import zenoh
 
@@ -78,8 +78,8 @@ def query_histories(
 def _error_of_reply(error: Any) -> Exception:
     """Convert an error reply of a daemon into an exception."""
     try:
-        said = json.loads(bytes(error.payload))
-        text, status = remove_control_characters(str(said["error"])[:500]), said.get("exit")
+        reply = json.loads(bytes(error.payload))
+        text, status = remove_control_characters(str(reply["error"])[:500]), reply.get("exit")
     except (ValueError, KeyError, TypeError, AttributeError):
         return LinkUnavailable("the daemon gave no answer, and no reason that can be read")
     return ERRORS.get(status, LinkUnavailable)(text)

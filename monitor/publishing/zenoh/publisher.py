@@ -21,6 +21,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.credential_masking import mask_secrets
@@ -46,7 +47,7 @@ MAX_QUEUED_QUERIES: Final = 64
 REFUSAL_CHECK_S: Final = 3.0
 """Interval between two checks of why a router refuses the connection."""
 DUPLICATE_REPORT_S: Final = 10.0
-"""Time during which a status that another program published under the same key is reported."""
+"""Time for which another program that publishes under the key of a device is reported after its last message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +74,15 @@ class ZenohPublisher:
         Settings of the session.
     devices
         Names of the devices.
-    recall
+    read_history
         Function that answers queries of ``history``; None if no history is stored.
     """
 
-    def __init__(self, settings: ZenohTable, devices: Sequence[str], recall: HistoryFunction | None = None) -> None:
+    def __init__(
+        self, settings: ZenohTable, devices: Sequence[str], read_history: HistoryFunction | None = None
+    ) -> None:
         self.settings = settings
-        self._recall = recall
+        self._read_history = read_history
         self._session_state = "off" if settings.mode == "none" else "not open yet"
         self._unsent = ""  # reason why the newest message could not be sent
         self.commands: queue.Queue[Command] = queue.Queue(MAX_QUEUED_QUERIES)
@@ -95,21 +98,21 @@ class ZenohPublisher:
         self._declaring = threading.Lock()  # the opener declares all devices; the main loop adds and removes devices
         self._showing = threading.Lock()  # the opener and the main loop both declare liveliness tokens
         self._opener = threading.Thread(target=self._keep_open, name="zenoh open", daemon=True)
-        self._takers: list[threading.Thread] = []
+        self._query_threads: list[threading.Thread] = []
         self._closing = threading.Event()
 
     @property
     def state(self) -> str:
-        """``ok``, or a description of what is wrong; part of the status message."""
+        """``ok``, or a description of the problem; part of the status message."""
         session = self._session
         if self._unsent or session is None:
             return self._unsent or self._session_state
         if self._connect and is_unconnected(session):
             return f"{self._refusal or 'nobody at ' + mask_secrets(', '.join(self._connect))}; trying again"
-        twins = self._duplicates.found(time.monotonic())
-        if not twins:
+        duplicates = self._duplicates.found(time.monotonic())
+        if not duplicates:
             return self._session_state
-        return f"{self._session_state}{'; ' if self._session_state != 'ok' else ', but '}{twins}"
+        return f"{self._session_state}{'; ' if self._session_state != 'ok' else ', but '}{duplicates}"
 
     def start(self) -> None:
         """Open the session in a separate thread, so that a missing router does not delay the samples."""
@@ -194,9 +197,9 @@ class ZenohPublisher:
             self._devices = tuple(one for one in self._devices if one != device)
             del self._alive[device]
             keys = {topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
-            gone = [self._publishers[key] for key in keys & self._publishers.keys()]
+            removed = [self._publishers[key] for key in keys & self._publishers.keys()]
             self._publishers = {key: one for key, one in self._publishers.items() if key not in keys}
-            for one in [*gone, *self._queryables.pop(device, []), *self._duplicates.remove(device)]:
+            for one in [*removed, *self._queryables.pop(device, []), *self._duplicates.remove(device)]:
                 one.undeclare()
 
     def close(self) -> None:
@@ -242,33 +245,35 @@ class ZenohPublisher:
             session.close()  # type: ignore[no-untyped-call]
         with self._showing:
             self._tokens = {}  # they were removed with the session
-        takers, self._takers = self._takers, []
-        for taker in takers:
-            taker.join(RETRY_S)
+        threads, self._query_threads = self._query_threads, []
+        for thread in threads:
+            thread.join(RETRY_S)
 
     def _open(self) -> None:
         """Open the session and declare all devices."""
-        session, said = self._open_session()
+        session, state = self._open_session()
         with self._declaring:
             self._session = session
             for device in self._devices:
                 self._declare(session, device)
-            self._session_state = said
+            self._session_state = state
 
     def _declare(self, session: "zenoh.Session", device: str) -> None:
         """Declare all keys of a device."""
         keys = {topic: topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
         published = {topic: key for topic, key in keys.items() if topic.when not in ("presence", "query")}
         new = {key: self._publisher(session, topic, key) for topic, key in published.items()}
-        self._declare_commands(session, device)
+        command_key = f"{self.settings.prefix}/{device}/command/*"
+        self._declare_queryable(session, device, command_key, partial(self._queue_command, device))
         self._duplicates.add(session, device)
-        if self._recall is not None:
-            self._declare_history(session, device, self._recall)
+        if self._read_history is not None:
+            answer = partial(self._answer_history, device, self._read_history)
+            self._declare_queryable(session, device, keys[topics.HISTORY], answer)
         self._publishers = {**self._publishers, **new}
         self._update_token(device)
 
     def _open_session(self) -> tuple["zenoh.Session", str]:
-        """Open the session, on a free port if the configured one is in use; return it with the state to report."""
+        """Open the session, on a free port if the configured port is in use. Return the session and its state."""
         import zenoh
 
         listen = self.settings.listen
@@ -284,15 +289,15 @@ class ZenohPublisher:
             return session, f"ok, but {', '.join(listen)} is busy: listening on {', '.join(free)}"
 
     def _configuration(self, listen: tuple[str, ...] | None) -> "zenoh.Config":
-        """Return the configuration: these settings override the file, and the file overrides the closed defaults."""
+        """Return the configuration of zenoh. The settings override the file, and the file overrides the defaults."""
         own = self.settings
         keys: dict[str, Any] = {
             "mode": own.mode,
             "listen/endpoints": [] if own.mode == "client" else listen,  # a client does not listen
             "connect/endpoints": own.connect or None,
         }
-        unsaid = {**DEFAULT_CONFIGURATION, "listen/endpoints": [topics.ENDPOINT], "timestamping/enabled": True}
-        return build_session_config(keys, own.config, unsaid)
+        defaults = {**DEFAULT_CONFIGURATION, "listen/endpoints": [topics.ENDPOINT], "timestamping/enabled": True}
+        return build_session_config(keys, own.config, defaults)
 
     def _publisher(
         self, session: "zenoh.Session", topic: topics.Topic, key: str
@@ -330,67 +335,49 @@ class ZenohPublisher:
             elif not self._alive[device] and device in self._tokens:
                 self._tokens.pop(device).undeclare()
 
-    def _declare_commands(self, session: "zenoh.Session", device: str) -> None:
-        """Declare the queryable of a device's commands and start its thread."""
+    def _declare_queryable(
+        self, session: "zenoh.Session", device: str, key: str, handle: Callable[[Any], None]
+    ) -> None:
+        """Declare a queryable of a device, and start the thread that handles its queries."""
         import zenoh
 
-        key = f"{self.settings.prefix}/{device}/command/*"
         queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(MAX_QUEUED_QUERIES))
-        taker = threading.Thread(
-            target=self._take_queries, args=(device, queryable), name=f"commands of {device}", daemon=True
-        )
-        taker.start()
-        self._add_queryable(device, queryable, taker)
-
-    def _declare_history(self, session: "zenoh.Session", device: str, recall: HistoryFunction) -> None:
-        """Declare the queryable of a device's history and start its thread."""
-        import zenoh
-
-        key = topics.HISTORY.key(self.settings.prefix, device)
-        queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(MAX_QUEUED_QUERIES))
-        taker = threading.Thread(
-            target=self._answer_history, args=(device, key, queryable, recall), name=f"history of {device}", daemon=True
-        )
-        taker.start()
-        self._add_queryable(device, queryable, taker)
-
-    def _add_queryable(self, device: str, queryable: Any, taker: threading.Thread) -> None:
-        """Remember a queryable and its thread."""
+        name = f"queries of {key}"
+        thread = threading.Thread(target=self._handle_queries, args=(queryable, handle), name=name, daemon=True)
+        thread.start()
         self._queryables.setdefault(device, []).append(queryable)
-        self._takers = [*(one for one in self._takers if one.is_alive()), taker]
+        self._query_threads = [*(one for one in self._query_threads if one.is_alive()), thread]
 
-    def _answer_history(self, device: str, key: str, queryable: Any, recall: HistoryFunction) -> None:
-        """Answer history queries until the session is closed (runs in a thread)."""
+    def _handle_queries(self, queryable: Any, handle: Callable[[Any], None]) -> None:
+        """Handle queries until the session is closed (runs in a thread)."""
         handler = queryable.handler
         while not self._closing.is_set():
             try:
                 query = handler.recv()
             except _zenoh_errors():
                 return
-            answer, _ = _reply_functions(query, key)
-            with contextlib.suppress(*_zenoh_errors()):  # the session may have been closed meanwhile
-                try:
-                    payload = recall(device, str(query.parameters))
-                except ImuError as error:
-                    _reply_error(query, error)
-                else:
-                    answer(payload)
+            handle(query)
 
-    def _take_queries(self, device: str, queryable: Any) -> None:
-        """Pass commands to the queue until the session is closed (runs in a thread)."""
-        handler = queryable.handler
-        while not self._closing.is_set():
+    def _answer_history(self, device: str, read_history: HistoryFunction, query: Any) -> None:
+        """Answer a query of ``history``."""
+        answer, _ = _reply_functions(query, topics.HISTORY.key(self.settings.prefix, device))
+        with contextlib.suppress(*_zenoh_errors()):  # the session may have been closed meanwhile
             try:
-                query = handler.recv()
-            except _zenoh_errors():
-                return
-            verb = str(query.key_expr).rsplit("/", 1)[-1]
-            key = f"{self.settings.prefix}/{device}/command/{verb}"  # the key of the query may match several devices
-            command = Command(device, verb, *_reply_functions(query, key))
-            try:
-                self.commands.put_nowait(command)
-            except queue.Full:
-                command.refuse("busy: too many commands wait")
+                payload = read_history(device, str(query.parameters))
+            except ImuError as error:
+                _reply_error(query, error)
+            else:
+                answer(payload)
+
+    def _queue_command(self, device: str, query: Any) -> None:
+        """Pass a command to the queue."""
+        verb = str(query.key_expr).rsplit("/", 1)[-1]
+        key = f"{self.settings.prefix}/{device}/command/{verb}"  # the key of the query may match several devices
+        command = Command(device, verb, *_reply_functions(query, key))
+        try:
+            self.commands.put_nowait(command)
+        except queue.Full:
+            command.refuse("busy: too many commands wait")
 
 
 class _DuplicatePublishers:
@@ -421,9 +408,9 @@ class _DuplicatePublishers:
     def remove(self, device: str) -> list[Any]:
         """Forget a device; return the subscribers to undeclare."""
         self._heard_s.pop(device, None)
-        gone = [one for name, one in self._subscribers.items() if name == device]
+        removed = [one for name, one in self._subscribers.items() if name == device]
         self._subscribers = {name: one for name, one in self._subscribers.items() if name != device}
-        return gone
+        return removed
 
     def clear(self) -> None:
         """Forget all devices; their subscribers are closed with the session."""
@@ -462,8 +449,8 @@ def _reply_error(query: Any, error: ImuError) -> None:
 
     status = 3 if isinstance(error, NotReady) else 2 if isinstance(error, ConfigError) else 1
     with query:
-        said = json.dumps({"error": str(error), "exit": status}).encode()
-        query.reply_err(said, encoding=zenoh.Encoding(topics.JSON))
+        payload = json.dumps({"error": str(error), "exit": status}).encode()
+        query.reply_err(payload, encoding=zenoh.Encoding(topics.JSON))
 
 
 def _free_port(endpoint: str) -> str:

@@ -85,7 +85,7 @@ class ZenohSubscriber:
     Raises
     ------
     ConfigError
-        zenoh rejects the key expression, an endpoint or the file, or other users may modify the file.
+        If zenoh rejects the key expression, an endpoint or the file, or other users may modify the file.
     """
 
     def __init__(
@@ -185,7 +185,7 @@ class _EndpointSession:
         self._endpoint, self._config, self._keys, self._push = endpoint, config, keys, push
         self._session: zenoh.Session | None = None
         self._opener = threading.Thread(target=self._keep_open, name=f"zenoh {self.endpoint}", daemon=True)
-        self._takers: list[threading.Thread] = []
+        self._receiver_threads: list[threading.Thread] = []
         self._tokens: set[str] = set()  # keys of existing liveliness tokens
         self._since_s: float | None = None  # monotonic time at which the connection was established [s]
 
@@ -247,22 +247,22 @@ class _EndpointSession:
         session, self._session = self._session, None
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
-        takers, self._takers = self._takers, []
-        for taker in takers:
-            taker.join(RETRY_S)
+        threads, self._receiver_threads = self._receiver_threads, []
+        for thread in threads:
+            thread.join(RETRY_S)
 
     def _subscribe(self, session: "zenoh.Session") -> None:
         """Subscribe to all keys, each with its own thread."""
         for topic, keys in self._keys.items():
             for key in keys:
                 subscriber = _subscriber(session, topic, key)
-                taker = threading.Thread(
-                    target=self._take, args=(subscriber, topic is topics.ALIVE), name=f"zenoh {key}", daemon=True
+                thread = threading.Thread(
+                    target=self._receive, args=(subscriber, topic is topics.ALIVE), name=f"zenoh {key}", daemon=True
                 )
-                taker.start()
-                self._takers.append(taker)
+                thread.start()
+                self._receiver_threads.append(thread)
 
-    def _take(self, subscriber: Any, liveliness: bool) -> None:
+    def _receive(self, subscriber: Any, liveliness: bool) -> None:
         """Move messages from the ring to the queue until the session is closed (runs in a thread)."""
         import zenoh
 
@@ -319,23 +319,23 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
     Raises
     ------
     ConfigError
-        An endpoint or the file is not valid, or other users may modify the file.
+        If an endpoint or the file is not valid, or other users may modify the file.
     """
     import zenoh
 
     if file is not None and (line := file_permissions.describe_write_access(file)):
         raise ConfigError(f"{file}: {line}")
     try:
-        theirs = find_connect_endpoints(build_session_config({}, file))
+        file_endpoints = find_connect_endpoints(build_session_config({}, file))
     except zenoh.ZError as error:
         text = format_error(error)
         raise ConfigError(text if text.startswith(str(file)) else f"{file}: {text}") from error
-    unsaid = {**DEFAULT_CONFIGURATION, "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
+    defaults = {**DEFAULT_CONFIGURATION, "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
     found = {}
-    for endpoint in dict.fromkeys(connect or theirs or (topics.ENDPOINT,)):
+    for endpoint in dict.fromkeys(connect or file_endpoints or (topics.ENDPOINT,)):
         own = {"mode": "client", "connect/endpoints": [endpoint], "listen/endpoints": []}
         try:
-            found[endpoint] = build_session_config(own, file, unsaid)
+            found[endpoint] = build_session_config(own, file, defaults)
         except (zenoh.ZError, UnicodeEncodeError) as error:
             raise ConfigError(
                 f'connect "{mask_secrets(endpoint)}": no endpoint; write e.g. {topics.ENDPOINT}'

@@ -24,7 +24,8 @@ from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnC
 from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.query import PARTS, HistoryQuery
 from monitor.history.reading import HistoryTable
-from monitor.history.sqlite_store import HistoryStore, StoredEvent, open_history
+from monitor.history.sqlite_store import HistoryStore, open_history
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages.history import HistoryMessage
 from tests.experiments.benchmarks.machine import Load
@@ -39,7 +40,7 @@ QUESTIONS = (
     ("last hour", 3600.0, HistoryQuery()),
     ("last day", 86_400.0, HistoryQuery()),
     ("last month", 30 * 86_400.0, HistoryQuery()),
-    ("all, N of gz", math.inf, HistoryQuery(what=("coefficients",), axes=("gz",), letters=("N",))),
+    ("all, N of gz", math.inf, HistoryQuery(what=("coefficients",), axes=("gz",), symbols=("N",))),
     ("all, coefficients and status", math.inf, HistoryQuery()),
     ("all, everything", math.inf, HistoryQuery(what=PARTS)),
 )

@@ -20,7 +20,7 @@ def main() -> None:
         output = MetricsOutput(Metrics("127.0.0.1", 0))
         for i in range(devices):
             output.health(f"device-{i}", 0.0, made.health())
-            output.estimate(f"device-{i}", 0.0, made.estimate())
+            output.result(f"device-{i}", 0.0, 0, made.estimate())
         output.start()
         while not output.port:
             time.sleep(0.01)

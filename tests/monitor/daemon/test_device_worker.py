@@ -15,7 +15,12 @@ from drivers.settings_model import read_settings
 from monitor.daemon import device_worker
 from monitor.daemon.device_worker import DeviceWorker
 from monitor.daemon.kernel_readiness import KernelReadiness
+from monitor.drift.compensation.live_compensation import DriftUpdate
+from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import Status
+from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings import loading as settings
 from monitor.settings.loading import Device, Driver
 from tests.support.loopback_link import LoopbackLink
@@ -37,24 +42,16 @@ class Caught:
         self.blocks.append(samples)
         self.counts.append(received)
 
-    def estimate(self, device, unix_s, estimate):
-        self.estimates.append((unix_s, estimate))
-
-    def model_gap(self, device, unix_s, gap):
-        self.gaps.append((unix_s, gap))
-
-    def thermal(self, device, unix_s, received, look):
-        self.thermals.append((unix_s, look))
+    def result(self, device, unix_s, received, result):
+        kept = {Estimate: self.estimates, ModelGap: self.gaps, ThermalUpdate: self.thermals, DriftUpdate: self.drifts}
+        if isinstance(result, SlowStatistics):
+            self.totals.append((received, *result))
+            self.total_times.append(unix_s)
+        else:
+            kept[type(result)].append((unix_s, result))
 
     def compensated(self, device, received, samples, offset_ns):
         self.rates.append(samples)
-
-    def drift(self, device, unix_s, look):
-        self.drifts.append((unix_s, look))
-
-    def total(self, device, unix_s, received, total, hadamard):
-        self.totals.append((received, total, hadamard))
-        self.total_times.append(unix_s)
 
     def event(self, device, unix_s, received, event):
         self.events.append((unix_s, event))

@@ -5,6 +5,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -195,11 +196,11 @@ class Estimates(Output):
         self.gaps: list[ModelGap] = []
         self.health_text = ""
 
-    def estimate(self, device: str, unix_s: float, estimate: Estimate) -> None:
-        self.all.append(estimate)
-
-    def model_gap(self, device: str, unix_s: float, gap: ModelGap) -> None:
-        self.gaps.append(gap)
+    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        if isinstance(result, Estimate):
+            self.all.append(result)
+        elif isinstance(result, ModelGap):
+            self.gaps.append(result)
 
     def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.kinds.add(event.kind)
@@ -240,20 +241,20 @@ record = false
     with open_history(tmp_path / "kept" / FILE_NAME) as reader:
         kept = past.read_history(reader, "d", TimeRange(-math.inf, math.inf), step_s=60)
     (known,) = board.devices(time.monotonic())
-    assert known.noise is not None
+    assert known.coefficients is not None
     published = {Status(one) for estimate in told.all for one in estimate.coefficients.status.ravel().tolist()}
     assert told.all[-1].rate_hz == 100.0
     if rate_hz == 100.0:
         assert Status.ESTIMATED in published
         assert told.kinds >= {"limit_crossed", "model_disagrees"}
         assert np.isfinite(kept.column("gz.N").last).any()
-        assert Status.ESTIMATED in known.noise.coefficients.status
+        assert Status.ESTIMATED in known.coefficients.coefficients.status
     else:
         assert published == {Status.UNESTIMATED}
         assert not told.kinds & {"limit_crossed", "model_disagrees"}
         assert all(look.axes == {} for look in told.gaps)
         assert not np.isfinite(kept.column("gz.N").last).any()
-        assert set(known.noise.coefficients.status.ravel().tolist()) == {Status.UNESTIMATED}
+        assert set(known.coefficients.coefficients.status.ravel().tolist()) == {Status.UNESTIMATED}
         assert known.status is not None
         assert known.status.text == told.health_text
         assert told.health_text.endswith(

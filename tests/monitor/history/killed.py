@@ -11,7 +11,8 @@ import numpy as np
 
 from monitor.history import sqlite_store as stores
 from monitor.history.bucket import HistoryRow
-from monitor.history.sqlite_store import HistoryStore, StoredEvent
+from monitor.history.sqlite_store import HistoryStore
+from monitor.history.stored_events import StoredEvent
 
 T0 = 1_760_400_000  # a multiple of all widths
 NAMES = ("gz.N", "rate")

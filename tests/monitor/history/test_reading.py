@@ -13,7 +13,8 @@ from drivers.errors import NotReady
 from monitor.history import reading as past
 from monitor.history.bucket import HistoryRow
 from monitor.history.reading import HistoryTable
-from monitor.history.sqlite_store import HistoryStore, StoredEvent, open_history
+from monitor.history.sqlite_store import HistoryStore, open_history
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from tests.monitor.history.made import NAMES, row, same, together
 

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from drivers.errors import RecordingError
 from monitor.history import sqlite_store as stores
 from monitor.history.bucket import HistoryRow
-from monitor.history.sqlite_store import LEVELS, HistoryStore, StoredEvent, open_history
+from monitor.history.sqlite_store import LEVELS, HistoryStore, open_history
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from tests.monitor.history.kills import ALL, kill
 from tests.monitor.history.made import NAMES, numbers_of, row, same, together

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from monitor.history import writer as writers
-from monitor.history.sqlite_store import APPLICATION, SQLITE_SUFFIXES, VERSION, HistoryStore, StoredEvent, open_history
+from monitor.history.sqlite_store import APPLICATION, SQLITE_SUFFIXES, VERSION, HistoryStore, open_history
+from monitor.history.stored_events import StoredEvent
 from monitor.history.writer import HistoryWriter
 from tests.monitor.history.kills import ALL
 from tests.monitor.history.made import row

@@ -15,7 +15,7 @@ from monitor.common.units import unit_of
 from monitor.estimation.fit.coefficients import SYMBOLS
 from monitor.history.bucket import STATES, HistoryRow
 from monitor.history.reading import HistoryTable, build_table
-from monitor.history.sqlite_store import StoredEvent
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.plots.history_plot import save_history_plot
 from monitor.publishing.reports import history_file

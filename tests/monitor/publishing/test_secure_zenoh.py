@@ -105,7 +105,7 @@ def nothing_kept(device: str, _parameters: str) -> bytes:
 def daemon(file: Path) -> Iterator[ZenohPublisher]:
     """A daemon's session that sends status ten times a second and answers ``reset``."""
     table = ZenohTable(mode=None, listen=None, config=file)
-    out, ending = ZenohPublisher(table, ["nose"], recall=nothing_kept), threading.Event()
+    out, ending = ZenohPublisher(table, ["nose"], read_history=nothing_kept), threading.Event()
 
     def work() -> None:
         while not ending.wait(0.1):

@@ -45,11 +45,11 @@ def history_question(data: bytes) -> None:
         assert not math.isnan(asked.span.start_s)
         assert asked.span.start_s <= asked.span.end_s
     again = parse_query(asked.parameters(), NOW_S)
-    assert (again.step_s, again.what, again.axes, again.letters) == (
+    assert (again.step_s, again.what, again.axes, again.symbols) == (
         asked.step_s,
         asked.what,
         asked.axes,
-        asked.letters,
+        asked.symbols,
     )
 
 

@@ -58,7 +58,7 @@ def test_every_number_is_the_newest_one_in_si() -> None:
         output.health("a", 0.0, made.health(received=1))
         output.health("a", 0.0, health)
         output.health("b", 0.0, replace(health, state="lost", rate_hz=None, latency_p50_s=None))
-        output.estimate("a", 0.0, estimate)
+        output.result("a", 0.0, 0, estimate)
         for _ in range(3):
             output.event("a", 0.0, 1, Event("link_lost", 0, ""))
         numbers = scrape(output.port)
@@ -92,7 +92,7 @@ def test_a_device_that_is_gone_has_no_numbers() -> None:
         wait_for(lambda: output.state == "ok")
         for name in ("a", "b"):
             output.health(name, 0.0, made.health())
-            output.estimate(name, 0.0, made.estimate())
+            output.result(name, 0.0, 0, made.estimate())
             output.event(name, 0.0, 1, Event("moved", 0, ""))
         output.device_removed("a")
         devices = {dict(labels).get("device") for _, labels in scrape(output.port)}

@@ -24,7 +24,7 @@ from monitor.estimation.fit.coefficient_fit import empty_fit
 from monitor.estimation.fit.coefficients import Coefficients, Status
 from monitor.history.query import PARTS, HistoryQuery
 from monitor.history.reading import HistoryTable
-from monitor.history.sqlite_store import StoredEvent
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages.analysis import AnalysisMessage, FailedAnalysisMessage
 from monitor.publishing.messages.history import HistoryMessage
@@ -185,7 +185,7 @@ def messages() -> dict[str, Message | AnalysisMessage | FailedAnalysisMessage]:
         "reset": ResetMessage.of(device, UNIX_S, 7, "the window is empty"),
         "history": HistoryMessage.reply(past(), query, UNIX_S, 7),
         "history_of_one_coefficient": HistoryMessage.reply(
-            past(), HistoryQuery(what=("coefficients",), axes=("gz",), letters=("B", "N")), UNIX_S, 7
+            past(), HistoryQuery(what=("coefficients",), axes=("gz",), symbols=("B", "N")), UNIX_S, 7
         ),
         "analyze": AnalysisMessage.of(analysis()),
         "analyze_with_all_curves": AnalysisMessage.of(analysis(), *slow_curves(), dynamic(), without_temperature()),

@@ -16,7 +16,7 @@ from monitor.history.bucket import STATES, HistoryRow, merge_rows
 from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.query import PARTS, HistoryQuery
 from monitor.history.reading import HistoryTable, build_table
-from monitor.history.sqlite_store import StoredEvent
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages.history import HistoryMessage, decode_history
 from tests.monitor.publishing.made import estimate, health
@@ -74,7 +74,7 @@ def test_the_layout_is_the_documented_one() -> None:
 
 
 def test_only_what_is_asked_for_is_said() -> None:
-    asked = HistoryQuery(what=("coefficients",), axes=("gz",), letters=("B", "N"))
+    asked = HistoryQuery(what=("coefficients",), axes=("gz",), symbols=("B", "N"))
     said = json.loads(HistoryMessage.reply(made(), asked, T0, 1).encode())
     assert set(said) & {"deviations", "status", "events"} == set()
     assert {axis: list(letters) for axis, letters in said["axes"].items()} == {"gz": ["B", "N"]}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from drivers.sample import AXES, Event
+from monitor.publishing.rerun.viewer_settings import DeviceInfo
 from tests.monitor.publishing import made
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
@@ -57,12 +58,13 @@ def test_a_recording_holds_surfaces_labels_and_marks(tmp_path: Path) -> None:
     path = tmp_path / "scene.rrd"
     stream = rr.RecordingStream("imu-monitor")
     stream.save(path)
-    scene = Scene(stream, [("bench-1", "")])
-    scene.open()
+    scene = Scene(stream)
+    scene.show([DeviceInfo("bench-1")])
     for i in range(12):
-        scene.estimate("bench-1", T0 + i, made.estimate(T0 + i, seed=i))
+        scene.draw("bench-1", "AllanPanel", [(T0 + i, made.estimate(T0 + i, seed=i))])
     what = {"N": {"before": 1.5e-4, "after": 3.0e-4}, "floor": {"after": 1.0}}
-    scene.event("bench-1", T0 + 9, Event("noise_changed", 0, "gz is louder", axis="gz", values=what))
+    event = Event("noise_changed", 0, "gz is louder", axis="gz", values=what)
+    scene.draw("bench-1", "EventsPanel", [(T0 + 9, event)])
     stream.flush()
     stream.disconnect()
     cells: dict[str, list[object]] = {}
@@ -87,15 +89,15 @@ def test_a_recording_holds_surfaces_labels_and_marks(tmp_path: Path) -> None:
 
 
 def test_a_device_has_a_tab_for_now_and_one_for_the_time() -> None:
-    tabs = blueprint.blueprint(["bench-1"]).root_container
+    tabs = blueprint.blueprint([DeviceInfo("bench-1")]).root_container
     assert [page.name for page in tabs.contents] == ["Now", "Dynamic"]
     assert tabs.active_tab == 0
-    fleet = blueprint.blueprint(["nose", "tail"]).root_container
+    fleet = blueprint.blueprint([DeviceInfo("nose"), DeviceInfo("tail")]).root_container
     assert [page.name for page in fleet.contents] == ["Overview", "nose", "tail"]
 
 
 def test_the_tab_of_temperature_is_there_only_where_bias_is_held_against_it() -> None:
-    fleet = blueprint.blueprint(["a", "b"], [], ["b"]).root_container
+    fleet = blueprint.blueprint([DeviceInfo("a"), DeviceInfo("b", has_thermal=True)]).root_container
     (_, first, second) = fleet.contents
     assert [page.name for page in first.contents] == ["Now", "Dynamic"]
     assert [page.name for page in second.contents] == ["Now", "Dynamic", "Temperature"]
@@ -108,8 +110,8 @@ def test_gaps_have_their_row_only_where_there_is_a_model() -> None:
             name for one in getattr(page, "contents", []) for name in views(one)
         ]
 
-    assert not [name for name in views(blueprint.blueprint(["a"]).root_container) if "gap" in str(name)]
-    fleet = blueprint.blueprint(["a", "b"], ["b"]).root_container
+    assert not [name for name in views(blueprint.blueprint([DeviceInfo("a")]).root_container) if "gap" in str(name)]
+    fleet = blueprint.blueprint([DeviceInfo("a"), DeviceInfo("b", has_model=True)]).root_container
     (_, first, second) = fleet.contents
     assert not [name for name in views(first) if "gap" in str(name)]
     assert [name for name in views(second) if "gap" in str(name)] == [

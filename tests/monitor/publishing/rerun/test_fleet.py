@@ -13,7 +13,7 @@ from monitor.common import topics
 from monitor.publishing.messages.results import AllanMessage, CoefficientsMessage, EventMessage, StatusMessage
 from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.rerun.fleet import FleetView, detail_key
-from monitor.publishing.rerun.panels import fleet_text
+from monitor.publishing.rerun.panel_text import fleet_text
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
@@ -95,7 +95,7 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
 def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.MonkeyPatch) -> None:
     viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
     drawn: list[float] = []
-    monkeypatch.setattr(viewer, "health", lambda _device, wall_s, _health: drawn.append(wall_s))
+    monkeypatch.setattr(viewer, "put", lambda _device, unix_s, _health: drawn.append(unix_s))
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
     fleet.take(Message("imu/a/status", StatusMessage.of("a", None, 0, made.health(state="waiting")).encode()))
     (known,) = fleet.board.devices(time.monotonic())

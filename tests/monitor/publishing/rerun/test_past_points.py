@@ -9,7 +9,7 @@ from drivers.sample import AXES
 from monitor.common.units import COEFFICIENT_UNITS, sensor_kind
 from monitor.history.bucket import HistoryRow
 from monitor.history.reading import HistoryTable, build_table
-from monitor.history.sqlite_store import StoredEvent
+from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")

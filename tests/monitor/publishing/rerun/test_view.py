@@ -19,6 +19,7 @@ from drivers.sample import AXES, Event
 from monitor.publishing.rerun import view as rerun_view
 from monitor.publishing.rerun.view import MISSING, RerunView
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
+from monitor.publishing.result_kinds import SampleRows
 from tests.monitor.publishing import made
 from tests.support.ports import free_port
 from tests.support.waiting import FOREVER_S, PATIENCE_S, stays_true, wait_for
@@ -49,9 +50,9 @@ def feed(view: RerunView, i: int) -> None:
     """Pass a tenth of a second of everything to the view. The calls never wait for a viewer."""
     t = T0 + 0.1 * i
     samples, estimate, health = made.samples(t, 0.1), made.estimate(t, seconds=60 + i, seed=i), made.health()
-    view.samples("bench-1", *samples)
-    view.estimate("bench-1", t, estimate)
-    view.health("bench-1", t, health)
+    view.put("bench-1", t, SampleRows(*samples))
+    view.put("bench-1", t, estimate)
+    view.put("bench-1", t, health)
 
 
 def test_a_recording_holds_what_was_shown(tmp_path: Path) -> None:
@@ -61,10 +62,10 @@ def test_a_recording_holds_what_was_shown(tmp_path: Path) -> None:
     wait_for(lambda: view.state == "ok")
     t, values, temperature_c = made.samples(T0, 1.0)
     estimate = made.estimate(T0 + 1)
-    view.samples("bench-1", t, values, temperature_c)
-    view.estimate("bench-1", T0 + 1, estimate)
-    view.event("bench-1", T0 + 1, Event("noise_changed", 0, "gz angle random walk rose by 47 %", axis="gz"))
-    view.health("bench-1", T0 + 1, made.health())
+    view.put("bench-1", T0, SampleRows(t, values, temperature_c))
+    view.put("bench-1", T0 + 1, estimate)
+    view.put("bench-1", T0 + 1, Event("noise_changed", 0, "gz angle random walk rose by 47 %", axis="gz"))
+    view.put("bench-1", T0 + 1, made.health())
     view.close()
     assert view.state == "closed"
 
@@ -92,9 +93,9 @@ def test_the_gap_has_a_course_and_the_model_a_line(tmp_path: Path) -> None:
     wait_for(lambda: view.state == "ok")
     looks = [made.look(made.estimate(T0 + i, seed=i), scale=1.1) for i in range(3)]
     for i, look in enumerate(looks):
-        view.gap("bench-1", T0 + 0.1 * i, look)
-    view.estimate("bench-1", T0 + 1, made.estimate(T0 + 1))
-    view.estimate("plain", T0 + 1, made.estimate(T0 + 1))
+        view.put("bench-1", T0 + 0.1 * i, look)
+    view.put("bench-1", T0 + 1, made.estimate(T0 + 1))
+    view.put("plain", T0 + 1, made.estimate(T0 + 1))
     view.close()
     rows = read(path)
     # within a second the newest counts
@@ -115,7 +116,7 @@ def test_means_have_a_course_beside_what_was_expected(tmp_path: Path) -> None:
     view.start()
     wait_for(lambda: view.state == "ok")
     for i in range(3):
-        view.thermal("bench-1", T0 + 600.0 * i, made.thermal_look(bias=1e-4 * (i + 1)))
+        view.put("bench-1", T0 + 600.0 * i, made.thermal_look(bias=1e-4 * (i + 1)))
     view.close()
     rows = read(path)
     gz = column(rows["/bench-1/thermal/gz"], "Scalars:scalars").reshape(3, 4)
@@ -198,7 +199,7 @@ def test_a_process_with_a_frozen_viewer_exits(server: sinks.ViewerProcess) -> No
         os.kill({server.pid}, signal.SIGSTOP)
         t = np.arange(2000) / 100
         for i in range(400):
-            view.samples("d", t + 20.0 * i, np.random.default_rng(i).standard_normal((2000, 6)), t)
+            view.put("d", 20.0 * i, SampleRows(t + 20.0 * i, np.random.default_rng(i).standard_normal((2000, 6)), t))
             time.sleep(0.005)
         while not view.state.startswith("stalled"):
             time.sleep(0.05)

@@ -1,6 +1,6 @@
 """What a person reads in the panels."""
 
-from monitor.publishing.rerun.panels import health_text, noise_text, overview_text
+from monitor.publishing.rerun.panel_text import health_text, noise_text, overview_text
 from tests.monitor.publishing import made
 
 

@@ -1,0 +1,144 @@
+"""Events of a history file: insertion, reading, and the thinning of events that are too many.
+
+All events are kept up to MAX_EVENTS per device. Beyond that limit, only the first, the last and the most significant
+event of each kind, axis and day are kept. If this is not sufficient, the same is done per month and then per year.
+``represented_events`` of the last event counts the deleted ones.
+"""
+
+import math
+import sqlite3
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import msgspec
+
+from monitor.history.time_ranges import TimeRange
+
+DAY_S: Final = 86_400
+MAX_EVENTS: Final = 20_000
+"""Largest number of events per device."""
+THINNING_SPANS_S: Final = (DAY_S, 30 * DAY_S, 365 * DAY_S)
+"""Lengths of the time ranges of which only a few events are kept [s]."""
+MAX_TEXT_LENGTH: Final = 2000
+_FIELDS: Final = "t, kind, text, axis, what, since, sigma, stands_for"
+
+
+@dataclass(frozen=True, slots=True)
+class StoredEvent:
+    """An event of a device, as it is stored."""
+
+    t_s: float  # Unix time
+    kind: str
+    text: str
+    axis: str | None = None
+    what: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    since_s: float | None = None  # Unix time at which the reported condition began
+    sigma: float | None = None
+    represented_events: int = 1  # number of events it represents: itself, and deleted earlier events of its kind
+
+
+def insert_event(db: sqlite3.Connection, device: int, event: StoredEvent) -> None:
+    """Insert an event.
+
+    Parameters
+    ----------
+    db
+        Connection to the history file.
+    device
+        Identifier of the device.
+    event
+        The event.
+    """
+    text, values = event.text[:MAX_TEXT_LENGTH], _encode_values(event.what)
+    fields = (event.t_s, event.kind, text, event.axis, values, event.since_s, event.sigma, event.represented_events)
+    db.execute(f"INSERT INTO event (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", (device, *fields))
+
+
+def read_events(db: sqlite3.Connection, device: int, span: TimeRange, at_most: int) -> tuple[list[StoredEvent], int]:
+    """Return the newest events in a time range, in order of time, and the number of all events in it.
+
+    Parameters
+    ----------
+    db
+        Connection to the history file.
+    device
+        Identifier of the device.
+    span
+        Time range.
+    at_most
+        Largest number of events to return.
+    """
+    where = "device = ? AND t >= ? AND t <= ?"
+    bounds = (device, clamp_time(span.start_s), clamp_time(span.end_s))
+    found = db.execute(
+        f"SELECT {_FIELDS} FROM event WHERE {where} ORDER BY t DESC, id DESC LIMIT ?",
+        (*bounds, at_most + 2),  # events exactly at the ends may be excluded by the time range
+    ).fetchall()
+    events = [
+        StoredEvent(t, kind, text, axis, _decode_values(values), *rest)
+        for t, kind, text, axis, values, *rest in found
+        if span.contains(t)
+    ]
+    (count,) = db.execute(f"SELECT count(*) FROM event WHERE {where}", bounds).fetchone()
+    return events[:at_most][::-1], max(int(count), len(events[:at_most]))
+
+
+def count_events(db: sqlite3.Connection, device: int) -> int:
+    """Return the number of stored events of a device.
+
+    Parameters
+    ----------
+    db
+        Connection to the history file.
+    device
+        Identifier of the device.
+    """
+    return int(db.execute("SELECT count(*) FROM event WHERE device = ?", (device,)).fetchone()[0])
+
+
+def thin_events(db: sqlite3.Connection, device: int, span_s: int) -> None:
+    """Keep the first, last and most significant event per kind, axis and time range; the last counts the others.
+
+    Parameters
+    ----------
+    db
+        Connection to the history file.
+    device
+        Identifier of the device.
+    span_s
+        Length of the time ranges [s].
+    """
+    groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
+    rows = db.execute(
+        "SELECT id, t, kind, axis, sigma, stands_for FROM event WHERE device = ? ORDER BY t, id", (device,)
+    )
+    for one in rows:
+        groups.setdefault((int(one[1] // span_s), one[2], one[3]), []).append(one)
+    for group in groups.values():
+        most_significant = max(group, key=lambda one: -math.inf if one[4] is None else one[4])
+        kept = {group[0][0], most_significant[0], group[-1][0]}
+        deleted = [one for one in group if one[0] not in kept]
+        if deleted:
+            db.executemany("DELETE FROM event WHERE id = ?", [(one[0],) for one in deleted])
+            more = sum(one[5] for one in deleted)
+            db.execute("UPDATE event SET stands_for = stands_for + ? WHERE id = ?", (more, group[-1][0]))
+
+
+def clamp_time(t_s: float) -> float:
+    """Clamp a time to the range that SQLite can compare."""
+    return max(min(t_s, 1e18), -1e18)
+
+
+def _encode_values(what: Mapping[str, Mapping[str, float]]) -> str:
+    """Encode event values as JSON, NaN as null. Values that are too long for an event are replaced by ``{}``."""
+    text = msgspec.json.encode(what).decode()
+    return text if len(text) <= MAX_TEXT_LENGTH else "{}"
+
+
+def _decode_values(text: str) -> dict[str, dict[str, float]]:
+    """Decode event values from JSON, null as NaN."""
+    found = msgspec.json.decode(text, type=dict[str, dict[str, float | None]])
+    return {
+        name: {key: math.nan if one is None else one for key, one in sides.items()} for name, sides in found.items()
+    }

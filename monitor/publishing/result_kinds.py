@@ -1,0 +1,163 @@
+"""Table of the kinds of results that leave the pipeline of a device.
+
+A row of ``RESULT_KINDS`` names the messages that are published and the panels of the viewer that draw the result. It
+also says how often the panels draw, and how results are merged while they wait for a slow viewer. A new kind of result
+needs a row here, a message in ``monitor.publishing.messages.results``, a panel in ``monitor.publishing.rerun.panels``
+and the code that produces the result. The module does no I/O and does not import Rerun.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+from drivers.sample import Event, Floats
+from monitor.common.health import Health
+from monitor.drift.compensation.live_compensation import DriftUpdate
+from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.estimate import Estimate, concatenate_histories
+from monitor.publishing.messages.message import Message
+from monitor.publishing.messages.results import (
+    AllanMessage,
+    CoefficientsMessage,
+    EventMessage,
+    GapMessage,
+    SlowStatistics,
+    StatusMessage,
+    ThermalMessage,
+    TotalMessage,
+)
+
+POINT_INTERVAL_S: Final = 1.0
+"""Interval between two points of a time series of estimates, in sample time."""
+SMALL_RESULT_BYTES: Final = 1000
+"""Approximate size of a result without large arrays."""
+
+TimedResult = tuple[float, Any]
+"""Unix time of a result [s], and the result."""
+Merge = Callable[[list[TimedResult], TimedResult], None]
+"""Function that adds a new result to the results that wait for a drawing."""
+
+
+@dataclass(frozen=True, slots=True)
+class SampleRows:
+    """Samples of a batch."""
+
+    unix_s: Floats  # [n]
+    values: Floats  # [n, 6] rad/s and m/s²; NaN if not measured
+    temperature_c: Floats  # [n] NaN if not measured
+
+
+@dataclass(frozen=True, slots=True)
+class CompensatedRows:
+    """Angular rates of a batch without their drift."""
+
+    unix_s: Floats  # [n]
+    values: Floats  # [n, 3] rad/s
+
+
+@dataclass(frozen=True, slots=True)
+class OverviewText:
+    """Table of all devices as Markdown. It belongs to no device, so the name of its device is empty."""
+
+    text: str
+
+
+def keep_all(waiting: list[TimedResult], new: TimedResult) -> None:
+    """Keep every result.
+
+    Parameters
+    ----------
+    waiting
+        Results that wait for a drawing. The list is changed.
+    new
+        The new result.
+    """
+    waiting.append(new)
+
+
+def keep_newest(waiting: list[TimedResult], new: TimedResult) -> None:
+    """Keep only the new result. The parameters are those of ``keep_all``."""
+    waiting[:] = [new]
+
+
+def keep_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
+    """Replace the previous result by the new one if it is too close to the result before it.
+
+    The values that an estimate has for every sample are kept. The parameters are those of ``keep_all``.
+    """
+    if len(waiting) > 1 and new[0] - waiting[-2][0] < POINT_INTERVAL_S:
+        _, previous = waiting.pop()
+        if isinstance(previous, Estimate):
+            unix_s, estimate = new
+            histories = [one for one in (previous.history, estimate.history) if one is not None]
+            new = unix_s, replace(estimate, history=concatenate_histories(histories))
+    waiting.append(new)
+
+
+@dataclass(frozen=True, slots=True)
+class Drawing:
+    """Drawing of a kind of result in the viewer."""
+
+    panel: str
+    """Class in ``monitor.publishing.rerun.panels``."""
+    merge: Merge = keep_all
+    period_s: float = 0.0
+    """Shortest interval between two drawings of a device [s]."""
+    shares_rate: bool = False
+    """True if the devices share a limited rate of drawings; the period of each device then grows with their number."""
+
+
+@dataclass(frozen=True, slots=True)
+class ResultKind:
+    """Row of the table."""
+
+    result: type
+    """Class of the results."""
+    messages: tuple[type[Message], ...] = ()
+    drawings: tuple[Drawing, ...] = ()
+    size_bytes: Callable[[Any], int] = lambda _result: SMALL_RESULT_BYTES
+    """Approximate size of a result, for the limit of the viewer's queue."""
+
+
+RESULT_KINDS: Final = (
+    ResultKind(
+        SampleRows,
+        drawings=(Drawing("SamplesPanel"),),
+        size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes + one.temperature_c.nbytes,
+    ),
+    ResultKind(Event, (EventMessage,), (Drawing("EventsPanel"),)),
+    ResultKind(Health, (StatusMessage,), (Drawing("HealthPanel", keep_newest),)),
+    ResultKind(OverviewText, drawings=(Drawing("OverviewPanel", keep_newest),), size_bytes=lambda one: len(one.text)),
+    ResultKind(
+        CompensatedRows,
+        drawings=(Drawing("CompensatedPanel"),),
+        size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes,
+    ),
+    ResultKind(ThermalUpdate, (ThermalMessage,), (Drawing("ThermalPanel"),)),
+    ResultKind(DriftUpdate, drawings=(Drawing("DriftPanel"),)),
+    ResultKind(SlowStatistics, (TotalMessage,)),
+    ResultKind(
+        ModelGap,  # before the estimate, because the Allan plot also shows the curve of the model
+        (GapMessage,),
+        (Drawing("GapPanel", keep_spaced, period_s=1.0),),
+        size_bytes=lambda one: 6 * 4 * int(one.tau_s.nbytes),
+    ),
+    ResultKind(
+        Estimate,
+        (AllanMessage, CoefficientsMessage),
+        (
+            Drawing("AllanPanel", keep_newest, period_s=1.0, shares_rate=True),
+            Drawing("CoefficientsPanel", keep_spaced, period_s=5.0),
+        ),
+        size_bytes=lambda one: 8 * int(one.curve.avar.nbytes),
+    ),
+)
+"""All kinds of results, in the order in which the viewer draws them. Dynamic Allan deviations are drawn from the
+estimates, and the agreement with the model is a part of ``ModelGap``."""
+_BY_TYPE: Final = {kind.result: kind for kind in RESULT_KINDS}
+
+
+def kind_of(result: Any) -> ResultKind:
+    """Return the row of a result."""
+    return _BY_TYPE[type(result)]
