@@ -189,5 +189,7 @@ def test_the_first_without_an_answer_ends_it_where_the_model_was_to_be_its(tmp_p
     paths = (recorded(tmp_path / "s.csv", KNOWN, 1, 2.0), recorded(tmp_path / "t.csv", KNOWN, 1, 2.0))
     with pytest.raises(NotReady, match=r"0 can be: s: the recording has 200 samples"):
         compare_recordings(ComparisonRequest(paths, None, tmp_path / "out"))
-    with pytest.raises(NotReady, match=r"0 can be: s: the recording has 200 samples.*; t: the recording has 200 samples"):
+    with pytest.raises(
+        NotReady, match=r"0 can be: s: the recording has 200 samples.*; t: the recording has 200 samples"
+    ):
         compare_recordings(ComparisonRequest(paths, KNOWN, tmp_path / "out"))
