@@ -103,7 +103,7 @@ def test_the_terminal_tells_the_same(compared: tuple[Path, str]) -> None:
     said = " ".join(compared[1].split())
     assert "explained 3 recordings were compared with the model. Common to all: sinusoidal (gz)." in said
     assert "added bias step" in said
-    assert "not in run3: may differ: what happens once need not happen in another recording" in said
+    assert "not in run3: may differ: an effect that happens once need not happen in another recording" in said
 
 
 @pytest.mark.long
@@ -187,7 +187,9 @@ def test_one_recording_is_reported_as_before(tmp_path: Path) -> None:
 
 def test_the_first_without_an_answer_ends_it_where_the_model_was_to_be_its(tmp_path: Path) -> None:
     paths = (recorded(tmp_path / "s.csv", KNOWN, 1, 2.0), recorded(tmp_path / "t.csv", KNOWN, 1, 2.0))
-    with pytest.raises(NotReady, match=r"0 can be: s: 200 samples"):
+    with pytest.raises(NotReady, match=r"0 can be: s: the recording has 200 samples"):
         compare_recordings(ComparisonRequest(paths, None, tmp_path / "out"))
-    with pytest.raises(NotReady, match=r"0 can be: s: 200 samples.*; t: 200 samples"):
+    with pytest.raises(
+        NotReady, match=r"0 can be: s: the recording has 200 samples.*; t: the recording has 200 samples"
+    ):
         compare_recordings(ComparisonRequest(paths, KNOWN, tmp_path / "out"))

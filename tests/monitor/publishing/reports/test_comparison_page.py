@@ -57,7 +57,7 @@ def test_a_common_effect_has_every_recording_and_the_pooled_value() -> None:
 def test_a_single_effect_says_why_it_is_not_in_the_others() -> None:
     (row,) = (row for row in Text(render_page(made())).rows if "bias step" in " ".join(row))
     assert row[2] == "warm"
-    assert "cold <1>: may differ what happens once need not happen in another recording" in row[3]
+    assert "cold <1>: may differ an effect that happens once need not happen in another recording" in row[3]
     assert "c: may differ" in row[3]
 
 

@@ -89,7 +89,9 @@ def test_common_effects_say_whether_they_agree_and_single_ones_where_they_are() 
         "gz added sinusoidal: amplitude 46 ± 30 °/h, frequency 17.30000 ± 0.00071 Hz; sizes differ"
     )
     assert lines[single + 1].endswith("; in warm")
-    assert lines[single + 2] == "not in cold: may differ: what happens once need not happen in another recording"
+    assert (
+        lines[single + 2] == "not in cold: may differ: an effect that happens once need not happen in another recording"
+    )
 
 
 @pytest.mark.parametrize("width", [60, 80])
