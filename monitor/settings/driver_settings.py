@@ -124,6 +124,13 @@ def link_names() -> tuple[str, ...]:
     return tuple(sorted({*discovery.list_modules(drivers.links, "_link"), VIRTUAL}))
 
 
+def default_decoder(link: str) -> str:
+    """Return the default decoder of a link; "" if the configuration must name one."""
+    if link == VIRTUAL:
+        return VIRTUAL_DECODER
+    return str(discovery.import_module(drivers.links, link, "_link").DEFAULT_DECODER)
+
+
 def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
     """Return link and decoder of a table ``[device.driver]``.
 
@@ -153,8 +160,7 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
         link = checked.value if isinstance(checked.value, VirtualTable) else _build(module, checked)
         problems += checked.problems
         carrier = "" if module is None else getattr(link, "carrier", "") or _carrier_of(module)
-        default = VIRTUAL_DECODER if module is None else getattr(link, "default_decoder", module.DEFAULT_DECODER)
-        decoder_name = decoder_name or default
+        decoder_name = decoder_name or getattr(link, "default_decoder", default_decoder(name))
         silence_s = checked.value.silence if checked.value is not None else 0.0
     decoder = None
     if name in link_names() or decoder_name:
