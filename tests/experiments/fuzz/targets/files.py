@@ -46,7 +46,7 @@ _KEPT: Final[list[tempfile.TemporaryDirectory[str]]] = []
 def recorded(path: Path) -> None:
     """Read a recording, and look at all of it."""
     try:
-        with mock.patch.object(memory_check, "free_bytes", return_value=FREE_BYTES):
+        with mock.patch.object(memory_check, "available_bytes", return_value=FREE_BYTES):
             recording = load_samples(path, RATE_HZ)
     except (RecordingError, ConfigError) as error:
         one_line(error)
@@ -187,7 +187,7 @@ def replayed(path: Path, channel: str | None = None) -> None:
         one_line(error)
         return
     try:
-        with mock.patch.object(memory_check, "free_bytes", return_value=FREE_BYTES):
+        with mock.patch.object(memory_check, "available_bytes", return_value=FREE_BYTES):
             link.open()
         for _ in range(1000):
             for chunk in link.read(0.0) or []:
