@@ -106,52 +106,73 @@ def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, s
     n : int
         Number of rows.
     """
-    w = cut_arrays(ints, floats, missing, taus)
-    places = w.phase.size // LANES
+    # one statement, because each access to a field counts a reference
+    state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = cut_arrays(
+        ints, floats, missing, taus
+    )
+    places = phase.size // LANES
     length = places - 1 - RUN_SAMPLES
     done, end = start, start + n
     while done < end:
         run = min(RUN_SAMPLES, end - done)
-        first = w.state[NEWEST] + 1 if w.state[NEWEST] + 1 < places else 0
+        first = state[NEWEST] + 1 if state[NEWEST] + 1 < places else 0
         for row in range(done, done + run):
-            _append(w, row)
+            _append(stage[row * AXES : (row + 1) * AXES], scaling, phase, missing, state)
         done += run
-        count = w.state[TOTAL] - run  # number of samples before this run
-        whole = count - w.state[LAST_MISSING] > length
+        count = state[TOTAL] - run  # number of samples before this run
+        whole = count - state[LAST_MISSING] > length
         if run == 1 and whole and count >= length:
             for row in range(0, taus, RUN_SAMPLES):
-                _replace_terms(w, first, row, min(RUN_SAMPLES, taus - row))
+                some, lanes = slice(row, row + RUN_SAMPLES), slice(row * LANES, (row + RUN_SAMPLES) * LANES)
+                _replace_terms(first, factors[some], spans[some], phase, scratch, sums[lanes], rest[lanes])
         else:
-            _add_run(w, first, run, count, whole)
+            _add_run(first, run, count, whole, factors, spans, phase, missing, scratch, terms, sums, rest, state[WIDTH])
 
 
 @compiled
-def _add_run(w: WindowArrays, first: int, run: int, count: int, whole: bool) -> None:
+def _add_run(
+    first: int,
+    run: int,
+    count: int,
+    whole: bool,
+    factors: Ints,
+    spans: Ints,
+    phase: Ints,
+    missing: NDArray[np.int32],
+    scratch: Floats,
+    terms: Ints,
+    sums: Floats,
+    rest: Floats,
+    lanes: int,
+) -> None:
     """Update the sums of each τ by ``run`` samples whose phase begins at row ``first``.
 
-    ``count`` is the number of earlier samples. ``whole`` is True if no sample of the window is missing.
+    ``count`` is the number of earlier samples.
     """
-    places = w.phase.size // LANES
-    for i in range(w.factors.size):
-        row = max(0, 2 * w.factors[i] - 1 - count)  # first row with a complete term
+    places = phase.size // LANES
+    for i in range(factors.size):
+        row = max(0, 2 * factors[i] - 1 - count)  # first row with a complete term
+        own = slice(i * LANES, (i + 1) * LANES)
         while row < run:
             # up to the row at which a stream reaches the end of the ring or the span becomes full
             now = first + row if first + row < places else first + row - places
-            leaving = count + row >= w.spans[i]
-            end = run if leaving else min(run, w.spans[i] - count)
-            row += _slide(w, i, now, end - row, leaving, whole)
+            leaving = count + row >= spans[i]
+            end = run if leaving else min(run, spans[i] - count)
+            row += _slide(
+                now, end - row, factors[i], spans[i], leaving, whole,
+                phase, missing, scratch, terms[own], sums[own], rest[own], lanes,
+            )  # fmt: skip
 
 
 @compiled
-def _append(w: WindowArrays, row: int) -> None:
-    """Write the phase point and the running count of missing samples for one row of the input buffer."""
-    stage, scaling, phase, missing, state = w.stage, w.scaling, w.phase, w.missing, w.state
+def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.int32], state: Ints) -> None:
+    """Write one phase point and the running count of missing samples."""
     before = LANES * state[NEWEST]
     now = before + LANES if before + LANES < phase.size else 0
     state[TOTAL] += 1
     state[NEWEST] = now // LANES
-    for lane in range(AXES):
-        y = stage[row * AXES + lane] * scaling[lane] + scaling[LANES + lane]
+    for lane in range(sample.size):
+        y = sample[lane] * scaling[lane] + scaling[LANES + lane]
         if abs(y) < 4.0e18:  # false for NaN too
             step = np.rint(y)
             scaling[LANES + lane] = y - step
@@ -166,32 +187,44 @@ def _append(w: WindowArrays, row: int) -> None:
 
 
 @compiled
-def _slide(w: WindowArrays, i: int, now: int, rows: int, leaving: bool, whole: bool) -> int:
-    """Add the terms of row i that end at up to ``rows`` phase points from ``now`` on, and evict as many if ``leaving``.
+def _slide(
+    now: int,
+    rows: int,
+    m: int,
+    span: int,
+    leaving: bool,
+    whole: bool,
+    phase: Ints,
+    missing: NDArray[np.int32],
+    scratch: Floats,
+    terms: Ints,
+    sums: Floats,
+    rest: Floats,
+    lanes: int,
+) -> int:
+    """Add the terms that end at up to ``rows`` phase points from row ``now`` on, and evict as many if ``leaving``.
 
-    Return the number of points processed. It is smaller than ``rows`` if a stream reaches the end of the ring.
+    Return the number of rows processed. It is smaller than ``rows`` if a stream reaches the end of the ring.
     """
-    m, places = w.factors[i], w.phase.size // LANES
-    own = slice(i * LANES, (i + 1) * LANES)
-    terms, sums, rest = w.terms[own], w.sums[own], w.rest[own]
-    old = now - w.spans[i] - 1
+    places = phase.size // LANES
+    old = now - span - 1
     new1, new2 = place(now - m, places), place(now - 2 * m, places)
     old0, old1, old2 = place(old + 2 * m, places), place(old + m, places), place(old, places)
     run = min(rows, places - max(now, new1, new2, old0, old1, old2))
     n = run * LANES
-    added, evicted = w.scratch[: RUN_SAMPLES * LANES], w.scratch[RUN_SAMPLES * LANES :]
-    _square(w.phase, now, new1, new2, n, added)
+    added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
+    _square(phase, now, new1, new2, n, added)
     if leaving:
-        _square(w.phase, old0, old1, old2, n, evicted)
+        _square(phase, old0, old1, old2, n, evicted)
     else:
         evicted[:n] = 0.0
     if not whole:
-        _remove_incomplete(w.missing, now, new2, 1, n, added, terms)
+        _remove_incomplete(missing, now, new2, 1, n, added, terms)
         if leaving:
-            _remove_incomplete(w.missing, old0, old2, -1, n, evicted, terms)
+            _remove_incomplete(missing, old0, old2, -1, n, evicted, terms)
     elif not leaving:
         terms += run
-    _exchange(added, evicted, n, sums, rest, w.state[WIDTH])
+    _exchange(added, evicted, n, sums, rest, lanes)
     return run
 
 
@@ -250,17 +283,19 @@ def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats
 
 
 @compiled
-def _replace_terms(w: WindowArrays, now: int, begin: int, taus: int) -> None:
-    """Update ``taus`` rows from row ``begin`` at once for a single sample of a full window without gaps.
+def _replace_terms(
+    now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, sums: Floats, rest: Floats
+) -> None:
+    """Update all τ at once for a single sample of a full window without gaps.
 
     Setting up a vector loop for each τ would cost more than the work itself. The differences are therefore collected
     one by one, and a single loop updates all sums.
     """
-    phase, factors, spans, places = w.phase, w.factors, w.spans, w.phase.size // LANES
-    added, evicted = w.scratch[: RUN_SAMPLES * LANES], w.scratch[RUN_SAMPLES * LANES :]
+    places = phase.size // LANES
+    added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
     at0 = np.uintp(now * LANES)
-    for i in range(taus):
-        m, old = factors[begin + i], now - spans[begin + i] - 1
+    for i in range(factors.size):
+        m, old = factors[i], now - spans[i] - 1
         at1, at2 = np.uintp(place(now - m, places) * LANES), np.uintp(place(now - 2 * m, places) * LANES)
         old0, old1 = np.uintp(place(old + 2 * m, places) * LANES), np.uintp(place(old + m, places) * LANES)
         old2 = np.uintp(place(old, places) * LANES)
@@ -270,8 +305,8 @@ def _replace_terms(w: WindowArrays, now: int, begin: int, taus: int) -> None:
             e = float(phase[old0 + lane] - 2 * phase[old1 + lane] + phase[old2 + lane])
             added[out + lane] = d * d
             evicted[out + lane] = e * e
-    n = taus * LANES
-    _exchange(added, evicted, n, w.sums[begin * LANES :], w.rest[begin * LANES :], n)
+    n = factors.size * LANES
+    _exchange(added, evicted, n, sums, rest, n)
 
 
 @compiled
@@ -318,27 +353,31 @@ def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
 
 
 @inlined
-def _reference_level(w: WindowArrays, n: int, axis: int) -> int:
+def _reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> int:
     """Return the mean of the newest samples of an axis in integer units, or ``NEVER`` if all of them are missing.
 
     The level is close enough to the mean of the axis for differences to fit 64 bits.
     """
-    phase, missing, newest = w.phase, w.missing, w.state[NEWEST]
-    last, first = newest * LANES + axis, place(newest - min(n, LEVEL), phase.size // LANES) * LANES + axis
+    places = phase.size // LANES
+    last, first = newest * LANES + axis, place(newest - min(n, LEVEL), places) * LANES + axis
     present = min(n, LEVEL) - (missing[last] - missing[first])
     return (phase[last] - phase[first]) // present if present > 0 else NEVER
 
 
 @inlined
-def slope_of_thirds(w: WindowArrays, n: int, axis: int) -> float:
+def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
     """Return the slope of the last n samples from the means of the first and the last third.
 
     Parameters
     ----------
-    w : WindowArrays
-        Arrays of the window.
+    phase : ndarray of int64, shape (places · LANES,)
+        Integer phase.
+    missing : ndarray of int32, shape (places · LANES,)
+        Running count of missing samples.
+    newest : int
+        Row of the newest phase point.
     n : int
-        Number of newest samples in use.
+        Number of samples in use.
     axis : int
         Index of the axis.
 
@@ -347,9 +386,8 @@ def slope_of_thirds(w: WindowArrays, n: int, axis: int) -> float:
     float
         Slope in integer units per sample; NaN if too many samples are missing.
     """
-    phase, missing, newest = w.phase, w.missing, w.state[NEWEST]
     third, places = n // 3, phase.size // LANES
-    middle = _reference_level(w, n, axis)
+    middle = _reference_level(phase, missing, newest, n, axis)
     if third == 0 or middle == NEVER:
         return np.nan
     at0, at1 = newest * LANES + axis, place(newest - third, places) * LANES + axis
@@ -385,23 +423,28 @@ def slopes_of_axes(
     """
     w = cut_arrays(ints, floats, missing, taus)
     for axis in range(AXES):
-        slope[axis] = slope_of_thirds(w, lengths[axis], axis)
+        n, newest = lengths[axis], w.state[NEWEST]
+        slope[axis] = slope_of_thirds(w.phase, w.missing, newest, n, axis)
         for i in range(w.factors.size):
-            slopes[i, axis] = mean_second_difference(w, lengths[axis], w.factors[i], axis)
+            slopes[i, axis] = mean_second_difference(w.phase, w.missing, newest, n, w.factors[i], axis)
 
 
 @compiled
-def mean_second_difference(w: WindowArrays, n: int, m: int, axis: int) -> float:
+def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, m: int, axis: int) -> float:
     """Return the mean second difference of phase over clusters of m samples, divided by m².
 
     The sum of all second differences telescopes to four blocks of m points at the ends. Only ``BEND_POINTS`` points of
-    a long block are used, because phase is smooth enough for these points to represent the block. Missing samples are
-    replaced by the reference level.
+    a long block are used, because phase is smooth enough for them to represent the block. A missing sample counts as
+    one of the level.
 
     Parameters
     ----------
-    w : WindowArrays
-        Arrays of the window.
+    phase : ndarray of int64, shape (places · LANES,)
+        Integer phase.
+    missing : ndarray of int32, shape (places · LANES,)
+        Running count of missing samples.
+    newest : int
+        Row of the newest phase point.
     n : int
         Number of newest samples in use.
     m : int
@@ -414,10 +457,9 @@ def mean_second_difference(w: WindowArrays, n: int, m: int, axis: int) -> float:
     float
         Slope of the rate in integer units per sample; NaN if too many samples are missing.
     """
-    phase, missing, newest = w.phase, w.missing, w.state[NEWEST]
     places = phase.size // LANES
     last, first = newest * LANES + axis, place(newest - n, places) * LANES + axis
-    middle = _reference_level(w, n, axis)
+    middle = _reference_level(phase, missing, newest, n, axis)
     if n < 2 * m or middle == NEVER or n - (missing[last] - missing[first]) < MIN_PRESENT_SHARE * n:
         return np.nan
     stride = max(1, m // BEND_POINTS)

@@ -33,6 +33,7 @@ from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.allan.window_kernel import (
     AXES,
     LANES,
+    NEWEST,
     STAGE_SAMPLES,
     TOTAL,
     WindowArrays,
@@ -198,46 +199,41 @@ def _follow(
     axes as a bit set.
     """
     w = cut_arrays(buffers.ints, buffers.floats, buffers.missing, buffers.taus)
-    curves, output, m = state.curves, state.output, state.curves.avar.shape[1]
-    theta, status, slope = output.theta, output.status, curves.slope
-    right, valid = np.empty((AXES, 5)), np.empty(AXES, np.bool_)
-    scale = CurveScale(np.empty((AXES, m)), np.empty((AXES, m)))
+    curves, output, gains, ages = state
+    ints, floats, missing, taus, window = buffers
+    # local names, because each access to a field in a loop counts a reference
+    counters, phase, scaling, terms, slope = w.state, w.phase, w.scaling, curves.terms, curves.slope
+    used, free, misfit, theta, status = gains.used, gains.free, output.misfit, output.theta, output.status
+    right, valid, m = np.empty((AXES, 5)), np.empty(AXES, np.bool_), terms.shape[1]
+    unit, inverse = np.empty((AXES, m)), np.empty((AXES, m))
     for axis in range(AXES):
         for i in range(m):
-            scale.unit[axis, i] = 2.0 * (w.factors[i] * w.scaling[axis]) ** 2
-            scale.inverse[axis, i] = 1.0 / (scale.unit[axis, i] * curves.terms[axis, i])
+            unit[axis, i] = 2.0 * (w.factors[i] * scaling[axis]) ** 2
+            inverse[axis, i] = 1.0 / (unit[axis, i] * terms[axis, i])
+    scale = CurveScale(unit, inverse)
     for row in range(start, end):
         due = 0
-        advance(buffers.ints, buffers.floats, buffers.missing, buffers.taus, row, 1)
-        filled = min(w.state[TOTAL], buffers.length)
+        advance(ints, floats, missing, taus, row, 1)
+        filled = min(counters[TOTAL], window)
         for axis in range(AXES):
             lengths[axis] = min(lengths[axis] + 1, filled)
-            slope[axis] = slope_of_thirds(w, lengths[axis], axis) / w.scaling[axis]
-        _project(w, scale, curves, state.gains, right)
-        _apply_gains(right, slope, state.gains, output, valid)
+            slope[axis] = slope_of_thirds(phase, missing, counters[NEWEST], lengths[axis], axis) / scaling[axis]
+        _project(w, scale, curves, gains, right)
+        _apply_gains(right, slope, gains, output, valid)
         for axis in range(AXES):
-            if _is_due(axis, state, valid[axis], lengths[axis]):
+            ages[axis] += 1
+            solved = used[axis, 1] > used[axis, 0]
+            patience = REFRESH if solved and not free[axis] and misfit[axis] == 1.0 else PATIENCE
+            if (solved and not valid[axis]) or ages[axis] * patience > lengths[axis]:
                 _copy_curve(w, scale, curves, axis, lengths[axis])
                 due |= 1 << axis
+                ages[axis] = 0
             for a in range(5):
                 estimated = status[axis, a] == 2
                 coefficients[row, a, axis] = np.sqrt(max(theta[axis, a], 0.0)) * to_si[a] if estimated else np.nan
         if due > 0:
             return row + 1, due
     return end, 0
-
-
-@inlined
-def _is_due(axis: int, state: RefitState, valid: bool, length: int) -> bool:
-    """Return True if an axis must be fitted because its gains are no longer valid or too old."""
-    gains = state.gains
-    solved = gains.used[axis, 1] > gains.used[axis, 0]
-    explained = solved and not gains.free[axis] and state.output.misfit[axis] == 1.0
-    state.ages[axis] += 1
-    due = (solved and not valid) or state.ages[axis] * (REFRESH if explained else PATIENCE) > length
-    if due:
-        state.ages[axis] = 0
-    return bool(due)
 
 
 @compiled
@@ -250,7 +246,8 @@ def _copy_curve(w: WindowArrays, scale: CurveScale, curves: AxisCurves, axis: in
         scale.inverse[axis, i] = 1.0 / (scale.unit[axis, i] * count)
         # as in AllanWindow.avar, a constant axis has no noise
         curves.avar[axis, i] = total * scale.inverse[axis, i] if total > count else 0.0
-        curves.slopes[axis, i] = mean_second_difference(w, length, w.factors[i], axis) / w.scaling[axis]
+        bend = mean_second_difference(w.phase, w.missing, w.state[NEWEST], length, w.factors[i], axis)
+        curves.slopes[axis, i] = bend / w.scaling[axis]
 
 
 @inlined

@@ -138,6 +138,6 @@ def test_a_term_on_the_verge_costs_no_fit_at_every_sample():
     for i in range(2 * length, len(values)):
         estimator.update(make_block(np.array([i]), values[i : i + 1]))
         anew += refit._ages == 0
-        verge += int((refit._answer.status[:, 3] == 1).sum())
+        verge += int((refit._state.output.status[:, 3] == 1).sum())
     assert verge > 1000
     assert anew.max() < 20
