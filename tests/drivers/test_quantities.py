@@ -4,6 +4,7 @@ import math
 from typing import Annotated
 
 import pytest
+from pydantic import Field
 
 from drivers import quantities
 from drivers.errors import ConfigError
@@ -20,7 +21,7 @@ class Inner(SettingsModel):
 class Outer(SettingsModel):
     rate: Annotated[float, RATE_HZ] | None = None
     tau: ListOf[Annotated[float, RATE_HZ]] = ()
-    signals: dict[str, Inner] = {}
+    signals: dict[str, Inner] = Field({})
     seed: Annotated[int, SEED] = 1
 
 
