@@ -5,6 +5,7 @@ without a default, or with a default that turns a function off, also has an exam
 of a table at once. Each mistake is described in plain words, without names of Python types.
 """
 
+import contextlib
 import copy
 import os
 import re
@@ -250,15 +251,16 @@ def _add_conflicts(checked: CheckedTable[Any], value: object, place: str) -> Non
 def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
     """Replace a wrong or missing value so that the rest of the table can be checked."""
     *path, last = [part for part in error["loc"] if part != "[key]"]
-    for part in path:
-        table = table[part]
     found = _field_at(kind, error["loc"])[1]
-    if error["type"] == "model_type":
-        table[last] = {}
-    elif error["type"] == "missing" and found is not None and found.examples:
-        table[last] = found.examples[0]
-    elif error["type"] != "missing":
-        del table[last]
+    with contextlib.suppress(LookupError):  # the repair of another error at this place has removed the value
+        for part in path:
+            table = table[part]
+        if error["type"] == "model_type":
+            table[last] = {}
+        elif error["type"] == "missing" and found is not None and found.examples:
+            table[last] = found.examples[0]
+        elif error["type"] != "missing":
+            del table[last]
 
 
 def _field_at(kind: type[SettingsModel], place: Sequence[str | int]) -> tuple[type[SettingsModel], FieldInfo | None]:

@@ -21,7 +21,7 @@ class Inner(SettingsModel):
 class Outer(SettingsModel):
     rate: Annotated[float, RATE_HZ] | None = None
     tau: ListOf[Annotated[float, RATE_HZ]] = ()
-    signals: dict[str, Inner] = Field(default_factory=dict)
+    signals: dict[str, Inner] = Field({})
     seed: Annotated[int, SEED] = 1
 
 

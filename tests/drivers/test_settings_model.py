@@ -86,6 +86,12 @@ def test_no_mistake_hides_another() -> None:
     ]
 
 
+def test_a_wrong_key_with_a_wrong_value_is_two_mistakes_at_one_place() -> None:
+    found = lines({"scale": {"gw": "x", "gx": "y"}, "low": 5.0})
+    assert found[0] == 'scale.gw: "gw"; possible are gx, gy'
+    assert [line.partition(": ")[0] for line in found] == ["scale.gw", "scale.gw", "scale.gx", "low"]
+
+
 def test_a_conflict_with_a_wrong_value_is_not_reported() -> None:
     assert lines({"low": 5.0, "high": "x"}) == ['high: expected a number, got "x"']
 
