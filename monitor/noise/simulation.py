@@ -248,7 +248,7 @@ class _AxisSimulator:
         return self.leaks_out or bool(self.leaks)
 
     def insert(self, place: int, running: RunningTransform) -> None:
-        """Insert a transform after the others at its position in ORDER."""
+        """Insert a transform after the others at its position in TRANSFORM_ORDER."""
         if self.leaks:
             self._alone.append((place, copy.deepcopy(running)))
             self._alone.sort(key=lambda one: one[0])

@@ -30,7 +30,7 @@ def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_a
     sensor : str, optional
         Model of the catalogue, or path of a model file. The default is the model of the shipped configuration.
     effects : sequence of str, optional
-        Effects in the syntax of ``effects_of``.
+        Effects in the syntax of ``parse_effects``.
     effect_at_s : float, optional
         Time at which the effects begin, in seconds since the start.
 

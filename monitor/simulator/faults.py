@@ -58,7 +58,7 @@ class FaultCounts:
 
         Parameters
         ----------
-        kind : Kind
+        kind : FaultKind
             Fault of the sample.
         out : bool
             True if all chunks that were to be sent have been sent.
@@ -81,7 +81,7 @@ class FaultCounts:
 class DrawnFaults:
     """Random faults of consecutive samples."""
 
-    kind: NDArray[np.int64]  # [n] of Kind
+    kind: NDArray[np.int64]  # [n] of FaultKind
     where: Floats  # [n] position of the fault in the frame, 0 to 1
     pulled: NDArray[np.bool_]  # [n] True if the cable is pulled before this sample
 
@@ -131,7 +131,7 @@ class Faults:
 
         Parameters
         ----------
-        kind : Kind
+        kind : FaultKind
             Fault of the sample.
         where : float
             Position of the fault in the chunk, 0 to 1.

@@ -47,7 +47,7 @@ HISTORY_INTERVALS: Final = 2048
 """Intervals that are kept to identify a model."""
 MIN_IDENTIFICATION_INTERVALS: Final = 60
 """Intervals at rest before a first model is identified. The next identification follows after half as many more, and
-after at most REMEMBERED more."""
+after at most HISTORY_INTERVALS more."""
 MAX_REST_RMS: Final = (0.02,) * 3 + (0.3,) * 3
 """Largest rms of a block at rest about its mean, in rad/s and m/s².
 
@@ -60,7 +60,8 @@ MAX_GAP_INTERVALS: Final = 100_000
 """Largest number of intervals predicted across a gap. After a longer gap, the prediction holds no information."""
 
 BLOCK_NUMBER, COUNT, ORIGIN, SUM, SQUARES = range(5)
-"""Columns of ``State.waiting``: number of the block, number of samples, origin of the sums, sum and sum of squares."""
+"""Columns of ``CompensatorState.waiting``: number of the block, number of samples, origin of the sums, sum, and sum of
+squares."""
 MEAN, EXPECTED, INNOVATION_STD, OUTCOME, EXPECTED_ERROR, SCATTER = range(6)
 """Columns of the result of an interval.
 
@@ -81,15 +82,15 @@ class CompensatorState(NamedTuple):
     bank: Floats  # [3, filters + 1, 5] columns as in ``motion_filter_bank``
     ages: Ints  # [3, filters, 2] columns as in ``motion_filter_bank``
     feedback: Floats  # [3, 1] difference of input and output that is still to be fed back
-    waiting: Floats  # [SLOTS, 6, 5] sums of the blocks that wait for a rest decision
-    sums: Floats  # [SLOTS, 3, filters + 1, 2] sums of ``follow`` for each of these blocks
+    waiting: Floats  # [MAX_PENDING_BLOCKS, 6, 5] sums of the blocks that wait for a rest decision
+    sums: Floats  # [MAX_PENDING_BLOCKS, 3, filters + 1, 2] sums of ``filter_sample`` for each of these blocks
     means: Floats  # [3, BLOCKS_PER_INTERVAL] rad/s, means of the blocks of the interval; NaN = not at rest
-    followed: Floats  # [3, filters + 1, 2] sums of ``follow`` over the blocks at rest
+    followed: Floats  # [3, filters + 1, 2] sums of ``filter_sample`` over the blocks at rest
     samples: Floats  # [3] number of samples in these blocks
     table: Floats  # [rows, 2] gains of all filters
     first: Ints  # [filters + 1] first row of each filter in the table
-    decisions: Ints  # [2, SLOTS] scratch: block numbers, and 1 if the block is in motion
-    episodes: Floats  # [SLOTS, 5] scratch, not used
+    decisions: Ints  # [2, MAX_PENDING_BLOCKS] scratch: block numbers, and 1 if the block is in motion
+    episodes: Floats  # [MAX_PENDING_BLOCKS, 5] scratch, not used
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +101,7 @@ class DriftInterval:
     mean: Floats  # [3] measured at rest; NaN = in motion
     expected: Floats  # [3] predicted drift; NaN = not known yet
     error: Floats  # [3] predicted standard deviation of ``mean - expected``
-    outcome: Ints  # [3] NOT_SEEN, USED, LEFT_OUT or STEPPED of ``sage_husa``
+    outcome: Ints  # [3] NOT_AT_REST, USED, REJECTED or STEPPED of ``sage_husa``
     known: Floats  # [3] standard error of ``expected``
 
     @property
@@ -244,7 +245,7 @@ class Compensator:
         ----------
         axis : int
             Index of the gyro axis, 0 to 2.
-        model : Arma or None
+        model : ArmaModel or None
             The identified model. None means that no model was found, so the identification is repeated later.
         """
         self._next_identification[axis] = self._at_rest[axis] + min(
@@ -485,7 +486,7 @@ def _interval_mean(means: Floats) -> tuple[int, float, float]:
 
 @compiled
 def _min_variance(blocks: Floats, axis: int) -> float:
-    """Return the variance of an interval mean that rounding may hide; ``blocks`` is ``motion_kernel.State.open``."""
+    """Return the variance of an interval mean that rounding may hide, from ``MotionState.open``."""
     return float(blocks[axis, motion_kernel.STEP] ** 2 / 12.0 / BLOCKS_PER_INTERVAL + motion_kernel.MIN_VARIANCE)
 
 

@@ -13,7 +13,8 @@ INTERVALS: Final = 64
 FALSE_ALARM_PROBABILITY: Final = 1e-8
 """Probability that noise alone exceeds the limit in one evaluation. Successive evaluations overlap."""
 LIMIT: Final = 2.327393746165351
-"""Quantile of χ² with INTERVALS degrees of freedom that is exceeded with probability CHANCE, divided by INTERVALS."""
+"""Quantile of χ² with INTERVALS degrees of freedom divided by INTERVALS. Noise exceeds the quantile with
+FALSE_ALARM_PROBABILITY."""
 RESET_LIMIT: Final = 1.3
 """Mean square below which the model fits again."""
 

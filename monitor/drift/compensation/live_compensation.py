@@ -1,8 +1,8 @@
 """Live drift compensation of one device: the samples of a stream without the drift of their gyros.
 
 Each interval produces a ``DriftUpdate``. An event reports a model that no longer fits, or a step of the bias. The
-caller identifies the models beside the stream, because an identification takes some 50 ms. The property ``due`` of the
-compensator names the axes, and ``adopt`` takes the identified models.
+caller identifies the models beside the stream, because an identification takes some 50 ms. The property ``axes_due`` of
+the compensator names the axes, and ``set_model`` takes an identified model.
 """
 
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ class LiveCompensation:
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
         self._events: list[Event] = []
-        self._looks: list[DriftUpdate] = []
+        self._updates: list[DriftUpdate] = []
         self._reset()
 
     def update(self, samples: SampleBlock) -> SampleBlock:
@@ -61,8 +61,8 @@ class LiveCompensation:
 
     def take(self) -> list[DriftUpdate]:
         """Return the results of the intervals that have ended since the last call."""
-        looks, self._looks = self._looks, []
-        return looks
+        updates, self._updates = self._updates, []
+        return updates
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call: steps of the bias, and models that no longer fit."""
@@ -76,7 +76,7 @@ class LiveCompensation:
         ----------
         axis : int
             Index of the gyro axis, 0 to 2.
-        model : Arma or None
+        model : ArmaModel or None
             The identified model. None means that no model was found.
         """
         self.compensator.set_model(axis, model)
@@ -86,8 +86,8 @@ class LiveCompensation:
     def set_rate(self, rate_hz: float) -> None:
         """Set a better estimate of the sample rate in Hz.
 
-        If the rate differs by more than OTHER_RATE, the compensation starts anew, because its intervals had another
-        length.
+        If the rate differs by more than MAX_RATE_CHANGE, the compensation starts anew, because the intervals had
+        another length.
         """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._rate_hz = rate_hz
@@ -101,7 +101,7 @@ class LiveCompensation:
     def _publish(self, interval: DriftInterval, t_ns: int) -> None:
         """Append the result of an interval and its events."""
         used = interval.outcome == USED
-        self._looks.append(
+        self._updates.append(
             DriftUpdate(
                 t_ns,
                 self.compensator.interval_s,

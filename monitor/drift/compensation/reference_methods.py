@@ -48,7 +48,7 @@ def apply_reference_method(x: Floats, learned: Floats, variant: ReferenceMethod)
     learned : ndarray, shape (m,)
         Rate at rest in rad/s, in the order of time.
     variant : callable
-        One of the VARIANTS.
+        One of the REFERENCE_METHODS.
 
     Returns
     -------

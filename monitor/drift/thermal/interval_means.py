@@ -63,7 +63,7 @@ def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float
 
 
 def _row_means(rows: Floats) -> tuple[Floats, Floats]:
-    """Return the mean [n] and the standard error [n] of each row [n, length]; NaN if fewer than MOSTLY are known."""
+    """Return mean and standard error [n] of each row [n, length]; NaN if fewer than MIN_KNOWN_SHARE are known."""
     known_samples = np.isfinite(rows)
     count = known_samples.sum(axis=1)
     too_few = count < max(MIN_KNOWN_SHARE * rows.shape[1], 1.0)

@@ -43,7 +43,7 @@ class LiveThermal:
     rate_hz : float
         Sample rate in Hz.
     interval_s : float
-        Length of an interval in seconds. An interval has at least PARTS samples.
+        Length of an interval in seconds. An interval has at least PARTS_PER_INTERVAL samples.
     """
 
     def __init__(self, rate_hz: float, interval_s: float) -> None:
@@ -63,8 +63,8 @@ class LiveThermal:
             return []
         self._sample_count += lost + len(samples)
         over = self._means.update(samples.values, samples.temperature_c, lost)
-        looks = [self._process_interval(one, int(samples.t_ns[-1])) for one in over]
-        return [look for look in looks if np.isfinite(look.temperature_c) and look.axes]
+        updates = [self._process_interval(one, int(samples.t_ns[-1])) for one in over]
+        return [update for update in updates if np.isfinite(update.temperature_c) and update.axes]
 
     @property
     def choosing(self) -> bool:
@@ -93,7 +93,8 @@ class LiveThermal:
     def set_rate(self, rate_hz: float) -> None:
         """Set a better estimate of the sample rate in Hz.
 
-        If the rate differs by more than OTHER_RATE, the models start anew, because the intervals had another length.
+        If the rate differs by more than MAX_RATE_CHANGE, the models start anew, because the intervals had
+        another length.
         """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._rate_hz = rate_hz

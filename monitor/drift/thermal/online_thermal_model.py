@@ -2,8 +2,8 @@
 
 The model of the earlier intervals predicts each interval, multi-step and one-step. Only then is the interval used, and
 ``RecursiveThermalFit`` updates the coefficients. Form and time constants are chosen again when the number of known
-intervals has grown by the factor GROWN. A choice takes up to a second. ``step`` therefore does one piece of it at a
-time, on the intervals that were known at its start.
+intervals has grown by the factor REFIT_GROWTH. A choice takes up to a second. ``step`` therefore does
+one piece of the choice at a time, on the intervals that were known at the start.
 
 Intervals that stay outside their prediction are a suspected change (``residual_alarm``). Until it is resolved, no
 routine choice is started, because a new form could fit the change and hide it. Intervals far outside their prediction

@@ -50,7 +50,7 @@ class RecursiveThermalFit:
     ----------
     model : ThermalModel
         Model with the form, the time constants, φ and the reference to use. Its coefficients are computed again.
-    means : Means
+    means : IntervalMeans
         The intervals so far, from the first one that the model is to use.
     """
 

@@ -1,9 +1,9 @@
 """Alarm for a bias that leaves its prediction from temperature more often than by chance, for one axis.
 
 Every interval is predicted one step ahead before it is used for the fit. If the model is true, one in forty intervals
-lies above its 95 % prediction interval and one in forty below, independently. If OUTSIDE of the last OF known intervals
-lie outside on the same side, a change is suspected. ``online_thermal_model`` resolves the suspicion. docs/thermal.md
-has the measured rate of false alarms.
+lies above its 95 % prediction interval and one in forty below, independently. If MIN_OUTSIDE of the last
+WINDOW_INTERVALS known intervals lie outside on the same side, a change is suspected. ``online_thermal_model`` resolves
+the suspicion. docs/thermal.md has the measured rate of false alarms.
 """
 
 from collections import deque
@@ -17,9 +17,9 @@ from monitor.common.distributions import Z95
 from monitor.drift.thermal.recursive_least_squares import PredictionInterval
 
 MIN_OUTSIDE: Final = 4
-"""Intervals outside their prediction on one side that raise a suspicion, and the number of intervals that are
-considered."""
+"""Number of intervals outside their prediction on one side that raises a suspicion."""
 WINDOW_INTERVALS: Final = 6
+"""Number of known intervals that are considered."""
 FAR_HALF_WIDTHS: Final = 2.0
 """Distance from the prediction, in half widths of its interval, above which an interval is not used for the fit until
 others confirm it."""
@@ -75,7 +75,7 @@ class ResidualAlarm:
         ----------
         bias : float
             Measured mean in rad/s or m/s²; NaN = not measured.
-        multi_step, one_step : Band
+        multi_step, one_step : PredictionInterval
             Predictions of the interval.
         """
         self._interval_count += 1

@@ -36,7 +36,7 @@ class RunningIntervalMeans:
     Parameters
     ----------
     length : int
-        Samples per interval, at least PARTS.
+        Samples per interval, at least PARTS_PER_INTERVAL.
     longest : int
         Largest number of empty intervals that are returned for one gap. More would hold no information.
 

@@ -148,7 +148,7 @@ def find_dependence(means: IntervalMeans) -> TemperatureDependence | None:
 
     Parameters
     ----------
-    means : Means
+    means : IntervalMeans
         Interval means of bias (rad/s or m/s²) and temperature (°C). Temperature must vary.
 
     Returns
@@ -188,7 +188,7 @@ def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
 
     Parameters
     ----------
-    means : Means
+    means : IntervalMeans
         Interval means of bias (rad/s or m/s²) and temperature (°C). Temperature must vary.
 
     Returns

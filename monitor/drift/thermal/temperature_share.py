@@ -55,7 +55,7 @@ class TemperatureShare:
         Parameters
         ----------
         letter : str
-            Letter of the coefficient, one of LETTERS.
+            Letter of the coefficient, one of SYMBOLS.
         axis : str
             Name of the axis.
 
@@ -77,7 +77,7 @@ class TemperatureShare:
         Parameters
         ----------
         letter : str
-            Letter of the coefficient, one of LETTERS.
+            Letter of the coefficient, one of SYMBOLS.
         axis : str
             Name of the axis.
         """

@@ -139,7 +139,7 @@ def fit_in_steps(means: IntervalMeans, since: int | None = None, lags: bool = Fa
 
     Parameters
     ----------
-    means : Means
+    means : IntervalMeans
         Interval means of bias (rad/s or m/s²) and temperature (°C).
     since : int or None
         Index of the interval from which the bias may have another offset. The step is one more coefficient.

@@ -35,7 +35,7 @@ class ThermalModel:
     initial_state: Floats  # [k] initial state of each lag at the start of the fit, rad/s (m/s²)
     phi: float  # correlation of the residuals of successive intervals
     sigma: float  # rad/s (m/s²), standard deviation of the one-step residuals
-    covariance: Floats  # covariance of sizes, start and logarithms of the time constants
+    covariance: Floats  # covariance of coefficients, initial state and logarithms of the time constants
     lowest_c: float  # °C, lowest temperature of the fit
     highest_c: float  # °C, highest temperature of the fit
 
@@ -129,7 +129,7 @@ def predict_with_variance(
     excess : ndarray, shape (n,)
         T − reference, °C.
     columns : ndarray, shape (n, terms + k)
-        Regressors of ``responses``.
+        Regressors of ``regressors``.
     sizes : ndarray, shape (terms + k,)
         Coefficients of the columns.
     bends : ndarray, shape (n, k)
@@ -200,7 +200,7 @@ def regressor_derivatives(shape: ThermalModelForm, excess: Floats, interval_s: f
 
     Parameters
     ----------
-    shape : Shape
+    shape : ThermalModelForm
         Form of the model.
     excess : ndarray, shape (n,)
         T − reference, °C.
@@ -221,7 +221,7 @@ def combine_derivatives(shape: ThermalModelForm, of_each: Floats, sizes: Floats)
 
     Parameters
     ----------
-    shape : Shape
+    shape : ThermalModelForm
         Form of the model.
     of_each : ndarray, shape (n, 2 k)
         Derivatives of the columns, from ``regressor_derivatives``.

@@ -52,7 +52,7 @@ def lag_roots(shape: ThermalModelForm, interval_s: float) -> Floats:
 
     Parameters
     ----------
-    shape : Shape
+    shape : ThermalModelForm
         Form of the model.
     interval_s : float
         Length of an interval, s.
@@ -71,7 +71,7 @@ def regressors(
 
     Parameters
     ----------
-    shape : Shape
+    shape : ThermalModelForm
         Form of the model.
     excess_c : ndarray, shape (n,)
         T − reference, °C, without gaps.
@@ -160,7 +160,7 @@ def difference_equation(shape: ThermalModelForm, sizes: Floats, interval_s: floa
 
     Parameters
     ----------
-    shape : Shape
+    shape : ThermalModelForm
         Form of the model.
     sizes : ndarray, shape (terms,)
         Coefficients of constant, powers and lags.

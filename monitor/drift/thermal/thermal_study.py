@@ -83,7 +83,7 @@ def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ModelCompar
     ----------
     model : ThermalModel
         Fitted model.
-    means : Means
+    means : IntervalMeans
         Interval means of bias (rad/s or m/s²) and temperature (°C).
     """
     multi, known = predict(model, means.temperature_c), means.known
