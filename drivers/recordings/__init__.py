@@ -263,6 +263,8 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
     notes: list[str] = []
     free = memory_check.available_bytes()
     rows = size_bytes = 0
+    if last_s is None:
+        _check_folder(path, segments, free)
     for segment in reversed(segments):
         try:
             part = _load_file(segment, rate_hz)
@@ -278,6 +280,19 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
     if not parts:
         raise RecordingError(f"{path}: none of {len(segments)} segments can be read; {notes[-1]}")
     return _concatenate(path, parts[::-1], notes[::-1])
+
+
+def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> None:
+    """Raise an error if the rows of all segments exceed the limits. Unreadable segments do not count."""
+    rows = size_bytes = 0
+    for segment in segments:
+        try:
+            check_regular(segment)
+            rows += format_for_path(segment).count_rows(segment) if segment.stat().st_size else 0
+        except (RecordingError, OSError):
+            continue  # left out, with a note, when the segment is read
+        size_bytes += segment.stat().st_size
+        memory_check.ReadLimit(path, size_bytes, free).check_rows(rows)
 
 
 def _duration_s(parts: Sequence[Recording]) -> float:

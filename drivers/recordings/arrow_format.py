@@ -69,13 +69,26 @@ def read_parquet(path: Path) -> Table:
     """
     notes: list[str] = []
     with _open_parquet(path) as file:
-        metadata = file.metadata
-        check_width(path, metadata.num_columns)
-        chosen = choose_columns(path, file.schema_arrow.names, notes)
-        _check_types(path, file.schema_arrow, chosen)
-        stated = sum(metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
-        memory_check.read_limit(path).check_rows(max(int(metadata.num_rows), stated))
+        chosen, _ = _check_parquet(path, file, notes)
         return _float_table(path, file.read(columns=list(chosen.values())), chosen, notes)
+
+
+def count_parquet_rows(path: Path) -> int:
+    """Return the number of rows that the index states."""
+    with _open_parquet(path) as file:
+        return _check_parquet(path, file, [])[1]
+
+
+def _check_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, str], int]:
+    """Return the columns to read and the number of rows, after checking both against the limits."""
+    metadata = file.metadata
+    check_width(path, metadata.num_columns)
+    chosen = choose_columns(path, file.schema_arrow.names, notes)
+    _check_types(path, file.schema_arrow, chosen)
+    rows = int(metadata.num_rows)
+    stated = sum(metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
+    memory_check.read_limit(path).check_rows(max(rows, stated))
+    return chosen, rows
 
 
 @contextmanager
@@ -121,7 +134,7 @@ def read_ipc(path: Path) -> Table:
         schema = _ipc_schema(path, file)
         own = METADATA_KEY in (schema.metadata or {})
         chosen = choose_columns(path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes)
-        count = _check_ipc(path, start, schema, chosen)
+        count, _ = _check_ipc(path, start, schema, chosen)
         if not _has_end_mark(path, start > 0):
             notes.append("The file has no end mark; it is cut off and was read up to the cut.")
         file.seek(start)
@@ -139,6 +152,12 @@ def read_ipc(path: Path) -> Table:
             notes.append(f"Only {len(batches)} complete batches could be read: {first_line(error)}.")
     schema = batches[0].schema if batches else schema
     return _float_table(path, pa.Table.from_batches(batches, schema), chosen, notes)
+
+
+def count_ipc_rows(path: Path) -> int:
+    """Return the number of rows of all batches up to a truncation."""
+    with open_regular(path) as file:
+        return _check_ipc(path, _ipc_start(path), _ipc_schema(path, file), {})[1]
 
 
 def _ipc_start(path: Path) -> int:
@@ -170,8 +189,8 @@ def _ipc_schema(path: Path, file: Any) -> Any:
     return schema
 
 
-def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -> int:
-    """Return the number of record batches, after checking their sizes and the column types against the limits."""
+def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -> tuple[int, int]:
+    """Return the number of record batches and of rows, after checking sizes and column types against the limits."""
     pa = import_pyarrow(path)
     _check_types(path, schema, chosen)
     counts = [
@@ -195,7 +214,7 @@ def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -
             limit.check_rows(rows)
             if wrong := check_buffer_sizes(size, counts, SLACK_BYTES):
                 raise RecordingError(f"{path}: batch {batches} is damaged: {wrong}")
-    return batches
+    return batches, rows
 
 
 def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:

@@ -78,7 +78,7 @@ def read_csv(path: Path) -> Table:
     """
     notes: list[str] = []
     bad = _BadLines()
-    _check_size(path)
+    count_csv_rows(path)
     with open_regular(path) as file:
         texts = _whole_lines(_decompressed(file, notes), notes)
         head = _find_header(path, texts)
@@ -100,8 +100,8 @@ def read_csv(path: Path) -> Table:
     return Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
 
 
-def _check_size(path: Path) -> None:
-    """Count the lines of a text up to a truncation, and check their number and size against the limits."""
+def count_csv_rows(path: Path) -> int:
+    """Return the number of lines of a text up to a truncation, after checking number and size against the limits."""
     limit = memory_check.read_limit(path)
     lines = unpacked = 0
     with open_regular(path) as file:
@@ -111,6 +111,7 @@ def _check_size(path: Path) -> None:
             limit.check_rows(lines)
             if unpacked > limit.size_bytes:
                 limit.check_unpacked(unpacked)
+    return lines
 
 
 def _too_many_bad_lines(path: Path, bad: _BadLines, rows: int) -> RecordingError:

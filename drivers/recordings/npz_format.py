@@ -96,6 +96,15 @@ class _Header:
         return math.prod(self.shape)
 
 
+def count_npz_rows(path: Path) -> int:
+    """Return the number of rows that the headers of the columns state; 0 for a truncated file."""
+    with _BoundedFile(path) as file:
+        if not _has_index(path, file):
+            return 0  # a truncated archive is measured while it is read
+        with _open_archive(path, file) as archive:
+            return _check_columns(path, archive, choose_columns(path, _array_names(archive), []))
+
+
 def read_npz(path: Path) -> Table:
     """Read the known arrays of a .npz file. A truncated file is read up to the cut.
 
@@ -154,8 +163,9 @@ def _find_member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
     return names[key] if key in names else names[f"{key}.npy"]
 
 
-def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str]) -> None:
-    """Check the headers of all columns against the file size and the memory."""
+def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str]) -> int:
+    """Return the rows of the longest column, after checking the headers of all columns against the limits."""
+    rows = 0
     limit = memory_check.read_limit(path)
     for key in chosen.values():
         header = _read_header(path, archive, key)
@@ -163,8 +173,10 @@ def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, st
             raise RecordingError(f"{path}: {key} contains {_describe_dtype(header.dtype)}, expected numbers")
         if len(header.shape) != 1:
             raise RecordingError(f"{path}: {key} has shape {header.shape}, expected one dimension")
-        limit.check_rows(header.values)
+        rows = max(rows, header.values)
+        limit.check_rows(rows)
         _check_size(path, limit, _find_member(archive, key), key, header)
+    return rows
 
 
 def _check_size(path: Path, limit: memory_check.ReadLimit, member: zipfile.ZipInfo, key: str, header: _Header) -> None:
