@@ -105,12 +105,12 @@ def test_linear_algebra_keeps_to_one_thread_unless_told() -> None:
 WRONG_FILES = {
     "unknown key": (VIRTUAL + "windw = 10.0\n", 'windw: unknown key; did you mean "window"?'),
     "unknown table": (VIRTUAL + '[zeno]\nmode = "peer"\n', 'zeno: unknown key; did you mean "zenoh"?'),
-    "wrong type": (VIRTUAL + 'rate = "fast"\n', "device[0].rate: expected a number from 0.001 Hz to 1 MHz, or nothing"),
+    "wrong type": (VIRTUAL + 'rate = "fast"\n', "device bench-1: rate: expected a number from 0.001 Hz to 1 MHz"),
     "infinite rate": (VIRTUAL + "rate = inf\n", "inf Hz"),
     "one name twice": (VIRTUAL + VIRTUAL, '2 devices are named "bench-1"; names must be unique'),
     "name with a slash": (VIRTUAL.replace("bench-1", "a/b"), '"a/b"; letters, digits, - and _ are possible'),
     "no name": ('[[device]]\ndriver = { link = "virtual" }\n', "device[0].name: missing"),
-    "no driver": (DEVICE, "device[0].driver: missing"),
+    "no driver": (DEVICE, "device bench-1: driver: missing"),
     "no device": ("", "there is none; add [[device]]"),
     "not TOML": ("[[device\nname =", "not TOML: "),
     "not text": (b"\xff\xfe\x00", "cannot be read: "),
@@ -128,7 +128,7 @@ WRONG_FILES = {
     "no port": (DEVICE + 'driver = { link = "serial", decoder = "stim300" }\n', "driver.port: missing"),
     "protocol that does not fit": (
         DEVICE + 'driver = { link = "serial", port = "x", decoder = "ros2_imu" }\n',
-        "ros2_imu reads messages, link serial brings bytes",
+        "ros2_imu reads messages, link serial provides bytes",
     ),
     "negative silence": (
         DEVICE + 'driver = { link = "virtual", silence = -1.0 }\n',
@@ -158,10 +158,10 @@ WRONG_FILES = {
     "window too short": (VIRTUAL + "rate = 100.0\nwindow = 0.1\n", "are 10 samples; possible are 100 to 10000000"),
     "window too long": (VIRTUAL + 'rate = 100.0\nwindow = "2d"\n', "are 17280000 samples; possible are 100 to"),
     "window too long at any rate": (VIRTUAL + 'window = "1e9 s"\n', "1e+09 s; at most 3.456e+06 s"),
-    "unknown grid of tau": (VIRTUAL + 'tau = "octav"\n', "device[0].tau: "),
+    "unknown grid of tau": (VIRTUAL + 'tau = "octav"\n', "device bench-1: tau: "),
     "negative tau": (
         VIRTUAL + "tau = [-1.0]\n",
-        "device[0].tau[0]: -1 s is outside the supported range 1 µs to 36525 d",
+        "device bench-1: tau[0]: -1 s is outside the supported range 1 µs to 36525 d",
     ),
     "empty tau": (VIRTUAL + "tau = []\n", "tau: none of [] s lies between one sample and 1800 s, half the window"),
     "tau beyond the window": (VIRTUAL + "window = 10.0\ntau = [1000.0]\n", "tau: none of [1000.0] s lies between"),
@@ -206,7 +206,7 @@ def test_check_tells_all_that_is_wrong_and_run_the_first(call: Call) -> None:
     assert said.status == 2
     assert said.out == ""
     assert [line.split(": ")[:2] for line in said.err.splitlines()] == [
-        ["c.toml", key] for key in ("device[0].windw", "log.level", "viewer.mode")
+        ["c.toml", key] for key in ("device a", "viewer.mode", "log.level")
     ]
     line = call("run", "c.toml").only_line()
     assert "windw" in line
@@ -242,7 +242,7 @@ def test_check_tells_what_is_wrong_with_models_beside_all_else(call: Call) -> No
     said = call("check", "c.toml")
     assert said.status == 2
     begins = [
-        "device[0].windw: unknown key",
+        "device a: windw: unknown key",
         'device b: driver.link: "sereal"; possible are serial, ',
         "device c: driver.seed: ",
         'log.level: "loud"; possible are ',
@@ -631,7 +631,7 @@ def test_deviations_are_those_of_allantools(call: Call, recording: Path, grid: s
     ("name", "content", "words"),
     [
         ("x.csv", b"", "x.csv: the file is empty"),
-        ("x.csv", b"t,gx\n", "x.csv: has a header line but no whole line of samples"),
+        ("x.csv", b"t,gx\n", "x.csv: has a header line but no complete line of samples"),
         (
             "x.csv",
             b"gx\n" + b"0.1\n" * 100,
@@ -922,8 +922,8 @@ def test_an_axis_that_stands_still_is_no_answer(call: Call) -> None:
     np.savez("x.npz", fs=100.0, gx=np.full(6000, 0.1))
     said = call("reconcile", "x.npz", "--out", "found")
     assert said.status == 3
-    assert "gx: all samples are the same" in said.err
-    assert "gx: all samples are the same" in json.loads(Path("found/report.json").read_bytes())["why"]
+    assert "gx: all samples have the same value" in said.err
+    assert "gx: all samples have the same value" in json.loads(Path("found/report.json").read_bytes())["why"]
 
 
 # --- as a process ----------------------------------------------------------------------------------
@@ -999,7 +999,7 @@ def test_a_wrong_file_ends_a_real_process(tmp_path: Path) -> None:
     done = program("run", "c.toml", cwd=tmp_path, env={**os.environ, "PYTHONPATH": os.getcwd()})
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.splitlines() == [
-        'imu-monitor: c.toml: device[0].windw: unknown key; did you mean "window"?',
+        'imu-monitor: c.toml: device bench-1: windw: unknown key; did you mean "window"?',
     ]
 
 
@@ -1312,7 +1312,7 @@ def test_a_view_of_what_is_not_kept_is_refused(call: Call, tmp_path: Path) -> No
     (tmp_path / "c.toml").write_text(VIRTUAL + QUIET)
     said = call("run", "c.toml", "--history", "1d")
     assert said.status == 2
-    assert said.only_line() == "imu-monitor: --history: none is kept; [storage] folder says where it would be\n"
+    assert said.only_line() == "imu-monitor: --history: there is no history to show; add folder to [storage]\n"
     assert "no duration" in call("run", "c.toml", "--history", "long").only_line()
 
 
@@ -1409,13 +1409,19 @@ def test_a_thread_that_fails_is_one_line(
     [
         (
             ("export", "m.toml"),
-            "Missing option '--format' (kalibr|gyroparams|kalman): For which tool. See imu-monitor exp",
+            "Missing option '--format' (kalibr|gyroparams|kalman): Tool that reads the parameters. See imu-monitor exp",
         ),
-        (("simulate", "m.toml", "--seconds", "1"), "Missing option '--out' (FILE): What to write: .csv, .csv.gz, .npz"),
+        (
+            ("simulate", "m.toml", "--seconds", "1"),
+            "Missing option '--out' (FILE): Recording to write: .csv, .csv.gz, .npz",
+        ),
         (("simulate", "m.toml"), "Missing option '--seconds' (S): Length in seconds"),
-        (("compensate", "a.csv"), "Missing option '--out' (FILE): The recording without drift"),
+        (("compensate", "a.csv"), "Missing option '--out' (FILE): Recording without drift"),
         (("reconcile", "a.csv"), "Missing option '--out' (DIR): Folder for the report"),
-        (("thermal", "predict", "a.csv"), "Missing option '--model' (MODEL.json): What thermal fit wrote."),
+        (
+            ("thermal", "predict", "a.csv"),
+            "Missing option '--model' (MODEL.json): Model file that thermal fit has written.",
+        ),
         (("analyze",), "Missing argument 'RECORDING': File, or folder of segments. See imu-monitor analyze --help"),
         (("analyze", "a.csv", "--rte", "1"), "No such option: --rte of imu-monitor analyze; did you mean --rate?"),
         (

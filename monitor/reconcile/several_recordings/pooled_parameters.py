@@ -56,7 +56,7 @@ def pool_parameter(found: Sequence[ParameterInterval]) -> PooledParameter:
     Examples
     --------
     >>> both = pool_parameter([ParameterInterval(10.0, 8.04, 11.96), ParameterInterval(12.0, 10.04, 13.96)])
-    >>> print(both.bounds.value, round(both.chi2, 3), both.freedom)
+    >>> print(round(both.bounds.value, 3), round(both.chi2, 3), both.freedom)
     11.0 2.0 1
     """
     known = [one for one in found if _finite_interval(one) is not None]

@@ -283,7 +283,10 @@ def test_two_daemons_on_one_serial_port(tmp_path: Path) -> None:
     try:
         first, second = (serial_link.build(serial_link.Settings(port=port)) for _ in range(2))
         first.open()
-        with contextlib.closing(first), pytest.raises(LinkUnavailable, match="held by another program; close it"):
+        with (
+            contextlib.closing(first),
+            pytest.raises(LinkUnavailable, match="held by another program; close the program"),
+        ):
             second.open()
         with contextlib.closing(second):
             second.open()

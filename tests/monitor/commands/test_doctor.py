@@ -303,8 +303,8 @@ def test_kernels_that_cannot_be_kept_are_told(tmp_path: Path) -> None:
     assert cache_folder() is not None
     say = "from monitor.common.compiled import cache_folder; print(cache_folder())"
     copy = tmp_path / "copy"
-    shutil.copytree(Path(doctor.__file__).parent, copy / "monitor", ignore=shutil.ignore_patterns("__pycache__"))
-    (copy / "monitor" / "__pycache__").touch()  # no folder can be made there
+    shutil.copytree(Path(doctor.__file__).parents[1], copy / "monitor", ignore=shutil.ignore_patterns("__pycache__"))
+    (copy / "monitor" / "common" / "__pycache__").touch()  # no folder can be made there
     (tmp_path / "file").touch()
     environment = {**os.environ, "PYTHONPATH": str(copy), "HOME": str(tmp_path / "file")}
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):

@@ -17,6 +17,7 @@ from monitor.commands import thermal
 from monitor.common import topics
 from monitor.publishing.exporters import FORMATS, export, from_analysis
 from monitor.publishing.remote_devices import DeviceStates
+from monitor.publishing.terminal.live_table import device_table
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
 from monitor.simulator.scheduled_effects import parse_effects
@@ -79,7 +80,7 @@ def heard(data: bytes) -> None:
 def board(data: bytes) -> None:
     """The same, and then shown."""
     console = Console(width=100, height=30, file=_Nowhere(), force_terminal=True)
-    console.print(_taken(data).table(2.0))
+    console.print(device_table(_taken(data), 2.0))
 
 
 class _Nowhere:

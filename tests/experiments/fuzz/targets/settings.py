@@ -18,7 +18,6 @@ from drivers.errors import ConfigError
 from drivers.sample import Chunk
 from drivers.settings_model import SettingsModel, read_settings
 from monitor.common import config_files
-from monitor.noise import model_file
 from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
 from monitor.settings import loading
@@ -292,10 +291,8 @@ def model(data: bytes) -> None:
         one_line(error)
         return
     possible([value for _, effect in found for value in (getattr(effect, f.name) for f in fields(effect))])
-    model_file.format_table(found)
-    assert model_file.format_model(NoiseModel.from_toml(model_file.format_model(found))) == model_file.format_model(
-        found
-    )
+    str(found)
+    assert NoiseModel.from_toml(found.to_toml()).to_toml() == found.to_toml()
 
 
 # --- CAN databases

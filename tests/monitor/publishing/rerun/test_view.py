@@ -191,6 +191,7 @@ def test_a_process_with_a_frozen_viewer_exits(server: sinks.ViewerProcess) -> No
         import os, signal, time
         import numpy as np
         from monitor.publishing.rerun.view import RerunView
+        from monitor.publishing.result_kinds import SampleRows
         from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
         view = RerunView(ViewerSettings("native", port={server.port}), [DeviceInfo("d")])
         view.start()
@@ -281,6 +282,7 @@ def test_a_killed_daemon_takes_its_viewer_along() -> None:
     program = f"""
         import time
         from monitor.publishing.rerun.view import RerunView
+        from monitor.publishing.result_kinds import SampleRows
         from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
         RerunView(ViewerSettings("web", {port}, {web_port}), [DeviceInfo("d")]).start()
         time.sleep({FOREVER_S})
@@ -340,6 +342,7 @@ def test_mode_none_imports_and_starts_nothing() -> None:
     program = """
         import sys, threading
         from monitor.publishing.rerun.view import RerunView
+        from monitor.publishing.result_kinds import SampleRows
         from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
         view = RerunView(ViewerSettings("none"), [DeviceInfo("d")])
         view.start()
