@@ -414,6 +414,10 @@ def _arrow_errors(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
     except (import_pyarrow(path).ArrowException, UnicodeDecodeError, RecursionError, msgspec.DecodeError) as error:
         raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
+    except MemoryError as error:  # the first bytes are read as a length, which can be gigabytes in a foreign file
+        raise RecordingError(
+            f"{path}: is no segment of a recording (it claims more bytes than the memory holds)"
+        ) from error
 
 
 def _check_schema(path: Path, schema: Any) -> SegmentMetadata:

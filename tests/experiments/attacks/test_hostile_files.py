@@ -73,7 +73,7 @@ MEMORY_OR_ROWS: Final = "of memory would be needed|are not measured samples"
 CHEAP: Final[Sequence[Case]] = (
     (hostile.csv_hundred_thousand_columns, ".csv", "100002 columns, expected at most 10000"),
     (hostile.csv_line_without_end, ".csv", "Line 2 is longer than 1048576 bytes"),
-    (hostile.gz_header_without_end, ".csv.gz", "not one whole line.*Line 1 is longer"),
+    (hostile.gz_header_without_end, ".csv.gz", "not one complete line.*Line 1 is longer"),
     (hostile.gz_rows_without_end, ".csv.gz", MEMORY_OR_ROWS),
     (hostile.gz_bad_lines, ".csv.gz", "lines are not samples"),
     (hostile.npz_zeros, ".npz", MEMORY_OR_ROWS),
@@ -81,7 +81,7 @@ CHEAP: Final[Sequence[Case]] = (
     (hostile.npz_header_without_end, ".npz", "its header has 3221225472 bytes"),
     (hostile.npz_objects, ".npz", "gx contains Python objects"),
     (hostile.arrow_nulls, ".arrow", MEMORY_OR_ROWS),
-    (hostile.arrow_run_ends, ".arrows", "gx holds run_end_encoded"),
+    (hostile.arrow_run_ends, ".arrows", "gx contains run_end_encoded"),
     (hostile.folder_of_bombs, "", "none of 9 segments can be read|of memory would be needed"),
 )
 COSTLY: Final[Sequence[Case]] = (
@@ -96,7 +96,7 @@ COSTLY: Final[Sequence[Case]] = (
     (hostile.gz_in_gz, ".csv.gz", "is no CSV text"),
     (hostile.npz_sizes_claim, ".npz", f"{MEMORY_OR_ROWS}|its data hold|is damaged"),
     (hostile.npz_two_dimensions, ".npz", "expected one dimension"),
-    (hostile.npz_long_strings, ".npz", "not numbers"),
+    (hostile.npz_long_strings, ".npz", "expected numbers"),
     (hostile.npz_nested, ".npz", "not an array in the format .npy"),
     (hostile.npz_members, ".npz", "its index of arrays is damaged"),
     (hostile.npz_cut_zeros, ".npz", f"unpacks to more than|{MEMORY_OR_ROWS}"),

@@ -285,7 +285,7 @@ def test_two_daemons_on_one_serial_port(tmp_path: Path) -> None:
         first.open()
         with (
             contextlib.closing(first),
-            pytest.raises(LinkUnavailable, match="held by another program; close the program"),
+            pytest.raises(LinkUnavailable, match="held by another program; close"),
         ):
             second.open()
         with contextlib.closing(second):
