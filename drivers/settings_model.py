@@ -123,7 +123,7 @@ class CheckedTable(Generic[Model]):
     partial: dict[str, object] = field(default_factory=dict)  # partial objects of wrong tables, by place
 
     def is_sound(self, *places: str) -> bool:
-        """Return True if there is no mistake at these places, above or below them."""
+        """Return True if no problem was found in these keys, in their tables or in their subkeys."""
         return not any(_nested(place, wrong.place) for place in places for wrong in self.problems)
 
     def add(self, place: str, text: str) -> None:

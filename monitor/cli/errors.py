@@ -67,7 +67,7 @@ def _system_error(error: OSError) -> str:
 
 
 def _usage(error: TyperException) -> str:
-    """Return a message about wrong arguments, with the missing or the possible arguments."""
+    """Return an error message that names the missing arguments, or the possible values of a wrong argument."""
     text, context = error.format_message(), getattr(error, "ctx", None)
     if isinstance(error, typer.BadParameter) and error.param is not None and not error.message:
         option: Any = error.param

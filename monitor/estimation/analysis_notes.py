@@ -294,7 +294,10 @@ def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[i
 
 
 def _left_out_note(tau_s: Floats, axes: Collection[int], why: str) -> str:
-    """Format the note on τ left out of the fit. ``tau_s`` [6] is the longest one of each axis."""
+    """Format a note about short averaging times that the fit excludes.
+
+    ``tau_s`` [6] is the longest of them per axis.
+    """
     upto = ", ".join(dict.fromkeys(format_two_digits(float(tau_s[i])) for i in axes))
     return (
         f"{', '.join(AXES[i] for i in axes)}: the fit leaves out τ up to {upto} s, which no sum of the five terms "

@@ -232,7 +232,7 @@ def _allan_variance_at(tau: float, f: Floats, rest: Floats, tau0_s: float) -> fl
 
 
 def _integrate_cosine(omega: float, f: Floats, rest: Floats, slopes: Floats) -> float:
-    """Return ∫ rest cos(ωf) df, exact for a piecewise linear function."""
+    """Return the integral of a piecewise linear function times cos(ωf) over the frequency f. The result is exact."""
     ends = rest[-1] * np.sin(omega * f[-1]) - rest[0] * np.sin(omega * f[0])
     return float(ends / omega + (slopes * np.diff(np.cos(omega * f))).sum() / omega**2)
 

@@ -109,7 +109,7 @@ class VirtualImu:
                 made = due
 
     def _make_and_send(self, first: int, n: int) -> None:
-        """Make ``n`` samples, and send those for which the cable is connected."""
+        """Simulate ``n`` samples, and send the samples during which the simulated cable is connected."""
         frames, draws = self._sensor.frames(n), self._faults.draw(n)
         at = 0
         while at < n:

@@ -169,7 +169,7 @@ class Compensator:
     def compensate(self, values: Floats, lost: int = 0) -> Floats:
         """Return consecutive samples with the drift of the gyros removed.
 
-        A gyro rate is not changed until the bias is known, or if the sample is missing.
+        The rate of a gyroscope is returned unchanged until its bias is known. Missing samples remain missing.
 
         Parameters
         ----------

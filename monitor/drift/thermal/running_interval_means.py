@@ -86,7 +86,7 @@ class RunningIntervalMeans:
         return finished
 
     def forget(self) -> None:
-        """Discard the axes of the current interval, but keep its temperature."""
+        """Discard the sensor values of the current interval, and keep the temperatures of the interval."""
         self._rows[: self._buffered, :TEMPERATURE_COLUMN] = np.nan
         self._sum[:, :TEMPERATURE_COLUMN], self._count[:, :TEMPERATURE_COLUMN] = 0.0, 0
 

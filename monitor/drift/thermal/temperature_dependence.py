@@ -374,7 +374,7 @@ def _whitener(known: np.ndarray, ratio: float, correlation: float) -> tuple[Floa
 
 
 def _toeplitz(row: Floats) -> Floats:
-    """Return the symmetric matrix [n, n] of the row [n]: each diagonal has one value."""
+    """Return the symmetric Toeplitz matrix [n, n] with the given first row [n]."""
     at = np.arange(row.size)
     return np.asarray(row[np.abs(at[:, None] - at)])
 

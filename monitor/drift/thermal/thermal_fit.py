@@ -6,8 +6,8 @@ bias its roots towards zero. The residuals may be correlated: r_n = φ r_{n−1}
 chosen (Hurvich & Tsai, Biometrika 76, 1989). AICc asymptotically agrees with leave-one-out cross-validation (Stone, J.
 R. Stat. Soc. B 39, 1977) and needs no separate samples, of which there are few. A cross-validated error is given too,
 over FOLDS parts of the record that are each predicted from the others. A form that predicts them worse than a constant
-is rejected, because slow heating leaves one end of a polynomial unconstrained. Lags and powers beyond the third need a
-margin in AICc.
+is rejected, because slow heating leaves one end of a polynomial unconstrained. A thermal model with lags, or with
+powers above the third, is selected only if its AICc is better by a margin.
 
 The search takes some 50 ms to a second. ``fit_in_steps`` divides it into pieces of less than a millisecond.
 

@@ -5,10 +5,10 @@ variances. A round covers all τ of both variances, by default octaves of the wi
 together when the last τ is complete. The samples are not copied, because the sums use the ring of phase of the window
 between two updates by the same thread.
 
-The results lag behind the window. A window of 3.6 million samples has 22 τ of the total and 21 of the Hadamard
-variance. With ten steps per second, a round takes 4.3 s, and the oldest value returned by ``get`` is between 4.3 and
-8.6 s old. This is 0.24 % of the length of the window, which is an hour at 1 kHz. Each value is exact for the window at
-the time of the step that computed the value.
+The results lag behind the window. A window of 3.6 million samples has 22 averaging times for the total variance and 21
+for the Hadamard variance. With ten steps per second, a round takes 4.3 s, and the oldest value returned by ``get`` is
+between 4.3 and 8.6 s old. This is 0.24 % of the length of the window, which is an hour at 1 kHz. Each value is exact
+for the window at the time of the step that computed the value.
 
 Inside the record, the terms of the total variance are terms of the Allan variance. If the window already computes this
 τ over its full length, the sum of the window is used, and only the reflected ends are added.

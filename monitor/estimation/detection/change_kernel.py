@@ -397,7 +397,7 @@ def _relearn(s: ChangeState, axis: int, j: int) -> None:
 def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis: int, now: int) -> float:
     """Update the CUSUM of extremes as Bernoulli trials, and return its value.
 
-    It tests for a share of extremes ten times the usual one, and at least 1 %.
+    The CUSUM tests whether the share of extreme values is ten times the share at rest, and at least 1 %.
     """
     outer = 2.0 * band[axis, 0, LIMIT] * (EXTREME / CLIP)  # (y − y')² is 2 z²
     if band[axis, 0, SEEDED] != SEED or outer == 0.0:

@@ -1,9 +1,9 @@
 """Diagnostics: functions that measure how far an axis differs from a model.
 
 Measured and simulated recordings pass through the same diagnostics. Each diagnostic takes a ``WhitenedAxis`` and tests
-one kind of departure from white noise. It returns the largest gain in ln L, in nats, that such a departure would bring
-at one location, together with this location. The gains of a true model are nearly the same for every model and every
-length of the recording. The thresholds in ``null_distribution`` rely on this.
+one kind of departure from white noise. Each diagnostic returns the largest gain in log-likelihood, in nats, that a
+departure at one location explains, and this location. The gains of a true model are nearly the same for every model and
+every length of the recording. The thresholds in ``null_distribution`` rely on this.
 
 The diagnostics are deterministic and do not change their input.
 """

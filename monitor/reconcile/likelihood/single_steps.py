@@ -6,10 +6,10 @@ remaining noise shows the likeliest shock of the level (de Jong & Penzer, "Diagn
 heights are fitted by least squares.
 
 The likelihood of a process is an average over all times and heights that it allows. The likelihood of fixed steps is a
-maximum. Each step therefore gets the penalty that its time and height would have in such an average: ln of the number
-of blocks, and ½ ln(1 + h²/Var h) (the minimum description length of Rissanen, 1978). Up to about five steps, single
-steps usually have the smaller penalty. From about a dozen steps on, the process has the smaller penalty, because it
-describes them by common parameters.
+maximum. Each fixed step therefore gets a penalty for its time and its height h. The penalties are the logarithm of the
+number of blocks and ½ ln(1 + h²/Var h), after the minimum description length of Rissanen (1978). Up to about five
+steps, single steps usually have the smaller penalty. From about a dozen steps on, the process has the smaller penalty,
+because it describes them by common parameters.
 """
 
 from math import log

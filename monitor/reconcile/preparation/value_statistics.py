@@ -499,8 +499,9 @@ def _excess_gain(count: float, chance: float, variance: float) -> float:
 
 
 def _fit_difference_spread(counts: Floats, first: int) -> tuple[float, float]:
-    """Return the largest log-likelihood of the counts of 0, 1, … steps, from ``first`` on, and the standard deviation
-    that maximises it.
+    """Fit the noise to a histogram of differences, and return the largest log-likelihood and the standard deviation.
+
+    The histogram counts the differences of 0, 1, … quantization steps. Counts below ``first`` are not used.
     """
     kept = counts[first:]
 
