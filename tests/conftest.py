@@ -16,7 +16,7 @@ from tests.support.waiting import PATIENCE_S
 WORKERS_PER_CORE: Final = 3
 """Many tests wait, so three workers for each core keep the processors busy."""
 MAX_WORKERS: Final = 12
-LONG_FOLDERS: Final = {"experiments", "system"}
+LONG_FOLDERS: Final = {"benchmarks", "blind", "fuzz", "system"}
 """End-to-end, fault, network and fuzzing tests, blind trials of the reconciliation, and tests of the benchmarks."""
 
 # Hypothesis limits each example to 200 ms, and the generation of its input, by the clock on the wall.

@@ -10,7 +10,7 @@ import pytest
 from drivers.errors import ConfigError
 from monitor.publishing.zenoh.subscriber import client_configurations
 from monitor.settings import file_permissions, loading
-from tests.system.test_cli import VIRTUAL
+from tests.monitor.cli.test_cli import VIRTUAL
 
 pytestmark = pytest.mark.skipif(os.name != "posix", reason="permissions are not POSIX's here")
 SECRET = '{transport: {auth: {usrpwd: {user: "nose", password: "hunter2"}}}}'
