@@ -33,7 +33,7 @@ from monitor.cli import (
     warm_up,
     watch,
 )
-from monitor.cli.errors import DEBUG, INTERRUPTED, explain
+from monitor.cli.shared.errors import DEBUG, INTERRUPTED, explain
 
 # This must precede the import of NumPy. The matrices are small, and the program has its own threads for the work.
 # Additional threads of the linear algebra libraries would only wait actively.

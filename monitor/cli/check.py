@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import ConfigError
-from monitor.cli.errors import WRONG
+from monitor.cli.shared.errors import WRONG
 
 
 def check(

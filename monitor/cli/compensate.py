@@ -7,7 +7,7 @@ import typer
 
 from drivers.errors import ConfigError
 from drivers.file_access import real_path
-from monitor.cli import options, output, terminal_session
+from monitor.cli.shared import options, output, terminal_session
 
 
 def compensate(

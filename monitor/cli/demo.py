@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from monitor.cli import options, terminal_session
+from monitor.cli.shared import options, terminal_session
 
 
 def demo(

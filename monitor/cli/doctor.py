@@ -5,8 +5,8 @@ from typing import Annotated, Final
 
 import typer
 
-from monitor.cli import output
-from monitor.cli.errors import FAILED
+from monitor.cli.shared import output
+from monitor.cli.shared.errors import FAILED
 
 SCHEMA: Final = "imu-monitor/doctor/1"
 """Schema of the JSON."""

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import ConfigError
-from monitor.cli import options, output
+from monitor.cli.shared import options, output
 
 
 def export(

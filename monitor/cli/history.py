@@ -9,7 +9,7 @@ import typer
 
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
-from monitor.cli import options, output
+from monitor.cli.shared import options, output
 
 if TYPE_CHECKING:
     from monitor.history.query import HistoryQuery

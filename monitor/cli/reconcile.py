@@ -8,7 +8,7 @@ import typer
 
 from drivers.errors import NotReady
 from drivers.extras import check_extra
-from monitor.cli import options, output, terminal_session
+from monitor.cli.shared import options, output, terminal_session
 
 
 def reconcile(

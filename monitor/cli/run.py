@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from monitor.cli import options, terminal_session
+from monitor.cli.shared import options, terminal_session
 
 
 def run(

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import ConfigError, NotReady
-from monitor.cli import options, output
+from monitor.cli.shared import options, output
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")]
 JsonPath = Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")]

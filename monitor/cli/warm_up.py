@@ -7,13 +7,13 @@ from typing import Annotated
 import typer
 
 from drivers.errors import ConfigError
-from monitor.cli import output
+from monitor.cli.shared import output
 
 
 def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True)] = False) -> None:
     """Compile the numerical kernels and keep them on disk, so that the next start is quick."""
     from monitor.common.compiled import cache_folder
-    from monitor.daemon import kernel_compilation, kernel_parts
+    from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
     if from_stdin:
         kernel_compilation.compile_from_stdin(sys.stdin, sys.stdout)

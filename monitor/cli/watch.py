@@ -2,7 +2,7 @@
 
 import threading
 
-from monitor.cli import options, terminal_session
+from monitor.cli.shared import options, terminal_session
 
 
 def watch(

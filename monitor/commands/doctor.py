@@ -526,8 +526,8 @@ def check_packages(module_path: Sequence[str]) -> list[Finding]:
 def _check_kernels() -> list[Finding]:
     """Check that the kernels are compiled and cached on disk."""
     from monitor.common.compiled import cache_folder
-    from monitor.daemon.kernel_compilation import is_warm
-    from monitor.daemon.kernel_parts import SERVICE
+    from monitor.daemon.kernels.kernel_compilation import is_warm
+    from monitor.daemon.kernels.kernel_parts import SERVICE
 
     folder = cache_folder()
     if folder is None:

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import structlog
 
-from monitor.daemon.device_worker import DeviceWorker
+from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.operations.live_reconcile import Job, Reconciler
 from monitor.publishing.messages.results import ResetMessage
 from monitor.publishing.zenoh.publisher import Command, ZenohPublisher

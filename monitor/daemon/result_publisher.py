@@ -13,10 +13,10 @@ import numpy as np
 from drivers.driver import Driver
 from drivers.errors import NotReady
 from drivers.sample import Event, SampleBlock, merge_contiguous_blocks
-from monitor.daemon.device_timeline import DeviceTimeline
+from monitor.daemon.device.device_timeline import DeviceTimeline
+from monitor.daemon.device.pipeline import DevicePipeline
 from monitor.daemon.operations.limits import LimitMonitor
 from monitor.daemon.output import Output
-from monitor.daemon.pipeline import DevicePipeline
 from monitor.daemon.schedule import Schedule
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.estimation.detection.model_agreement import ModelAgreement

@@ -24,8 +24,8 @@ from drivers.recordings.segment import SegmentMetadata
 from monitor.common.health import Health, format_service_status
 from monitor.daemon import reload
 from monitor.daemon.command_handler import CommandHandler
-from monitor.daemon.device_worker import DeviceWorker
-from monitor.daemon.kernel_readiness import KernelReadiness
+from monitor.daemon.device.device_worker import DeviceWorker
+from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.hooks import Hooks
 from monitor.daemon.operations.live_reconcile import Reconciler
 from monitor.daemon.operations.log_level import set_log_level

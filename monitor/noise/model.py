@@ -18,9 +18,9 @@ from drivers.errors import ConfigError
 from drivers.sample import AXES, Floats
 from monitor.noise.effect import Effect, Leak, Source, Transform
 from monitor.noise.effects import TRANSFORM_ORDER
-from monitor.noise.effects.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.noise_step import NoiseStep
-from monitor.noise.effects.sample_rate_error import SampleRateError
+from monitor.noise.effects.disturbances.noise_step import NoiseStep
+from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
 from monitor.noise.model_file import error_location, format_model, format_table, parse_model
 from monitor.noise.simulation import ModelStream, check_effects
 from monitor.noise.spectrum import Spectrum, undefined_spectrum, zero_spectrum

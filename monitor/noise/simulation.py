@@ -35,9 +35,9 @@ from monitor.noise.effect import (
     first_sample,
 )
 from monitor.noise.effects import TRANSFORM_ORDER
-from monitor.noise.effects.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.noise_step import NoiseStep
-from monitor.noise.effects.sample_rate_error import SampleRateError
+from monitor.noise.effects.disturbances.noise_step import NoiseStep
+from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
 from monitor.noise.model_file import error_location
 from monitor.noise.temperature import Temperature, recorded_temperature
 

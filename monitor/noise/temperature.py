@@ -13,8 +13,8 @@ from drivers.errors import ConfigError
 from drivers.quantities import DURATION_S, TEMPERATURE_C
 from drivers.sample import Floats
 from monitor.noise.effect import FunctionSeries, NoiseSeries, ParameterTable, SampleBlockContext, parameter
-from monitor.noise.effects.exponentially_correlated import ExponentiallyCorrelated
-from monitor.noise.effects.sinusoidal import Sinusoidal
+from monitor.noise.effects.ieee952.exponentially_correlated import ExponentiallyCorrelated
+from monitor.noise.effects.ieee952.sinusoidal import Sinusoidal
 
 PAIRS: Final = (("swing", "period"), ("wander", "wander_time"))
 """Parameters that need each other."""

@@ -7,7 +7,7 @@ workers of pytest-xdist and the processes that tests start then load them from t
 
 from collections.abc import Callable
 
-from monitor.daemon import kernel_compilation, kernel_parts
+from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
 
 def compile_kernels(say: Callable[[str], None]) -> None:

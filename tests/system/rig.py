@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.sample import Event, SampleBlock, concatenate_blocks
 from monitor.common.health import Health
-from monitor.daemon.device_worker import DeviceWorker
+from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.output import Output
 from monitor.daemon.service import Service
 from monitor.drift.compensation.live_compensation import DriftUpdate

@@ -17,7 +17,6 @@ import os
 import queue
 import signal
 import subprocess
-import sys
 import tempfile
 import threading
 import time
@@ -30,15 +29,13 @@ import msgspec
 import numpy as np
 
 from drivers.sample import AXES, Floats
+from monitor.common.program import PROGRAM
 from monitor.estimation.window_snapshot import WindowSnapshot
 from monitor.publishing.messages.results import ReconcileMessage
 from monitor.publishing.zenoh.publisher import Command
 
-PROGRAM: Final = (sys.executable, "-P", str(Path(__file__).resolve().parents[3] / "imu_monitor.py"), "reconcile")
-"""Command of the child process, with the path of the program and without its folder on the module path.
-
-A foreign module with the name ``monitor`` is therefore never run.
-"""
+COMMAND: Final = (*PROGRAM, "reconcile")
+"""Command of the child process."""
 TIMEOUT_S: Final = 900.0
 """Time after which the child process is killed."""
 NICENESS_INCREASE: Final = 10
@@ -88,7 +85,7 @@ class Reconciler:
         Time in seconds after which the command is killed.
     """
 
-    def __init__(self, program: Sequence[str] = PROGRAM, limit_s: float = TIMEOUT_S) -> None:
+    def __init__(self, program: Sequence[str] = COMMAND, limit_s: float = TIMEOUT_S) -> None:
         self._program = tuple(program)
         self._limit_s = limit_s
         self._running: dict[str, threading.Thread] = {}

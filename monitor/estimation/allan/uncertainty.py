@@ -27,7 +27,7 @@ import numpy as np
 from drivers.sample import AXES, Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import chi2_quantile
-from monitor.noise.effects.bias_instability import FLICKER_AVAR, BiasInstability
+from monitor.noise.effects.ieee952.bias_instability import FLICKER_AVAR, BiasInstability
 
 Q, N, B, K, R = range(5)
 

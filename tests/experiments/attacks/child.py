@@ -73,7 +73,7 @@ def deadline(seconds: float) -> Iterator[None]:
 
 def replace_endless_commands() -> None:
     """Let services, ``reconcile`` and long simulations end where their arguments have been accepted."""
-    from monitor.cli import terminal_session
+    from monitor.cli.shared import terminal_session
     from monitor.commands import reconcile, simulate
     from monitor.publishing.terminal import watch
 

@@ -129,7 +129,7 @@ def test_foreign_packages_in_the_current_folder(form: str, tmp_path: Path) -> No
 def test_a_child_of_the_daemon_runs_the_same_program(tmp_path: Path) -> None:
     path = foreign(tmp_path / "ros", "packages")
     environment = os.environ | {"PYTHONPATH": str(path)}
-    command = [*live_reconcile.PROGRAM, "--help"]
+    command = [*live_reconcile.COMMAND, "--help"]
     done = subprocess.run(
         command, cwd=path, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
     )

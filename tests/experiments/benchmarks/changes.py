@@ -21,10 +21,10 @@ from drivers.sample import AXES, Floats
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.detection.change_detection import NOISE_SHARE, RATE_AT_ZERO, Change, ChangeDetector
-from monitor.noise.effects.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.bias_instability import BiasInstability
-from monitor.noise.effects.quantization_noise import QuantizationNoise
-from monitor.noise.effects.rate_random_walk import RateRandomWalk
+from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.ieee952.bias_instability import BiasInstability
+from monitor.noise.effects.ieee952.quantization_noise import QuantizationNoise
+from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
 from monitor.noise.model import NoiseModel
 from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
 

@@ -55,7 +55,7 @@ class Recorder(event.Listener):  # type: ignore[misc]
 
 def stages() -> Iterator[str]:
     """Yield the name of each part after it has been compiled by this process."""
-    from monitor.daemon import kernel_parts
+    from monitor.daemon.kernels import kernel_parts
 
     yield "imports"
     for group in kernel_parts.GROUPS:

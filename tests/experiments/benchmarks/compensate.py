@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 from drivers.recordings import load_samples
 from drivers.sample import AXES, Floats, make_block
 from monitor.commands.compensate import METHODS, Request, run_compensation
-from monitor.daemon.arma_worker import ArmaWorker
+from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import fit_arma, stationary_covariance
 from monitor.drift.compensation.compensation_result import AxisCompensation

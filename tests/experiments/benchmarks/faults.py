@@ -28,7 +28,7 @@ import numpy as np
 
 from drivers.recordings import segment
 from monitor.common.health import Health
-from monitor.daemon.device_worker import DeviceWorker
+from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.output import Output
 from monitor.daemon.service import Service
 from monitor.settings import loading

@@ -24,10 +24,10 @@ from monitor.estimation.allan.total import total_variance
 from monitor.estimation.allan.uncertainty import covariance_table
 from monitor.estimation.fit.coefficient_fit import design, fit
 from monitor.noise.effect import Source
-from monitor.noise.effects.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.bias_instability import BiasInstability
-from monitor.noise.effects.quantization_noise import QuantizationNoise
-from monitor.noise.effects.rate_random_walk import RateRandomWalk
+from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.ieee952.bias_instability import BiasInstability
+from monitor.noise.effects.ieee952.quantization_noise import QuantizationNoise
+from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
 
 SHARES: Final = (0.125, 0.25, 0.5, 0.75, 1.0)
 NOISES: Final[dict[str, tuple[float, float, float, float]]] = {  # Q N B K, τ0 = 1

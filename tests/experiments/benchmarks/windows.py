@@ -22,9 +22,9 @@ from monitor.estimation.allan.window import AllanWindow, display_spans
 from monitor.estimation.fit.coefficient_fit import Fit, design, fit
 from monitor.estimation.fit.coefficients import Status
 from monitor.noise.effect import Source
-from monitor.noise.effects.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.bias_instability import BiasInstability
-from monitor.noise.effects.rate_random_walk import RateRandomWalk
+from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.ieee952.bias_instability import BiasInstability
+from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
 from monitor.noise.model import NoiseModel
 from tests.experiments.benchmarks.machine import about, alternate, console, table
 

@@ -12,9 +12,9 @@ from drivers.errors import ConfigError
 from drivers.links import replay_link
 from drivers.sample import concatenate_blocks, make_block
 from drivers.settings_model import read_settings
-from monitor.daemon import device_worker
-from monitor.daemon.device_worker import DeviceWorker
-from monitor.daemon.kernel_readiness import KernelReadiness
+from monitor.daemon.device import device_worker
+from monitor.daemon.device.device_worker import DeviceWorker
+from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalUpdate
 from monitor.estimation.detection.model_gap import ModelGap

@@ -10,9 +10,9 @@ import pytest
 from drivers.errors import ConfigError
 from monitor.cli.warm_up import warm_up
 from monitor.common import compiled
-from monitor.daemon import kernel_compilation, kernel_parts
-from monitor.daemon.kernel_compilation import Progress
-from monitor.daemon.kernel_parts import KernelGroup, KernelPart
+from monitor.daemon.kernels import kernel_compilation, kernel_parts
+from monitor.daemon.kernels.kernel_compilation import Progress
+from monitor.daemon.kernels.kernel_parts import KernelGroup, KernelPart
 from tests.support.waiting import PATIENCE_S
 
 ANSWERS_ALL = "import sys\nfor line in sys.stdin: print(line, end='', flush=True)"
@@ -48,7 +48,7 @@ def group_of(calls: list[str], names: str) -> KernelGroup:
 def test_every_part_is_ready_in_its_order_whatever_becomes_of_the_children(
     monkeypatch: pytest.MonkeyPatch, processes: int, child: str
 ) -> None:
-    monkeypatch.setattr(kernel_compilation, "PROGRAM", (sys.executable, "-c", child))
+    monkeypatch.setattr(kernel_compilation, "COMPILER", (sys.executable, "-c", child))
     calls: list[str] = []
     told: list[Progress] = []
     group = group_of(calls, "abcd")
@@ -68,7 +68,7 @@ def test_every_part_is_ready_in_its_order_whatever_becomes_of_the_children(
 def test_progress_that_cannot_be_written_ends_the_compilation_with_its_error(
     monkeypatch: pytest.MonkeyPatch, processes: int
 ) -> None:
-    monkeypatch.setattr(kernel_compilation, "PROGRAM", (sys.executable, "-c", ANSWERS_ALL))
+    monkeypatch.setattr(kernel_compilation, "COMPILER", (sys.executable, "-c", ANSWERS_ALL))
 
     def tell(_progress: Progress) -> None:
         raise BrokenPipeError(32, "Broken pipe")
@@ -82,7 +82,7 @@ def test_progress_that_cannot_be_written_ends_the_compilation_with_its_error(
 @pytest.mark.usefixtures("_empty_cache")
 def test_processors_are_counted_where_the_system_has_no_affinity(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_getaffinity")  # as on macOS
-    monkeypatch.setattr(kernel_compilation, "PROGRAM", (sys.executable, "-c", ANSWERS_ALL))
+    monkeypatch.setattr(kernel_compilation, "COMPILER", (sys.executable, "-c", ANSWERS_ALL))
     calls: list[str] = []
     assert list(kernel_compilation.prepare_kernels(group_of(calls, "ab"), lambda _: None)) == ["a", "b"]
 
@@ -91,7 +91,7 @@ def test_processors_are_counted_where_the_system_has_no_affinity(monkeypatch: py
 def test_a_program_that_cannot_be_started_leaves_the_compilation_to_this_process(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(kernel_compilation, "PROGRAM", (str(tmp_path / "missing"),))
+    monkeypatch.setattr(kernel_compilation, "COMPILER", (str(tmp_path / "missing"),))
     calls: list[str] = []
     assert list(kernel_compilation.prepare_kernels(group_of(calls, "ab"), lambda _: None, 2)) == ["a", "b"]
     assert calls == ["a", "b"]
@@ -101,7 +101,7 @@ def test_without_a_folder_for_them_kernels_are_compiled_by_this_process_at_every
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(kernel_compilation, "cache_folder", lambda: None)
-    monkeypatch.setattr(kernel_compilation, "PROGRAM", (sys.executable, "-c", ANSWERS_ALL))
+    monkeypatch.setattr(kernel_compilation, "COMPILER", (sys.executable, "-c", ANSWERS_ALL))
     calls: list[str] = []
     told: list[Progress] = []
     group = group_of(calls, "ab")
@@ -112,7 +112,7 @@ def test_without_a_folder_for_them_kernels_are_compiled_by_this_process_at_every
 
 
 def test_the_child_ends_with_its_parent() -> None:
-    child = subprocess.Popen(kernel_compilation.PROGRAM, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    child = subprocess.Popen(kernel_compilation.COMPILER, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
     with child:
         assert child.stdin is not None
         assert child.stdout is not None
@@ -129,7 +129,7 @@ def test_the_warm_up_command_fills_an_empty_cache_and_nothing_is_compiled_after_
     def run(*arguments: str) -> "subprocess.CompletedProcess[str]":
         return subprocess.run(arguments, env=environment, capture_output=True, text=True, check=True)
 
-    command = kernel_compilation.PROGRAM[:-1]
+    command = kernel_compilation.COMPILER[:-1]
     first, second = run(*command), run(*command)
     assert first.stdout.startswith("compiled ")
     assert "compiling 2 of " in first.stderr

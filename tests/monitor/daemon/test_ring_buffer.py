@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.sample import make_block
-from monitor.daemon.ring_buffer import RingBuffer
+from monitor.daemon.device.ring_buffer import RingBuffer
 
 
 def made(first, n, lost=0):

@@ -15,7 +15,7 @@ from structlog.testing import capture_logs
 from drivers.recordings import save_samples
 from drivers.sample import Event
 from monitor.common.health import Health
-from monitor.daemon import kernel_compilation, kernel_parts
+from monitor.daemon.kernels import kernel_compilation, kernel_parts
 from monitor.daemon.output import Output
 from monitor.daemon.outputs import TableOutput
 from monitor.daemon.service import Service

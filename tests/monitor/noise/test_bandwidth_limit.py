@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import butter, sosfilt, sosfilt_zi, sosfreqz
 
 from monitor.noise.effects import BandwidthLimit
-from monitor.noise.effects.bandwidth_limit import butterworth_sections
+from monitor.noise.effects.signal_chain.bandwidth_limit import butterworth_sections
 
 
 @pytest.mark.parametrize("order", range(1, 9))

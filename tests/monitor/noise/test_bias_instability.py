@@ -4,8 +4,8 @@ import allantools
 import numpy as np
 import pytest
 
-from monitor.noise.effects import bias_instability
-from monitor.noise.effects.bias_instability import BiasInstability
+from monitor.noise.effects.ieee952 import bias_instability
+from monitor.noise.effects.ieee952.bias_instability import BiasInstability
 from tests.support.recordings import recordings
 
 

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from drivers.errors import ConfigError, DecodeError, ImuError
 from drivers.zenoh.sample_message import decode_samples, encode_samples
-from monitor.cli import options
+from monitor.cli.shared import options
 from monitor.commands import thermal
 from monitor.common import topics
 from monitor.publishing.exporters import FORMATS, export, from_analysis

@@ -14,7 +14,7 @@ import pytest
 import imu_monitor
 from drivers.recordings import load_samples
 from drivers.sample import make_block
-from monitor.daemon.operations.live_reconcile import NICENESS_INCREASE, PROGRAM, Job, Reconciler, format_result
+from monitor.daemon.operations.live_reconcile import COMMAND, NICENESS_INCREASE, Job, Reconciler, format_result
 from monitor.estimation.estimator import Estimator
 from monitor.publishing.zenoh.publisher import Command
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
@@ -227,8 +227,8 @@ def test_reports_are_kept_only_where_the_configuration_says(tmp_path: Path) -> N
 
 
 def test_the_program_is_this_one() -> None:
-    assert PROGRAM[0] == sys.executable
-    assert PROGRAM[1:] == ("-P", str(Path(imu_monitor.__file__)), "reconcile")
+    assert COMMAND[0] == sys.executable
+    assert COMMAND[1:] == ("-P", str(Path(imu_monitor.__file__)), "reconcile")
 
 
 def test_a_verdict_without_steps_and_a_step_without_confidence() -> None:

@@ -18,8 +18,8 @@ from drivers.driver import AxisMap
 from drivers.recordings import load_samples, segment
 from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentWriter
 from drivers.sample import Chunk, SampleBlock, concatenate_blocks, make_block
-from monitor.daemon.device_worker import DeviceWorker
-from monitor.daemon.kernel_readiness import KernelReadiness
+from monitor.daemon.device.device_worker import DeviceWorker
+from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.storage import recorder, recording_track, retention
 from monitor.daemon.storage.recorder import Recorder, origin
 from monitor.settings.loading import Device, Driver, Storage

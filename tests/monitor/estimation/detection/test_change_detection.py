@@ -9,11 +9,11 @@ from drivers.sample import AXES
 from monitor.estimation.detection.change_detection import LEARN_S, ChangeDetector
 from monitor.estimation.detection.change_kernel import TICK_SAMPLES, F, N, S
 from monitor.estimation.detection.change_size import Octaves, identify_noise_change
-from monitor.noise.effects.angle_random_walk import AngleRandomWalk
-from monitor.noise.effects.bias_instability import BiasInstability
-from monitor.noise.effects.quantization_noise import QuantizationNoise
-from monitor.noise.effects.rate_ramp import RateRamp
-from monitor.noise.effects.rate_random_walk import RateRandomWalk
+from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
+from monitor.noise.effects.ieee952.bias_instability import BiasInstability
+from monitor.noise.effects.ieee952.quantization_noise import QuantizationNoise
+from monitor.noise.effects.ieee952.rate_ramp import RateRamp
+from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
 from monitor.noise.model import NoiseModel
 
 SIGMA = 1e-3

@@ -3,10 +3,10 @@
 import time
 
 from monitor.common.health import Health
-from monitor.daemon.latency_meter import LatencyMeter
+from monitor.daemon.device.latency_meter import LatencyMeter
+from monitor.daemon.device.ring_buffer import RingBuffer
+from monitor.daemon.device.window_restore import WindowRestore
 from monitor.daemon.result_publisher import ResultPublisher
-from monitor.daemon.ring_buffer import RingBuffer
-from monitor.daemon.window_restore import WindowRestore
 
 
 class DeviceStatus:

@@ -15,8 +15,8 @@ from drivers.errors import ImuError
 from drivers.recordings.segment import DaemonState
 from drivers.sample import AXES, Event, Ints, SampleBlock, make_block
 from drivers.timing.sample_clock import LastSample, SampleClock
-from monitor.daemon.device_timeline import DeviceTimeline
-from monitor.daemon.pipeline import DevicePipeline
+from monitor.daemon.device.device_timeline import DeviceTimeline
+from monitor.daemon.device.pipeline import DevicePipeline
 from monitor.daemon.storage.recording_tail import RecordingTail
 from monitor.settings.loading import Device
 

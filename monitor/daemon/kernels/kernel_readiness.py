@@ -7,7 +7,7 @@ from typing import Final
 
 import structlog
 
-from monitor.daemon import kernel_compilation, kernel_parts
+from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
 MAX_INTERPRETED_HZ: Final = 250.0
 """Maximum total sample rate of the devices whose kernels are interpreted. A sample takes up to 0.8 ms."""

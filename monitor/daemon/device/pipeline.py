@@ -17,8 +17,8 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.sample import AXES, Event, Floats, SampleBlock
 from monitor.common.compiled import interpreted
-from monitor.daemon.arma_worker import ArmaWorker
-from monitor.daemon.kernel_readiness import KernelReadiness
+from monitor.daemon.device.arma_worker import ArmaWorker
+from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.drift.thermal.live_thermal import LiveThermal, ThermalUpdate
 from monitor.estimation.detection.model_gap import ModelComparison

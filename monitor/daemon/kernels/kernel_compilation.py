@@ -26,17 +26,12 @@ import numba
 from llvmlite import binding
 
 from monitor.common.compiled import cache_folder, source_hash
-from monitor.daemon.kernel_parts import GROUPS, KernelGroup, KernelPart
+from monitor.common.program import PROGRAM
+from monitor.daemon.kernels.kernel_parts import GROUPS, KernelGroup, KernelPart
 
 MAX_PROCESSES: Final = 2
 """Largest number of compiling processes. Each takes some 200 MB, which must be available on a small board too."""
-PROGRAM: Final = (
-    sys.executable,
-    "-P",
-    str(Path(__file__).resolve().parents[2] / "imu_monitor.py"),
-    "warm-up",
-    "--from-stdin",
-)
+COMPILER: Final = (*PROGRAM, "warm-up", "--from-stdin")
 """Command line of a child process."""
 NICENESS: Final = 5
 """Niceness of the child processes. The processing of samples has priority."""
@@ -198,7 +193,7 @@ class _ChildProcesses:
             with (
                 suppress(OSError),
                 subprocess.Popen(
-                    PROGRAM, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, start_new_session=True
+                    COMPILER, stdin=pipe, stdout=pipe, stderr=subprocess.DEVNULL, text=True, start_new_session=True
                 ) as child,
             ):
                 os.setpriority(os.PRIO_PROCESS, child.pid, NICENESS)

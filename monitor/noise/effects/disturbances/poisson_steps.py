@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
-from monitor.noise.effects.rate_random_walk import RateRandomWalk
+from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
 from monitor.noise.random_events import RandomEvents
 from monitor.noise.spectrum import Spectrum
 

@@ -78,7 +78,7 @@ def progress() -> Iterator[ProgressCallback]:
 
 def compile_kernels(tell: ProgressCallback) -> None:
     """Compile the kernels for the analysis of recordings in parallel, if they are not in the cache on disk."""
-    from monitor.daemon import kernel_compilation, kernel_parts
+    from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
     for group in kernel_parts.GROUPS:
         if not kernel_compilation.is_warm(group):

@@ -16,15 +16,15 @@ from drivers.links.replay_link import ReplayLink
 from drivers.sample import Chunk, Floats, SampleBlock
 from drivers.timing.sample_clock import SampleClock
 from monitor.common.health import Health
-from monitor.daemon.device_status import DeviceStatus
-from monitor.daemon.kernel_readiness import KernelReadiness
+from monitor.daemon.device.device_status import DeviceStatus
+from monitor.daemon.device.pipeline import DevicePipeline
+from monitor.daemon.device.ring_buffer import RingBuffer
+from monitor.daemon.device.window_restore import WindowRestore
+from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.limits import LimitMonitor, read_model_in_force
 from monitor.daemon.output import Output
-from monitor.daemon.pipeline import DevicePipeline
 from monitor.daemon.result_publisher import ResultPublisher
-from monitor.daemon.ring_buffer import RingBuffer
 from monitor.daemon.storage.recorder import Recorder
-from monitor.daemon.window_restore import WindowRestore
 from monitor.estimation.window_snapshot import WindowSnapshot
 from monitor.settings.loading import Device, VirtualTable
 

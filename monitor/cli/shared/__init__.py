@@ -1,0 +1,1 @@
+"""Options, output and error messages that the commands share."""

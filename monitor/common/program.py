@@ -1,0 +1,11 @@
+"""Command line with which the program starts itself in a child process."""
+
+import sys
+from pathlib import Path
+from typing import Final
+
+PROGRAM: Final = (sys.executable, "-P", str(Path(__file__).resolve().parents[2] / "imu_monitor.py"))
+"""Interpreter and path of the program, without the folder of the program on the module path.
+
+A foreign module with the name ``monitor`` is therefore never run. The name of a command follows.
+"""

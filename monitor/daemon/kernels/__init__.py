@@ -1,0 +1,1 @@
+"""Compilation of the numerical kernels when the daemon starts."""

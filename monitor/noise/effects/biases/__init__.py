@@ -1,0 +1,1 @@
+"""Effects that add a bias or change it with time or temperature."""

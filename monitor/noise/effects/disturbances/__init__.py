@@ -1,0 +1,1 @@
+"""Disturbances beyond the terms of IEEE Std 952."""

@@ -1,0 +1,1 @@
+"""Noise terms of IEEE Std 952."""
