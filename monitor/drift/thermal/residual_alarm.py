@@ -3,7 +3,7 @@
 Every interval is predicted one step ahead before it is used for the fit. If the model is true, one in forty intervals
 lies above its 95 % prediction interval and one in forty below, independently. If MIN_OUTSIDE of the last
 WINDOW_INTERVALS known intervals lie outside on the same side, a change is suspected. ``online_thermal_model`` resolves
-the suspicion. docs/thermal.md has the measured rate of false alarms.
+the suspicion. The measured rate of false alarms is in docs/thermal-measurements.md.
 """
 
 from collections import deque

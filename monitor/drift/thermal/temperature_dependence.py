@@ -5,7 +5,8 @@ on temperature. Both tests are therefore generalised least squares under a null 
 noise of the interval means plus a random walk whose increments may be correlated themselves (a smooth drift). The
 ratio of the two and the correlation of the increments are not known. An F test is made for every pair on a grid, and
 the least significant result counts among the pairs whose log restricted likelihood (Harville, J. Am. Stat. Assoc. 72,
-1977) is within MAX_LIKELIHOOD_LOSS of the best. The measured false positive rates are in docs/thermal.md.
+1977) is within MAX_LIKELIHOOD_LOSS of the best. The measured false positive rates are in
+docs/thermal-measurements.md.
 
 ``find_dependence`` tests a cubic polynomial in temperature, alone and with each description of hysteresis.
 ``find_hysteresis`` tests the descriptions of hysteresis beside a polynomial of order 5. The descriptions are:

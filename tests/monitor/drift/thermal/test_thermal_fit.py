@@ -32,7 +32,7 @@ def errors(seed, lag_h, noise):
     ("lag_h", "noise", "most"), [(1, 0.05, 0.65), (2, 0.05, 0.45), (4, 0.05, 0.3), (4, 0.02, 0.15)]
 )
 def test_late_heat_is_followed(lag_h, noise, most):
-    """The paper has 0.654 of a cubic's error; medians of 200 seeds stand in docs/thermal.md."""
+    """The paper has 0.654 of a cubic's error; medians of 200 seeds are in docs/thermal-measurements.md."""
     ratios, inside, found = zip(*(errors(seed, lag_h, noise) for seed in range(6)), strict=True)
     assert np.median(ratios) < most
     assert np.mean(inside) > 0.9
