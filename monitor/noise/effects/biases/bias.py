@@ -19,7 +19,7 @@ class Bias(Source):
 
     value: float = parameter("rad/s", "m/s²", signed=True)
 
-    description: ClassVar[str] = "What the sensor reads when it should read zero."
+    description: ClassVar[str] = "The sensor reads a constant value when the true value is zero."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return a spectrum that has only a constant level."""

@@ -21,7 +21,7 @@ class BiasStep(Source):
     time: float = parameter("s")
     height: float = parameter("rad/s", "m/s²", signed=True)
 
-    description: ClassVar[str] = "The bias jumps once and stays there, as after a knock."
+    description: ClassVar[str] = "The bias jumps once and keeps the new value, for example after a knock."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return NaN, because the effect of a single step depends on the length of the recording."""

@@ -22,7 +22,7 @@ class TemperatureBias(Source):
     reference: float = parameter("°C", signed=True)
     quadratic: float | None = parameter("rad/s/°C²", "m/s²/°C²", signed=True, optional=True)
 
-    description: ClassVar[str] = "The bias moves with the temperature of the sensor, without delay."
+    description: ClassVar[str] = "The bias depends on the temperature of the sensor, without delay."
     uses_temperature: ClassVar[bool] = True
 
     def spectrum(self, tau0_s: float) -> Spectrum:

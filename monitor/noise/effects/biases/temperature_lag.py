@@ -29,7 +29,7 @@ class TemperatureLag(Source):
     reference: float = parameter("°C", signed=True)
     time_constant: float = parameter("s", positive=True)
 
-    description: ClassVar[str] = "The bias follows the temperature of the sensor, but later: heat takes its time."
+    description: ClassVar[str] = "The bias follows the temperature of the sensor with a delay."
     uses_temperature: ClassVar[bool] = True
 
     def spectrum(self, tau0_s: float) -> Spectrum:

@@ -23,7 +23,7 @@ class TurnOnTransient(Source):
     amplitude: float = parameter("rad/s", "m/s²", signed=True)
     time_constant: float = parameter("s", positive=True)
 
-    description: ClassVar[str] = "After switching on the bias runs in, quickly at first, then ever more slowly."
+    description: ClassVar[str] = "After the sensor is switched on, the bias decays exponentially to its final value."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return NaN, because the effect of a single transient depends on the length of the recording."""

@@ -20,7 +20,7 @@ class CrossAxis(Leak):
     source: str = source_axis()
     coefficient: float = parameter("1", signed=True)
 
-    description: ClassVar[str] = "The axis is not square to its neighbour and reads a little of it."
+    description: ClassVar[str] = "A misalignment adds a share of the signal of another axis."
 
     def check_axis(self, axis: str) -> None:
         """Raise ConfigError if the source is the same axis or an axis of the other kind."""

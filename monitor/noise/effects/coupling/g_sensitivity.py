@@ -21,7 +21,7 @@ class GSensitivity(Leak):
     source: str = source_axis()
     coefficient: float = parameter("rad/s per m/s²", "1", signed=True)
 
-    description: ClassVar[str] = "The gyroscope feels acceleration: gravity and vibration shift its reading."
+    description: ClassVar[str] = "Gravity and vibration change the reading of the gyroscope."
 
     def check_axis(self, axis: str) -> None:
         """Raise ConfigError if the axis is not a gyroscope, or the source not an accelerometer."""

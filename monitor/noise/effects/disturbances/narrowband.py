@@ -31,7 +31,7 @@ class Narrowband(Source):
     frequency: float = parameter("Hz", positive=True, below_nyquist=True)
     bandwidth: float = parameter("Hz", positive=True)
 
-    description: ClassVar[str] = "Something near rings at its own frequency, with an amplitude that comes and goes."
+    description: ClassVar[str] = "A nearby resonance adds an oscillation with a randomly varying amplitude."
 
     @property
     def _decay(self) -> complex:

@@ -20,4 +20,4 @@ class NoiseStep(Effect):
     time: float = parameter("s")
     ratio: float = parameter("1")
 
-    description: ClassVar[str] = "From one moment on the white noise is stronger, or weaker, by a factor."
+    description: ClassVar[str] = "The size of the white noise changes once by a factor."

@@ -25,7 +25,7 @@ class Outliers(Source):
     fraction: float = parameter("1", most=1.0)
     scale: float = parameter("rad/s", "m/s²")
 
-    description: ClassVar[str] = "Single samples are far off, the next ones are right again."
+    description: ClassVar[str] = "Single samples deviate strongly from their neighbours."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return the spectrum of independent samples of variance ps²."""

@@ -27,7 +27,7 @@ class PoissonSteps(Source):
     rate: float = parameter("1/s")
     height: float = parameter("rad/s", "m/s²")
 
-    description: ClassVar[str] = "Now and then the bias jumps to a new place and stays there."
+    description: ClassVar[str] = "The bias jumps at random times and keeps each new value."
 
     @property
     def events_hz(self) -> float:

@@ -28,7 +28,9 @@ class RandomTelegraph(Source):
     amplitude: float = parameter("rad/s", "m/s²")
     dwell_time: float = parameter("s", positive=True)
 
-    description: ClassVar[str] = "The bias jumps between two levels at random times, like popcorn."
+    description: ClassVar[str] = (
+        "The bias jumps between two levels at random times, which is also called popcorn noise."
+    )
 
     @property
     def events_hz(self) -> float:

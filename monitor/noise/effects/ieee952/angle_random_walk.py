@@ -20,7 +20,7 @@ class AngleRandomWalk(Source):
 
     N: float = parameter("rad/√s", "m/s/√s")
 
-    description: ClassVar[str] = "White noise of the rate: averaging four times as long halves it."
+    description: ClassVar[str] = "White noise of the rate averages out with the square root of the averaging time."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return S = N² and σ² = N²/τ."""

@@ -57,7 +57,9 @@ class BiasInstability(Source):
 
     B: float = parameter("rad/s", "m/s²")
 
-    description: ClassVar[str] = "Slow flicker of the bias: the floor that no averaging gets below."
+    description: ClassVar[str] = (
+        "The bias fluctuates with 1/f noise, so longer averaging does not reduce the error below a floor."
+    )
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return S = B²/(2πf) and σ² = (2 ln 2/π) B².

@@ -29,7 +29,7 @@ class ExponentiallyCorrelated(Source):
     sigma: float = parameter("rad/s", "m/s²")
     correlation_time: float = parameter("s", positive=True)
 
-    description: ClassVar[str] = "The bias wanders and comes back, and forgets where it was after a correlation time."
+    description: ClassVar[str] = "The bias fluctuates about zero with an exponential autocorrelation."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return the closed forms of the class docstring."""

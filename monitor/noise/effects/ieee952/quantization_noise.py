@@ -20,9 +20,7 @@ class QuantizationNoise(Source):
 
     Q: float = parameter("rad", "m/s")
 
-    description: ClassVar[str] = (
-        "The angle is rounded anew at every reading: strong between neighbouring samples, gone over seconds."
-    )
+    description: ClassVar[str] = "Rounding of the angle adds noise that averages out faster than white noise."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return S = 4Q²/τ0 sin²(πfτ0) and σ² = 3Q²/τ²."""

@@ -20,7 +20,7 @@ class RateRamp(Source):
 
     R: float = parameter("rad/s²", "m/s³")
 
-    description: ClassVar[str] = "The bias moves steadily in one direction, as while a sensor warms up."
+    description: ClassVar[str] = "The bias changes at a constant rate, for example while a sensor warms up."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return a spectrum that has only a slope."""

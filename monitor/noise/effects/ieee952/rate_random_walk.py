@@ -24,7 +24,7 @@ class RateRandomWalk(Source):
 
     K: float = parameter("rad/s/√s", "m/s²/√s")
 
-    description: ClassVar[str] = "The bias itself takes random steps and never returns: worse the longer one averages."
+    description: ClassVar[str] = "The bias takes independent random steps, so the error grows with the averaging time."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return S = K²τ0²/(4 sin²(πfτ0)) and σ² = K²τ/3 (1 + τ0²/(2τ²))."""

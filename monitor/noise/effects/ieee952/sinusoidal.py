@@ -33,9 +33,7 @@ class Sinusoidal(Source):
     frequency: float = parameter("Hz", positive=True, below_nyquist=True)
     phase: float | None = parameter("rad", signed=True, optional=True)
 
-    description: ClassVar[str] = (
-        "A steady oscillation at one frequency: a line in the spectrum, waves in the Allan curve."
-    )
+    description: ClassVar[str] = "A steady oscillation adds a line to the spectrum and waves to the Allan deviation."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return a spectrum that has only one line, because a line has power but no density."""

@@ -27,7 +27,7 @@ class BandwidthLimit(Transform):
     cutoff: float = parameter("Hz", positive=True, below_nyquist=True)
     order: int = parameter("1", positive=True, whole=True, most=8)
 
-    description: ClassVar[str] = "The sensor's own filter lets slow motion through and damps what is fast, noise too."
+    description: ClassVar[str] = "The low-pass filter of the sensor attenuates fast motion and high-frequency noise."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum times |H|²."""

@@ -30,7 +30,7 @@ class Resolution(Transform):
 
     step: float = parameter("rad/s", "m/s²", positive=True)
 
-    description: ClassVar[str] = "The output moves in steps of one least significant bit."
+    description: ClassVar[str] = "The output changes in steps of one least significant bit."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum plus white noise of variance step²/12, or NaN if the Allan deviation is too small."""

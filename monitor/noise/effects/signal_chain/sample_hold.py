@@ -28,7 +28,7 @@ class SampleHold(Transform):
 
     fraction: float = parameter("1", most=0.999)
 
-    description: ClassVar[str] = "Some samples are not new: the value before is sent once more."
+    description: ClassVar[str] = "Some samples repeat the previous value."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum by the formula of the class docstring."""

@@ -27,7 +27,9 @@ class SampleRateError(Transform):
 
     ratio: float = parameter("1", positive=True, quantity=RATE_RATIO)
 
-    description: ClassVar[str] = "The clock is off: what happens at one frequency is seen at another."
+    description: ClassVar[str] = (
+        "The true sample rate differs from the stated rate, which scales all times and frequencies."
+    )
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum unchanged; ``restated`` converts its time scale after all transforms."""

@@ -30,7 +30,7 @@ class Saturation(Transform):
 
     limit: float = parameter("rad/s", "m/s²", positive=True)
 
-    description: ClassVar[str] = "Beyond its range the sensor reads the end of the range."
+    description: ClassVar[str] = "Values beyond the measurement range are replaced by the end of the range."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum unchanged if the series stays within the range for an hour, else NaN."""

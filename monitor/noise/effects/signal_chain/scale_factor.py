@@ -21,7 +21,7 @@ class ScaleFactor(Transform):
     factor: float = parameter("1")
 
     description: ClassVar[str] = (
-        "Everything the axis reads is too large or too small by one factor, as after a slip of units."
+        "All values of the axis are multiplied by a constant, for example after an error of units."
     )
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
