@@ -2,7 +2,8 @@
 
     python -m tests.experiments.benchmarks.coverage --json coverage.jsonl                # all cells, 20 minutes
     python -m tests.experiments.benchmarks.coverage --json coverage.jsonl --records 120  # fewer
-    python -m tests.experiments.benchmarks.coverage --json coverage.jsonl --records 0 --page docs/statistics-measurements.md
+
+With ``--records 0 --page docs/statistics-measurements.md``, the program only writes the tables into the page.
 
 Counted for each cell (a noise and a length of record at 100 Hz), in percent with the 95 % interval of Wilson:
 
