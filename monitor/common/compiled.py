@@ -10,7 +10,7 @@ Without further measures, Numba generates machine code for each kernel before an
 the copy in the calling kernel. A function four calls below the kernel that Python calls would go through LLVM five
 times. ``Kernel`` therefore keeps functions that other kernels call as intermediate code. This code is optimised once,
 as a part of the kernel that Python calls. This saves more than a quarter of the time of a first start
-(``docs/benchmarks.md``). The machine code of the outer kernels is the same.
+(``docs/benchmarks-service.md``). The machine code of the outer kernels is the same.
 
 Kernels receive and return NamedTuples of arrays. In a loop, array fields are first copied to local names, because Numba
 counts a reference at each access to a field.
