@@ -89,14 +89,14 @@ def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) 
     ConfigError
         A file cannot be written, or its suffix is not supported.
     """
-    from drivers.recordings.formats import format_for_path
+    from drivers.recordings.formats import find_format
 
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
     for option, place in (("--json", json), ("--out", out), ("--plot", plot)):
         output.check_place(option, place)
     if out is not None:
-        format_for_path(out)
+        find_format(out)
 
 
 def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: Path | None, plot: Path | None) -> None:

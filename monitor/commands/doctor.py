@@ -29,10 +29,10 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from drivers import file_access
-from drivers.extras import missing_packages
-from drivers.links.can_link import missing_package
+from drivers.extras import find_missing_packages
+from drivers.links.can_link import describe_missing_package
 from drivers.links.replay_link import ReplayLink
-from drivers.quantities import DAY_S
+from drivers.number_ranges import DAY_S
 from monitor.commands.check import check
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, lock_holder
 from monitor.settings.file_permissions import contains_secret
@@ -216,7 +216,7 @@ def check_can_interface(
     sysfs : Path, optional
         Folder with the network interfaces of the kernel.
     """
-    if missing := missing_package(interface):
+    if missing := describe_missing_package(interface):
         text, _, command = missing.partition(": ")
         return [Finding("wrong", about, text, command)]
     if interface != "socketcan":
@@ -336,7 +336,7 @@ def _check_metrics(config: Config) -> list[Finding]:
 
 def _check_reconcile(config: Config) -> list[Finding]:
     """Check that ``command/reconcile`` can be answered, if a folder is configured for its reports."""
-    missing = missing_packages("reconcile")
+    missing = find_missing_packages("reconcile")
     if not missing or not any(one.reconcile_folder for one in config.devices):
         return []
     text = (
@@ -360,7 +360,7 @@ def _check_storage(config: Config) -> list[Finding]:
         found.append(Finding("wrong", "storage", text, 'pip install "imu-monitor[arrow]"'))
     folder = next(one for one in (own.folder, *own.folder.parents) if os.path.exists(one))
     try:
-        file_access.check_folder(folder)
+        file_access.check_folder_or_absent(folder)
         with tempfile.TemporaryFile(dir=folder):
             pass
         usage = shutil.disk_usage(folder)

@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from drivers.errors import ConfigError
-from drivers.quantities import SAMPLE_COUNT
+from drivers.number_ranges import SAMPLE_COUNT
 from drivers.recordings import Recording, load_samples, open_recording_writer
 from drivers.recordings.writing import atomic_write_path
 from drivers.sample import AXES, Floats

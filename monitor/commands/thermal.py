@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers import file_access
 from drivers.errors import ConfigError, NotReady
-from drivers.quantities import DURATION_S, FIT_NUMBER
+from drivers.number_ranges import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks, load_samples
 from drivers.sample import AXES, Floats
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
@@ -182,8 +182,14 @@ def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalMod
     wrong = [
         (axis in AXES, f"no such axis; possible are {', '.join(AXES)}"),
         (row.powers >= 0, f"powers: {row.powers}; it must be 0 or more"),
-        (all(map(DURATION_S.supports, row.time_constants)), f"time_constants: each must be {DURATION_S.range_text()}"),
-        (all(map(FIT_NUMBER.supports, numbers)), f"a number is outside the supported range {FIT_NUMBER.range_text()}"),
+        (
+            all(map(DURATION_S.supports, row.time_constants)),
+            f"time_constants: each must be {DURATION_S.format_range()}",
+        ),
+        (
+            all(map(FIT_NUMBER.supports, numbers)),
+            f"a number is outside the supported range {FIT_NUMBER.format_range()}",
+        ),
         (len(row.sizes) == terms, f"sizes: {len(row.sizes)} of them; {terms} are needed"),
         (len(row.start) == k, f"start: {len(row.start)} of them; {k} are needed"),
         (row.temperature[0] < row.temperature[1], "temperature: the coldest and the warmest of the fit are needed"),

@@ -17,7 +17,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from drivers.file_access import FILE_KINDS, check_folder
+from drivers.file_access import FILE_KINDS, check_folder_or_absent
 
 RECORDING_LOCK: Final = "recording.lock"
 """Name of the lock file for recordings."""
@@ -66,7 +66,7 @@ class FolderLock:
             if self._in_place(self._descriptor):
                 return ""
             self.release()
-        check_folder(self.folder)
+        check_folder_or_absent(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         descriptor = _open_lock_file(self.path)
         try:

@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from drivers.quantities import DAY_S, HOUR_S
+from drivers.number_ranges import DAY_S, HOUR_S
 from drivers.sample import AXES
 from drivers.units import G0
 

@@ -24,7 +24,7 @@ import numpy as np
 
 from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
-from drivers.quantities import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, Quantity
+from drivers.number_ranges import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, NumberRange
 from drivers.sample import AXES, Floats
 from monitor.noise.spectrum import Spectrum
 
@@ -264,7 +264,7 @@ def parameter(
     optional: bool = False,
     below_nyquist: bool = False,
     most: float = inf,
-    quantity: Quantity | None = None,
+    quantity: NumberRange | None = None,
 ) -> Any:
     """Return a dataclass field with its units and its allowed range. The default range is all numbers ≥ 0.
 
@@ -285,8 +285,8 @@ def parameter(
         True if the parameter is a frequency that must be below half the sample rate.
     most : float
         Largest allowed value.
-    quantity : Quantity or None
-        Quantity with the supported range. None selects the quantity by the unit.
+    quantity : NumberRange or None
+        NumberRange with the supported range. None selects the quantity by the unit.
     """
     metadata = {
         "units": (gyro_unit, accelerometer_unit or gyro_unit),
@@ -342,7 +342,7 @@ def _find_mistake(value: Any, allows: Mapping[str, Any]) -> str:
     if value == 0.0 and allows["positive"]:
         return "must be above zero"
     if not allows["quantity"].supports(value):
-        return f"must be {allows['quantity'].range_text()}"
+        return f"must be {allows['quantity'].format_range()}"
     if value > allows["most"]:
         return f"must be at most {allows['most']:g}"
     return "must be a whole number" if allows["whole"] and value != int(value) else ""

@@ -12,7 +12,7 @@ from typing import Any, Final, TypeVar
 
 from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
-from drivers.quantities import RATE_HZ
+from drivers.number_ranges import RATE_HZ
 from drivers.sample import AXES
 from monitor.noise.effect import GYROS, Effect, ParameterTable, parameter_units, required_parameters
 from monitor.noise.effects import EFFECTS

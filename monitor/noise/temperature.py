@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ConfigError
-from drivers.quantities import DURATION_S, TEMPERATURE_C
+from drivers.number_ranges import DURATION_S, TEMPERATURE_C
 from drivers.sample import Floats
 from monitor.noise.effect import FunctionSeries, NoiseSeries, ParameterTable, SampleBlockContext, parameter
 from monitor.noise.effects.ieee952.exponentially_correlated import ExponentiallyCorrelated

@@ -9,7 +9,7 @@ from pydantic import BeforeValidator
 from drivers import file_access
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError
-from drivers.quantities import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, format_value
+from drivers.number_ranges import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, format_value
 from drivers.settings_model import ReadAs, checked_by
 from monitor.common.topics import ENDPOINT
 

@@ -10,8 +10,8 @@ from typing import Any, Final
 
 from drivers import file_access
 from drivers.errors import ConfigError, format_one_line
-from drivers.settings_model import CheckedTable, Problem, check_table
-from drivers.zenoh.session import build_session_config, find_secret_files, format_error
+from drivers.settings_model import Problem, TableCheckResult, check_table
+from drivers.zenoh.session_config import build_session_config, find_secret_files, format_zenoh_error
 from monitor.settings import file_permissions, toml_text
 from monitor.settings.driver_settings import Driver, FaultsTable, VirtualTable
 from monitor.settings.field_types import Metrics, check_viewer_mode, period, seconds
@@ -163,14 +163,14 @@ def _configuration(file: ConfigFile) -> Config:
     return Config(file.devices, file.zenoh, file.viewer, file.log, storage, file.hooks, file.metrics.listen)
 
 
-def _check_zenoh_file(checked: CheckedTable[ConfigFile]) -> list[str]:
+def _check_zenoh_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
     """Check that zenoh accepts its file, and that nobody else can change it. Return warnings about readable secrets."""
     zenoh = checked.value.zenoh if checked.value else None
     if zenoh is None or zenoh.config is None or zenoh.mode == "none":
         return []
     path = zenoh.config
     if not os.path.exists(path):
-        checked.add("zenoh.config", f"{path}: no such file")
+        checked.add_problem("zenoh.config", f"{path}: no such file")
         return []
     if line := file_permissions.describe_write_access(path):
         checked.problems.append(Problem("zenoh.config", line))
@@ -197,7 +197,7 @@ def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
     try:
         return find_secret_files(build_session_config({}, path))
     except zenoh.ZError as error:
-        text = format_error(error)
+        text = format_zenoh_error(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from error
 
 
@@ -215,7 +215,7 @@ def _device_name(table: Mapping[str, Any], index: int) -> str:
     return f"device {name}" if isinstance(name, str) and DEVICE_NAME.fullmatch(name) else ""
 
 
-def _model_uses(checked: CheckedTable[ConfigFile], table: Mapping[str, Any]) -> tuple[ModelUse, ...]:
+def _model_uses(checked: TableCheckResult[ConfigFile], table: Mapping[str, Any]) -> tuple[ModelUse, ...]:
     """Return what is to be checked against model files, as far as it is not wrong."""
     uses = []
     for i, device in enumerate(checked.value.devices if checked.value else ()):

@@ -14,7 +14,7 @@ import structlog
 
 from drivers.decoders.base import Decoder
 from drivers.errors import ConfigError
-from drivers.sample import NO_TICK, Chunk, CounterTiming, Floats, Ints, make_block
+from drivers.sample import NO_TICK, Chunk, CounterTimedFormat, Floats, Ints, make_block
 from monitor.noise.catalogue import read_model
 from monitor.noise.simulation import ModelStream
 from monitor.settings.loading import VirtualTable
@@ -157,7 +157,7 @@ class SimulatedSensor:
     def _ticks(self, index: Ints) -> Ints:
         """Return the counter values of samples."""
         timing = self._decoder.timing
-        if not isinstance(timing, CounterTiming):
+        if not isinstance(timing, CounterTimedFormat):
             return np.full(index.size, NO_TICK, np.int64)
         ticks = index if timing.tick_s is None else np.rint(index / (self.rate_hz * timing.tick_s)).astype(np.int64)
         result: Ints = ticks % timing.modulus

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final
 from drivers.errors import LinkUnavailable
 from drivers.links import zenoh_link
 from drivers.sample import Chunk
-from drivers.zenoh.session import build_session_config, format_error
+from drivers.zenoh.session_config import build_session_config, format_zenoh_error
 
 if TYPE_CHECKING:
     import zenoh
@@ -52,7 +52,7 @@ class ZenohPort:
                 self._session = zenoh.open(build_session_config({"listen/endpoints": [self._endpoint]}))
                 self._publisher = self._session.declare_publisher(KEY)
             except zenoh.ZError as error:
-                raise LinkUnavailable(f"simulated sensor at {self._endpoint}: {format_error(error)}") from error
+                raise LinkUnavailable(f"simulated sensor at {self._endpoint}: {format_zenoh_error(error)}") from error
 
     def unplug(self) -> None:
         """Close the session."""

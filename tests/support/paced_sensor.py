@@ -65,7 +65,7 @@ def follow_reader(imu: VirtualImu, driver: Driver, allowed: Callable[[], float] 
         if not is_plugged(imu):
             return min(host_s - begun_s, (allowed() + 0.5) / imu._pace_hz)
         if is_open(imu):
-            waiting = imu.truth.sent + imu.truth.repeated - driver.counts.received - driver.clock.repeated_rows
+            waiting = imu.truth.sent + imu.truth.repeated - driver.counts.received - driver.clock.dropped_repeated_rows
             limit = max(limit, min(imu.truth.made + AHEAD - waiting, allowed()))
         return min(host_s - begun_s, (limit + 0.5) / imu._pace_hz)
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, overload
 import typer
 
 from drivers.errors import ConfigError, format_one_line
-from drivers.quantities import (
+from drivers.number_ranges import (
     AVERAGING_TIME_S,
     DURATION_S,
     INFLATION,
@@ -16,7 +16,7 @@ from drivers.quantities import (
     RUN_TIME_S,
     SEED,
     Number,
-    Quantity,
+    NumberRange,
 )
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ MAX_AVERAGING_TIMES: Final = 1000
 """Largest number of averaging times in a list."""
 
 
-def within(quantity: Quantity) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
+def within(quantity: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
     """Return a typer callback that checks the number of an option against a quantity.
 
     Raises

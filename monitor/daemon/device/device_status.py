@@ -56,8 +56,8 @@ class DeviceStatus:
             outputs=dict(states),
             text=self._text(),
             uptime_s=time.monotonic() - self._started_s,
-            repeated=clock.repeated_rows,
-            late=clock.late_rows + driver.counts.late,
+            repeated=clock.dropped_repeated_rows,
+            late=clock.dropped_late_rows + driver.counts.late,
             moving=signal_monitor is not None and signal_monitor.moving,
             moved=signal_monitor.moved_samples if signal_monitor is not None else 0,
             crossed=self._publisher.limits.crossed,
@@ -77,7 +77,7 @@ class DeviceStatus:
         lacking = self._missing_estimate_text() if driver.state in ("running", "ended") else ""
         if driver.text or driver.state != "running":
             return f"{driver.text.rstrip('.')}; {lacking}" if lacking else driver.text
-        return lacking or driver.late_hint or self._publisher.timeline.offset_text()
+        return lacking or driver.late_frames_hint or self._publisher.timeline.offset_text()
 
     def _missing_estimate_text(self) -> str:
         """Return the reason why there are no coefficients; empty if there are coefficients, or will be."""

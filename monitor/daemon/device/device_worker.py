@@ -219,7 +219,7 @@ class DeviceWorker:
     def _check_rate(self, drain: bool) -> None:
         """Withhold the coefficients while the configured rate is contradicted by the data, or is not checked yet."""
         if drain:
-            self.clock.end()
+            self.clock.compare_rates_at_end()
         doubts = (self.clock.contradicted_hz is not None, self.clock.rate_check_pending)
         if doubts != self._rate_doubts:
             self._rate_doubts = doubts

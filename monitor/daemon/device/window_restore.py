@@ -90,7 +90,7 @@ class WindowRestore:
         before, estimator = self._state_before, self._pipeline.estimator
         if self.active:
             return before
-        tick_step = self._clock.tick_step or before.tick_step
+        tick_step = self._clock.ticks_per_sample or before.tick_step
         if estimator is None:
             return msgspec.structs.replace(before, rate=self._clock.rate_hz or before.rate, tick_step=tick_step)
         offset_ns = self._timeline.offset_ns(self._pipeline.newest_ns)

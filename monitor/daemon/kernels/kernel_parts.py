@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.extras import missing_packages
+from drivers.extras import find_missing_packages
 from drivers.sample import SampleBlock, make_block
 from monitor.drift.compensation.arma import fit_arma
 from monitor.drift.compensation.compensator import Compensator
@@ -124,7 +124,7 @@ SERVICE: Final = KernelGroup(
 _ANALYSIS: Final = KernelPart("analysis of recordings", _call_analysis)
 _RECONCILIATION: Final = KernelPart("reconciliation", _call_reconciliation)
 COMMANDS: Final = KernelGroup(
-    "commands", (_ANALYSIS,) if missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION)
+    "commands", (_ANALYSIS,) if find_missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION)
 )
 """Parts that only the commands on recordings need. A few kernels of rare cases are compiled at their first call."""
 GROUPS: Final = (SERVICE, COMMANDS)

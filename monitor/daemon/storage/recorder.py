@@ -26,7 +26,7 @@ from typing import Final
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import segment
-from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentWriter
+from drivers.recordings.segment import DaemonState, SegmentMetadata, SingleSegmentWriter
 from drivers.sample import AXES, Chunk, Ints, SampleBlock, make_block
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
 from monitor.daemon.storage import retention
@@ -60,7 +60,9 @@ class Recorder:
         Opens a segment. Tests pass functions that simulate slow and broken disks.
     """
 
-    def __init__(self, storage: Storage, origins: Sequence[SegmentMetadata], opening: Opening = SegmentWriter) -> None:
+    def __init__(
+        self, storage: Storage, origins: Sequence[SegmentMetadata], opening: Opening = SingleSegmentWriter
+    ) -> None:
         self._storage = storage
         self._opening = opening
         self._events: deque[RecorderEvent] = deque(maxlen=1000)

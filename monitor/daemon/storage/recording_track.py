@@ -17,9 +17,9 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.file_access import check_folder
+from drivers.file_access import check_folder_or_absent
 from drivers.recordings import segment
-from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentWriter
+from drivers.recordings.segment import DaemonState, SegmentMetadata, SingleSegmentWriter
 from drivers.recordings.table import PARTIAL_SUFFIX
 from drivers.sample import NO_TICK, Chunk, SampleBlock
 from monitor.settings.loading import Storage
@@ -40,7 +40,7 @@ CHUNK_OVERHEAD_BYTES: Final = 100
 RAW_FOLDER: Final = "raw"
 """Name of the folder for raw bytes, inside the folder of a device."""
 
-Opening = Callable[[Path, SegmentMetadata], SegmentWriter]
+Opening = Callable[[Path, SegmentMetadata], SingleSegmentWriter]
 """Function that opens a new segment."""
 
 
@@ -105,7 +105,7 @@ class RecordingTrack:
         self._queue_bytes = 0
         self._dropped = 0  # rows that were dropped before the oldest in the queue, missing samples included
         self._taken: list[SampleBlock | Chunk] = []  # taken from the queue and being written
-        self._writer: SegmentWriter | None = None
+        self._writer: SingleSegmentWriter | None = None
         self._begin_s = 0.0  # Unix time of the open segment's first row
         self._number: int | None = None  # of the newest segment; None until the folder has been searched
         self._rows = 0  # rows or chunks in the open segment
@@ -226,7 +226,7 @@ class RecordingTrack:
             return
         self._unsynced = False
         try:
-            self._writer.sync()
+            self._writer.flush_to_disk()
         except OSError as error:
             self._report_failure(stopped_text(self.folder, error))
             self.end()
@@ -254,16 +254,16 @@ class RecordingTrack:
         The next row begins a new file.
         """
         writer = self._writer
-        change = "" if writer is None else writer.external_change()
+        change = "" if writer is None else writer.describe_external_change()
         if writer is None or not change:
             return ""
         self._writer = None
         try:
-            writer.abandon()
+            writer.close_changed_file()
         except OSError as error:
             change = f"{change} ({error.strerror or error})"
         known = segment.list_segments(self.folder)  # files of another program may be among them, and are not packed
-        self._number = max(self._number or 0, segment.segment_number(known[-1]) if known else 0)
+        self._number = max(self._number or 0, segment.parse_segment_number(known[-1]) if known else 0)
         note = f"{writer.path} {change} during recording, with {self._rows} rows in it; a new file is begun"
         self.report("recording_stopped", note)
         self.report("recording_back", "recording continues in a new file")
@@ -284,17 +284,17 @@ class RecordingTrack:
             self._rows += len(self._taken)
         self._unsynced = True
 
-    def _begin(self, begin_s: float) -> SegmentWriter:
+    def _begin(self, begin_s: float) -> SingleSegmentWriter:
         """Open the next segment."""
-        check_folder(self.folder)
+        check_folder_or_absent(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         if self._number is None:
             known = segment.list_segments(self.folder)
-            self._number = segment.segment_number(known[-1]) if known else 0
+            self._number = segment.parse_segment_number(known[-1]) if known else 0
             self._finished.extend(known)
             for part in self.folder.glob(f"*{PARTIAL_SUFFIX}"):
                 part.unlink()
-        path = self.folder / segment.segment_name(self._number + 1, begin_s)
+        path = self.folder / segment.format_segment_name(self._number + 1, begin_s)
         self._writer = self._opening(path, self.origin)
         self._number += 1
         self._begin_s, self._rows = begin_s, 0

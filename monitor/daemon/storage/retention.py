@@ -32,7 +32,7 @@ def delete_old(folders: Sequence[Path], keep_s: float, segment_s: float) -> None
     for folder in folders:
         known = segment.list_segments(folder)
         for at, (path, after) in enumerate(pairwise(known[: 1 - MIN_KEPT_SEGMENTS])):
-            by_name_s = segment.segment_start_s(known[-1]) - segment.segment_start_s(
+            by_name_s = segment.parse_segment_start_s(known[-1]) - segment.parse_segment_start_s(
                 after
             )  # a segment ends where the next begins
             by_number_s = (len(known) - 1 - at) * segment_s
@@ -63,7 +63,7 @@ def delete_until_free(folder: Path, folders: Sequence[Path], share: float) -> st
     while (taken := used_disk_share(folder)) > share:
         if olds is None:
             every = [path for one in folders for path in segment.list_segments(one)[:-MIN_KEPT_SEGMENTS]]
-            olds = deque(sorted(every, key=segment.segment_start_s))
+            olds = deque(sorted(every, key=segment.parse_segment_start_s))
         if not olds:
             return (
                 f"{folder}: the disk is {100 * taken:.4g} % full, disk_share allows {100 * share:.4g} %, and no older "

@@ -24,7 +24,7 @@ from typing import Final, TypeVar
 import numpy as np
 
 from drivers.errors import NotReady
-from drivers.quantities import HOUR_S
+from drivers.number_ranges import HOUR_S
 from drivers.sample import Floats
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_dependence import find_hysteresis

@@ -38,7 +38,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import ConfigError
-from drivers.quantities import DAY_S
+from drivers.number_ranges import DAY_S
 from drivers.sample import AXES, Floats
 from monitor.common.units import format_rate
 from monitor.estimation.detection.change_kernel import (

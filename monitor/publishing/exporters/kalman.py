@@ -22,7 +22,7 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ConfigError
-from drivers.quantities import DURATION_S
+from drivers.number_ranges import DURATION_S
 from drivers.sample import Floats
 from monitor.common.units import sensor_kind
 from monitor.noise.effects import BiasInstability
@@ -78,7 +78,7 @@ def kalman(
     step_s = 1.0 / noise.sample_rate_hz if dt_s is None and noise.sample_rate_hz else dt_s
     if step_s is None or not DURATION_S.supports(step_s):
         raise ConfigError(
-            f"kalman needs a time step of {DURATION_S.range_text()}: the model's sample_rate, or one that is given"
+            f"kalman needs a time step of {DURATION_S.format_range()}: the model's sample_rate, or one that is given"
         )
     if correlation_time_s is not None:
         try:

@@ -14,7 +14,7 @@ from typing import Final
 import msgspec
 
 from drivers.errors import ConfigError, ImuError, NotReady
-from drivers.quantities import RATE_HZ
+from drivers.number_ranges import RATE_HZ
 from drivers.sample import AXES
 from monitor.common.units import KINDS, Kind, axes_of
 from monitor.noise.effect import Source, parameter_units

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import NotReady
-from drivers.quantities import DAY_S
+from drivers.number_ranges import DAY_S
 from drivers.sample import AXES, Floats
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
 from monitor.estimation.fit.coefficients import SYMBOLS

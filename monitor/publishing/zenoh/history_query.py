@@ -11,7 +11,7 @@ from typing import Any, Final
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError, LinkUnavailable, NotReady
 from drivers.zenoh.connection_errors import explain_refusals
-from drivers.zenoh.session import format_error
+from drivers.zenoh.session_config import format_zenoh_error
 from monitor.common import topics
 from monitor.history.reading import HistoryTable
 from monitor.publishing.messages.history import decode_history
@@ -60,7 +60,7 @@ def query_histories(
             replies = list(session.get(selector, timeout=PATIENCE_S))
     except zenoh.ZError as error:
         raise LinkUnavailable(
-            explain_refusals([endpoint], config) or f"{mask_secrets(endpoint)}: {format_error(error)}"
+            explain_refusals([endpoint], config) or f"{mask_secrets(endpoint)}: {format_zenoh_error(error)}"
         ) from error
     endpoint = mask_secrets(endpoint)
     found, wrong = [], [_error_of_reply(reply.err) for reply in replies if reply.ok is None]

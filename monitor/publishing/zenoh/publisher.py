@@ -27,11 +27,11 @@ from typing import TYPE_CHECKING, Any, Final
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError, ImuError, NotReady
 from drivers.zenoh.connection_errors import explain_refusals
-from drivers.zenoh.session import (
+from drivers.zenoh.session_config import (
     DEFAULT_CONFIGURATION,
     build_session_config,
     find_connect_endpoints,
-    format_error,
+    format_zenoh_error,
     is_unconnected,
 )
 from monitor.common import topics
@@ -142,7 +142,7 @@ class ZenohPublisher:
         try:
             publisher.put(payload)
         except zenoh.ZError as error:
-            self._unsent = f"cannot send: {format_error(error)}"
+            self._unsent = f"cannot send: {format_zenoh_error(error)}"
         else:
             self._unsent = ""
 
@@ -164,7 +164,7 @@ class ZenohPublisher:
         try:
             session.put(key, payload, encoding=zenoh.Encoding(topics.JSON), express=True)
         except zenoh.ZError as error:
-            return f"not sent: zenoh: {format_error(error)}"
+            return f"not sent: zenoh: {format_zenoh_error(error)}"
         return ""
 
     def set_alive(self, device: str, flowing: bool) -> None:
@@ -219,7 +219,7 @@ class ZenohPublisher:
             try:
                 self._open()
             except errors as error:
-                self._session_state = f"{self._find_refusal() or format_error(error)}; trying again"
+                self._session_state = f"{self._find_refusal() or format_zenoh_error(error)}; trying again"
                 self._close_session()
                 self._closing.wait(RETRY_S)
             else:

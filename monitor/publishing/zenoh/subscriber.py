@@ -24,11 +24,11 @@ from typing import TYPE_CHECKING, Any, Final
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
 from drivers.zenoh.connection_errors import explain_refusal
-from drivers.zenoh.session import (
+from drivers.zenoh.session_config import (
     DEFAULT_CONFIGURATION,
     build_session_config,
     find_connect_endpoints,
-    format_error,
+    format_zenoh_error,
     is_unconnected,
 )
 from monitor.common import topics
@@ -328,7 +328,7 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
     try:
         file_endpoints = find_connect_endpoints(build_session_config({}, file))
     except zenoh.ZError as error:
-        text = format_error(error)
+        text = format_zenoh_error(error)
         raise ConfigError(text if text.startswith(str(file)) else f"{file}: {text}") from error
     defaults = {**DEFAULT_CONFIGURATION, "transport/link/rx/max_message_size": MAX_MESSAGE_BYTES}
     found = {}
@@ -367,7 +367,7 @@ def _check_keys(keyexpr: str, keys: list[str]) -> None:
     except UnicodeEncodeError as error:
         raise ConfigError(f'key expression "{keyexpr!a}": no UTF-8') from error
     except zenoh.ZError as error:
-        raise ConfigError(f'key expression "{keyexpr}": {format_error(error)}') from error
+        raise ConfigError(f'key expression "{keyexpr}": {format_zenoh_error(error)}') from error
     if not keys:
         shown = ", ".join(topic.name for topic in (*TOPICS, topics.ALIVE))
         raise ConfigError(f'key expression "{keyexpr}": nothing to show of it; shown are {shown}')

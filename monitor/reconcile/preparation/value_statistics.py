@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr, xlogy
 
-from drivers.quantities import HOUR_S
+from drivers.number_ranges import HOUR_S
 from drivers.sample import Floats
 from drivers.units import DEGREE, G0
 from monitor.common.compiled import compiled

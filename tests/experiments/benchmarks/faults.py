@@ -359,7 +359,7 @@ def can_bus(folder: Path, times: int) -> Outcome:
     service = Service(loading.load(path), [said])
     station = service.workers[0]
     # python-can would sort a peer's error frames out by their identifier, as the kernel does not
-    station.driver.link.accept([])  # type: ignore[attr-defined]
+    station.driver.link.set_address_filter([])  # type: ignore[attr-defined]
     thread = threading.Thread(target=service.run)
     thread.start()
     sent = 0
@@ -424,14 +424,14 @@ def full_disk(folder: Path, times: int) -> Outcome:
 
 def slow_disk(folder: Path, times: int) -> Outcome:
     """Every batch takes two seconds to write."""
-    write = segment.SegmentWriter.write_samples
+    write = segment.SingleSegmentWriter.write_samples
 
-    def slowly(writer: segment.SegmentWriter, *arguments: Any) -> None:
+    def slowly(writer: segment.SingleSegmentWriter, *arguments: Any) -> None:
         time.sleep(2.0)
         write(writer, *arguments)
 
     with (
-        mock.patch("drivers.recordings.segment.SegmentWriter.write_samples", slowly),
+        mock.patch("drivers.recordings.segment.SingleSegmentWriter.write_samples", slowly),
         running(folder, _storage(folder / "store")) as rig,
     ):
         for _ in range(4):

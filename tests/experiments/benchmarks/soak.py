@@ -87,7 +87,7 @@ class Wire:
     def close(self) -> None:
         self._closed.set()
 
-    def read(self, timeout_s: float) -> list[Chunk] | None:
+    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
         if self._closed.is_set():
             raise LinkLost("closed")
         truth = self.truth

@@ -18,7 +18,7 @@ import zenoh
 
 from drivers.errors import LinkUnavailable, NotReady
 from drivers.links import zenoh_link
-from drivers.zenoh.session import build_session_config
+from drivers.zenoh.session_config import build_session_config
 from monitor.common import topics
 from monitor.common.config_files import CONFIG_FOLDER
 from monitor.publishing.messages.results import StatusMessage
@@ -254,7 +254,7 @@ def test_samples_of_another_daemon_come_through_the_link_with_a_certificate(by_c
 
             def come() -> Any:
                 nose.put("imu/nose/samples", b"batch")
-                return link.read(0.1)
+                return link.poll_chunks(0.1)
 
             assert wait_for(come)[0].data == b"batch"
     finally:

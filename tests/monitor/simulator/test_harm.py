@@ -108,7 +108,7 @@ class Rig:
     @property
     def received(self) -> int:
         """Samples that have come, the repeated ones that were left out among them."""
-        return self.counts.received + self.driver.clock.repeated_rows
+        return self.counts.received + self.driver.clock.dropped_repeated_rows
 
 
 def whole_at_end(kinds: np.ndarray, samples: int, of: FaultKind) -> int:
@@ -150,7 +150,7 @@ def test_repeated_samples_are_left_out(name: str, tmp_path: Path) -> None:
     with Rig(BY_NAME[name], tmp_path, of=FaultKind.REPEATED, repeated=0.1) as rig:
         rig.read_all()
         assert rig.truth.repeated >= ENOUGH
-        assert 0 <= rig.truth.repeated - rig.driver.clock.repeated_rows <= 5
+        assert 0 <= rig.truth.repeated - rig.driver.clock.dropped_repeated_rows <= 5
         rig.wait(lambda: "samples_repeated" in rig.kinds)
 
 

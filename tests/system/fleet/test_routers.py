@@ -7,7 +7,7 @@ from typing import Any
 
 import zenoh
 
-from drivers.zenoh.session import build_session_config
+from drivers.zenoh.session_config import build_session_config
 from monitor.common.config_files import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.quantities import RATE_RATIO
+from drivers.number_ranges import RATE_RATIO
 from monitor.noise.effect import MemorylessTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum
 

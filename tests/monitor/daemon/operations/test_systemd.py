@@ -121,7 +121,7 @@ class Freezing:
     def open(self) -> None:
         self._closed.clear()
 
-    def read(self, timeout_s: float) -> list[Chunk] | None:
+    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
         if self.frozen.is_set():
             self._closed.wait()
             raise LinkLost("closed")

@@ -16,7 +16,7 @@ import pytest
 from drivers.decoders import text
 from drivers.driver import AxisMap
 from drivers.recordings import load_samples, segment
-from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentWriter
+from drivers.recordings.segment import DaemonState, SegmentMetadata, SingleSegmentWriter
 from drivers.sample import Chunk, SampleBlock, concatenate_blocks, make_block
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
@@ -113,8 +113,8 @@ def test_raw_bytes_come_back_as_chunks(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("cut", [1, 7, 200, 1999, 2600])
 def test_a_segment_that_was_cut_is_read_up_to_the_cut(tmp_path: Path, cut: int) -> None:
-    path = tmp_path / segment.segment_name(1, 1.7e9)
-    writer = SegmentWriter(path, SAMPLES)
+    path = tmp_path / segment.format_segment_name(1, 1.7e9)
+    writer = SingleSegmentWriter(path, SAMPLES)
     for first in range(0, 100, 10):
         writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
@@ -137,8 +137,8 @@ def test_a_segment_that_was_cut_is_read_up_to_the_cut(tmp_path: Path, cut: int) 
 def test_a_segment_that_is_packed_while_it_is_opened_is_read_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object]
 ) -> None:
-    path = tmp_path / segment.segment_name(1, 1.7e9)
-    writer = SegmentWriter(path, SAMPLES)
+    path = tmp_path / segment.format_segment_name(1, 1.7e9)
+    writer = SingleSegmentWriter(path, SAMPLES)
     for first in range(0, 100, 10):
         writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
@@ -161,7 +161,7 @@ def rows_of(n: int) -> np.ndarray:
     return np.concatenate([rows(first, 10).values for first in range(0, n, 10)])
 
 
-class Broken(SegmentWriter):
+class Broken(SingleSegmentWriter):
     """A disk that fails in the middle of a batch while ``why`` is set; it writes nothing until it is ``released``."""
 
     why: int | None = None
@@ -239,7 +239,7 @@ def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, 
 def test_old_segments_go_when_both_their_names_and_their_number_say_so(tmp_path: Path) -> None:
     folder = tmp_path / "bench"
     folder.mkdir()
-    names = [segment.segment_name(i, 1.7e9 + 100.0 * i) for i in range(10)]
+    names = [segment.format_segment_name(i, 1.7e9 + 100.0 * i) for i in range(10)]
     for name in names:
         (folder / name).write_bytes(b"x")
     (folder / "notes.txt").write_text("mine")
@@ -254,7 +254,7 @@ def test_neither_a_clock_set_wrong_nor_many_restarts_delete_what_is_new(tmp_path
     folder.mkdir()
     began = [1.7e9 + step_s * i for i in range(9)] + [1.7e9 + newest_s]
     for i, unix_s in enumerate(began):
-        (folder / segment.segment_name(i, unix_s)).write_bytes(b"x")
+        (folder / segment.format_segment_name(i, unix_s)).write_bytes(b"x")
     retention.delete_old([folder], keep_s=2000.0 if step_s > 1.0 else 350.0, segment_s=100.0)
     assert len(segment.list_segments(folder)) == 10
 
@@ -264,7 +264,7 @@ def test_the_oldest_of_all_devices_go_while_the_disk_is_too_full(tmp_path: Path,
     for at, folder in enumerate(folders):
         folder.mkdir()
         for i in range(5):
-            (folder / segment.segment_name(i, 1.7e9 + 100.0 * i + at)).write_bytes(b"x")
+            (folder / segment.format_segment_name(i, 1.7e9 + 100.0 * i + at)).write_bytes(b"x")
     left = lambda: [len(segment.list_segments(folder)) for folder in folders]  # noqa: E731
     monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.1 * sum(left()))
     assert retention.delete_until_free(tmp_path, folders, share=0.75) == ""
@@ -425,8 +425,8 @@ def test_what_the_samples_cannot_go_on_from_begins_anew(tmp_path, axes, older_s:
 
 def test_files_that_are_no_segments_are_passed_over(tmp_path: Path) -> None:
     lived(tmp_path)
-    (tmp_path / "bench" / segment.segment_name(900, 1.8e9)).write_bytes(b"no stream at all")
-    (tmp_path / "bench" / segment.segment_name(901, 1.8e9)).write_bytes(b"")
+    (tmp_path / "bench" / segment.format_segment_name(900, 1.8e9)).write_bytes(b"no stream at all")
+    (tmp_path / "bench" / segment.format_segment_name(901, 1.8e9)).write_bytes(b"")
     after = station(tmp_path, Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())]))
     after.restore.resume(after._recorder.tail("bench"))
     after.rebuild()
@@ -508,7 +508,7 @@ def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
     first.samples("bench", rows(0, 100), 0)
     wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
     for i in range(2, 8):
-        (tmp_path / "bench" / segment.segment_name(i, 1.0e9)).write_bytes(b"old")
+        (tmp_path / "bench" / segment.format_segment_name(i, 1.0e9)).write_bytes(b"old")
     (tmp_path / "bench" / "00000099_x.arrows.part").write_bytes(b"of the first")
     monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.99)
     monkeypatch.setattr(first, "_delete_old", lambda: None)
@@ -627,7 +627,7 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
     keeper.samples("bench", rows(0, 100), 0)
     wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
     keeper.close()
-    for name in (segment.segment_name(1, 1.0e9), segment.segment_name(7, 1.7e9)):
+    for name in (segment.format_segment_name(1, 1.0e9), segment.format_segment_name(7, 1.7e9)):
         path = tmp_path / "bench" / name
         match kind:
             case "fifo":
@@ -643,7 +643,7 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
     assert len(list(tail.pieces(10.0))) == 1
     again.start()
     again.samples("bench", rows(100, 100), 0)
-    wait_for(lambda: segment.segment_number(segment.list_segments(tmp_path / "bench")[-1]) == 8)
+    wait_for(lambda: segment.parse_segment_number(segment.list_segments(tmp_path / "bench")[-1]) == 8)
     again.close()
     assert again.state == "ok"
 

@@ -26,16 +26,16 @@ MAX_PROMPT_DELAY_S: Final = 0.05
 """A sample that arrives within this time of the bound has not waited. Only then is a new sample period adopted."""
 
 
-class ArrivalBound:
+class EarliestSampleTime:
     """Earliest host time at which the newest sample can have been taken.
 
     Examples
     --------
-    >>> bound = ArrivalBound()
-    >>> bound.update(1, arrived_s=0.0, period_s=0.01)
-    >>> bound.update(100, arrived_s=1.001, period_s=0.01)
-    >>> bound.update(100, arrived_s=9.0, period_s=0.04)  # read 7 s late: neither the bound nor the period follows
-    >>> bound.newest_s, bound.period_s
+    >>> bound = EarliestSampleTime()
+    >>> bound.advance_clock(1, arrived_s=0.0, period_s=0.01)
+    >>> bound.advance_clock(100, arrived_s=1.001, period_s=0.01)
+    >>> bound.advance_clock(100, arrived_s=9.0, period_s=0.04)  # read 7 s late: no effect
+    >>> bound.newest_sample_not_before_s, bound.period_s
     (2.0, 0.01)
     """
 
@@ -50,23 +50,23 @@ class ArrivalBound:
         self._arrived_s = 0.0  # time of the newest arrival
 
     @property
-    def newest_s(self) -> float | None:
+    def newest_sample_not_before_s(self) -> float | None:
         """Earliest time at which the newest sample can have been taken, in s; None before the first sample."""
         if self._clock_s is None:
             return None
         return self._clock_s + min(self._start_delay_s, self._delay_s, self._previous_delay_s)
 
     @property
-    def settled(self) -> bool:
+    def has_enough_arrivals(self) -> bool:
         """True if samples have arrived for SETTLED_S. Pauses of the reader do not count."""
         return self._total_s >= SETTLED_S
 
-    def start(self, taken_s: float) -> None:
-        """Start the clock at a sample that was read earlier and was not taken before ``taken_s`` (in s)."""
-        self._clock_s = self._arrived_s = taken_s
+    def start_clock(self, not_before_s: float) -> None:
+        """Start the clock at a sample that was read earlier and was not taken before ``not_before_s`` (in s)."""
+        self._clock_s = self._arrived_s = not_before_s
         self._start_delay_s = 0.0
 
-    def update(self, samples: float, arrived_s: float, period_s: float | None) -> None:
+    def advance_clock(self, samples: float, arrived_s: float, period_s: float | None) -> None:
         """Advance the clock to a newer sample.
 
         Parameters
@@ -83,7 +83,7 @@ class ArrivalBound:
         if period := self.period_s or period_s:
             step_s, self._uncounted = self._uncounted * period, 0.0
         if self._clock_s is None:
-            self.start(arrived_s - step_s)
+            self.start_clock(arrived_s - step_s)
         assert self._clock_s is not None
         self._clock_s += step_s
         delay_s = arrived_s - self._clock_s

@@ -32,7 +32,7 @@ BUFFER: Final = struct.Struct("<qq")  # offset in the body, length
 
 
 @dataclass(frozen=True, slots=True)
-class BatchSize:
+class StatedBatchSize:
     """Stated size of one record batch or dictionary."""
 
     rows: int
@@ -41,7 +41,7 @@ class BatchSize:
     dictionary: bool  # True for a dictionary
 
 
-def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
+def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSize]:
     """Yield the stated sizes of the batches of a stream up to the end, a truncation or damaged metadata.
 
     Parameters
@@ -53,7 +53,7 @@ def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
 
     Yields
     ------
-    BatchSize
+    StatedBatchSize
         Size of each record batch and dictionary, in the order of the file.
     """
     end = file.seek(0, os.SEEK_END)
@@ -86,7 +86,7 @@ def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[BatchSize]:
         at = body + body_bytes
 
 
-def check_buffer_sizes(size: BatchSize, counts: Sequence[int | None], slack_bytes: int) -> str:
+def check_buffer_sizes(size: StatedBatchSize, counts: Sequence[int | None], slack_bytes: int) -> str:
     """Check that no buffer of a numeric column is larger after unpacking than the rows of the batch need.
 
     Parameters
@@ -144,7 +144,7 @@ def count_buffers(pa: Any, type_: Any) -> int | None:
     return 3 if any(is_type(type_) for is_type in variable) else 2
 
 
-def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> BatchSize:
+def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> StatedBatchSize:
     """Return the stated size of a batch whose body begins at the offset ``body`` of the file."""
     rows = batch.read_number(BATCH_LENGTH, "q")
     packed = batch.has_field(BATCH_COMPRESSION)
@@ -156,7 +156,7 @@ def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: in
             (stated,) = struct.unpack("<q", file.read(8))
             unpacked = length if stated == -1 else stated  # -1: stored without compression
         sizes.append(max(unpacked, 0))
-    return BatchSize(max(rows, 0), body_bytes, tuple(sizes), dictionary)
+    return StatedBatchSize(max(rows, 0), body_bytes, tuple(sizes), dictionary)
 
 
 @dataclass(frozen=True, slots=True)

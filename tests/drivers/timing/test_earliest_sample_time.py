@@ -12,8 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.sample import CounterTiming, SampleBlock, make_block
-from drivers.timing.arrival_bound import SETTLED_S, WINDOW_S, ArrivalBound
+from drivers.sample import CounterTimedFormat, SampleBlock, make_block
+from drivers.timing.earliest_sample_time import SETTLED_S, WINDOW_S, EarliestSampleTime
 from drivers.timing.sample_clock import LastSample, SampleClock
 
 NS = 1e9
@@ -22,8 +22,8 @@ BEGUN_S = 5_000.0
 POLL_S = 0.01
 BURST_S = 2e-4
 """Time between two reads while the buffer is not empty."""
-WITH_TIME = CounterTiming(1 << 40, 1e-6)
-SAMPLES = CounterTiming(1 << 32)
+WITH_TIME = CounterTimedFormat(1 << 40, 1e-6)
+SAMPLES = CounterTimedFormat(1 << 32)
 COUNTERS = st.sampled_from([(WITH_TIME, True), (WITH_TIME, False), (SAMPLES, True), (SAMPLES, False)])
 """What is counted, and whether the rate is configured."""
 
@@ -77,7 +77,7 @@ class Reader:
         return reads
 
 
-def ticks_of(index: "np.ndarray", counter: CounterTiming, rate_hz: float) -> "np.ndarray":
+def ticks_of(index: "np.ndarray", counter: CounterTimedFormat, rate_hz: float) -> "np.ndarray":
     counted = index if counter.tick_s is None else np.rint(index / (rate_hz * counter.tick_s))
     return (counted.astype(np.int64) + counter.modulus - 1000) % counter.modulus  # wraps early
 
@@ -96,9 +96,9 @@ def told(clock: SampleClock) -> list[str]:
     return [event.text for event in clock.take_events(ended=True) if event.kind == "clock_jumped"]
 
 
-def new_clock(counter: CounterTiming, rate_hz: float, configured: bool) -> SampleClock:
+def new_clock(counter: CounterTimedFormat, rate_hz: float, configured: bool) -> SampleClock:
     clock = SampleClock(counter, rate_hz if configured else None)
-    clock.link_idle(round(BEGUN_S * NS))
+    clock.note_no_unread_data(round(BEGUN_S * NS))
     return clock
 
 
@@ -117,7 +117,7 @@ readers = st.builds(
 @settings(max_examples=40)
 @given(reader=readers, kind=COUNTERS)
 def test_every_sample_is_received_or_lost_however_late_it_is_read(
-    reader: Reader, kind: tuple[CounterTiming, bool]
+    reader: Reader, kind: tuple[CounterTimedFormat, bool]
 ) -> None:
     counter, configured = kind
     reads = reader.read(35.0 + sum(pause.for_s for pause in reader.pauses))
@@ -139,7 +139,7 @@ STARVED = [Pause(12.0, 0.4), Pause(15.0, 8.0), Pause(30.0, 1.5)]
 @pytest.mark.parametrize("ahead_s", [-3600.0, -45.0, 30.0, 3600.0, 86400.0])
 @pytest.mark.parametrize("starved", [False, True])
 def test_a_jump_is_told_and_counted_as_no_loss(
-    counter: CounterTiming, configured: bool, ahead_s: float, starved: bool
+    counter: CounterTimedFormat, configured: bool, ahead_s: float, starved: bool
 ) -> None:
     """The counter goes on or back, or begins anew, at 40 s."""
     rate_hz = 100.0
@@ -163,7 +163,7 @@ def test_a_jump_is_told_and_counted_as_no_loss(
     kind=COUNTERS,
 )
 def test_a_jump_longer_than_the_reader_was_late_is_told(
-    at_s: float, for_s: float, ahead_s: float, kind: tuple[CounterTiming, bool]
+    at_s: float, for_s: float, ahead_s: float, kind: tuple[CounterTimedFormat, bool]
 ) -> None:
     """The counter jumps while the reader is late: a longer step than that cannot be a hole."""
     counter, configured = kind
@@ -181,7 +181,7 @@ def test_a_jump_longer_than_the_reader_was_late_is_told(
 def test_a_device_that_begins_late_has_jumps_told_from_its_first_samples_on() -> None:
     """The link is idle until the device is switched on."""
     clock = new_clock(WITH_TIME, 100.0, configured=True)
-    clock.link_idle(round((BEGUN_S + 60.0) * NS))
+    clock.note_no_unread_data(round((BEGUN_S + 60.0) * NS))
     for i in range(100):
         stamp(clock, 60.05 + i / 100, [i], ticks_of(np.array([i + 1000 * (i >= 50)]), WITH_TIME, 100.0))
     assert len(told(clock)) == 1
@@ -190,7 +190,7 @@ def test_a_device_that_begins_late_has_jumps_told_from_its_first_samples_on() ->
 @pytest.mark.parametrize("counter", [WITH_TIME, SAMPLES])
 @pytest.mark.parametrize(("away", "jumps"), [(800, 0), (10_000, 1)])
 def test_the_last_sample_before_a_restart_may_have_been_read_late(
-    counter: CounterTiming, away: int, jumps: int
+    counter: CounterTimedFormat, away: int, jumps: int
 ) -> None:
     """It was taken at 2.5 s and read at 6 s; after the restart the first sample comes at 10.5 s."""
     last = np.array([250])
@@ -204,10 +204,10 @@ def test_the_last_sample_before_a_restart_may_have_been_read_late(
 
 
 def test_the_bound_forgets_a_period_that_was_wrong() -> None:
-    bound = ArrivalBound()
-    bound.start(0.0)
+    bound = EarliestSampleTime()
+    bound.start_clock(0.0)
     for i in range(1, round(5 * WINDOW_S)):
-        bound.update(1, float(i), 0.5 if i < 10 else 1.0)  # half of it at first: the bound falls behind
-        assert bound.newest_s is not None
-        assert bound.newest_s <= i
-    assert bound.newest_s == pytest.approx(i, abs=1e-9)
+        bound.advance_clock(1, float(i), 0.5 if i < 10 else 1.0)  # half of it at first: the bound falls behind
+        assert bound.newest_sample_not_before_s is not None
+        assert bound.newest_sample_not_before_s <= i
+    assert bound.newest_sample_not_before_s == pytest.approx(i, abs=1e-9)

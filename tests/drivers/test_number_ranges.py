@@ -6,12 +6,12 @@ from typing import Annotated
 import pytest
 from pydantic import Field
 
-from drivers import quantities
+from drivers import number_ranges
 from drivers.errors import ConfigError
-from drivers.quantities import RATE_HZ, SCALE, SEED, SILENCE_S, Quantity
+from drivers.number_ranges import RATE_HZ, SCALE, SEED, SILENCE_S, NumberRange
 from drivers.settings_model import ListOf, SettingsModel, read_settings
 
-ALL = {name: one for name, one in vars(quantities).items() if isinstance(one, Quantity)}
+ALL = {name: one for name, one in vars(number_ranges).items() if isinstance(one, NumberRange)}
 
 
 class Inner(SettingsModel):

@@ -83,7 +83,7 @@ def build_session_config(
     return config
 
 
-def format_error(error: Exception) -> str:
+def format_zenoh_error(error: Exception) -> str:
     """Return the text of a zenoh error in one line.
 
     Positions in zenoh's source code and quoted file contents are removed, since a line of a configuration file may

@@ -6,7 +6,7 @@ value that overflows, divides by zero or asks for more memory than exists. The r
 sensor or use. They are narrow enough that products, squares and quotients of the numbers stay finite.
 
 A field of a settings model names its quantity in its type: ``Annotated[float, RATE_HZ]``. pydantic then checks the
-number with ``Quantity.check``.
+number with ``NumberRange.check``.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ MAX_QUOTED_CHARACTERS: Final = 60
 
 
 @dataclass(frozen=True, slots=True)
-class Quantity:
+class NumberRange:
     """Kind of number with its unit and supported range. Both ends are included.
 
     >>> RATE_HZ.check(200.0)
@@ -63,17 +63,17 @@ class Quantity:
         """
         if self.supports(value):
             return value
-        raise ConfigError(f"{_number_text(value, self.unit)} is outside the supported range {self.range_text()}")
+        raise ConfigError(f"{_number_text(value, self.unit)} is outside the supported range {self.format_range()}")
 
     def supports(self, value: float) -> bool:
         """Return True if the value is in the supported range. Return False for NaN."""
         size = abs(value) if self.signed else value
         return self.low <= size <= self.high or (self.zero and value == 0)
 
-    def range_text(self) -> str:
+    def format_range(self) -> str:
         """Return the supported range with its unit.
 
-        >>> DURATION_S.range_text(), SILENCE_S.range_text()
+        >>> DURATION_S.format_range(), SILENCE_S.format_range()
         ('1 µs to 36525 d', '1 ms to 36525 d, or 0')
         """
         sign = "±" if self.signed else ""
@@ -92,7 +92,7 @@ class Quantity:
             try:
                 number = convert(value)
             except ValidationError:
-                raise ConfigError(f"expected {kind} from {self.range_text()}, got {format_value(value)}") from None
+                raise ConfigError(f"expected {kind} from {self.format_range()}, got {format_value(value)}") from None
             return self.check(number)
 
         return core_schema.no_info_wrap_validator_function(check, handler(source))
@@ -100,77 +100,77 @@ class Quantity:
 
 # --- time and rates
 
-RATE_HZ: Final = Quantity("Hz", 1e-3, 1e6)
+RATE_HZ: Final = NumberRange("Hz", 1e-3, 1e6)
 """Sample rate: from a sample in a quarter of an hour to far above the fastest vibration sensors (about 30 kHz)."""
-EFFECT_FREQUENCY_HZ: Final = Quantity("Hz", 1e-12, 1e6, zero=True)
+EFFECT_FREQUENCY_HZ: Final = NumberRange("Hz", 1e-12, 1e6, zero=True)
 """Frequency of a spectral line or of random events in a noise model; 0: none."""
-UPDATE_RATE_HZ: Final = Quantity("Hz", 1e-6, 1e6)
+UPDATE_RATE_HZ: Final = NumberRange("Hz", 1e-6, 1e6)
 """Rate at which results are published."""
-DURATION_S: Final = Quantity("s", 1e-6, 36_525.0 * DAY_S)
+DURATION_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S)
 """Duration: from one period of the highest sample rate to a century."""
-AVERAGING_TIME_S: Final = Quantity("s", 1e-6, 36_525.0 * DAY_S)
+AVERAGING_TIME_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S)
 """Averaging time τ of the Allan variance."""
-DELAY_S: Final = Quantity("s", 1e-6, 36_525.0 * DAY_S, zero=True)
+DELAY_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S, zero=True)
 """Time after a start; 0 is the start itself."""
-SILENCE_S: Final = Quantity("s", 1e-3, 36_525.0 * DAY_S, zero=True)
+SILENCE_S: Final = NumberRange("s", 1e-3, 36_525.0 * DAY_S, zero=True)
 """Time without data after which the program reacts; 0: never."""
-RUN_TIME_S: Final = Quantity("s", 0.1, 36_525.0 * DAY_S)
+RUN_TIME_S: Final = NumberRange("s", 0.1, 36_525.0 * DAY_S)
 """Time after which a command ends by itself."""
-JITTER_S: Final = Quantity("s", 0.0, 0.5)
-READ_TIMEOUT_S: Final = Quantity("s", 1e-4, 0.1)
+JITTER_S: Final = NumberRange("s", 0.0, 0.5)
+READ_TIMEOUT_S: Final = NumberRange("s", 1e-4, 0.1)
 """Time that a read of a serial port may wait. A port without ``cancel_read`` is closed after at most this time."""
-TICK_S: Final = Quantity("s", 1e-12, DAY_S)
+TICK_S: Final = NumberRange("s", 1e-12, DAY_S)
 """Length of one count of a device clock."""
 
 # --- transmission
 
-BIT_RATE: Final = Quantity("bit/s", 1, 1_000_000_000)
-BYTE_RATE: Final = Quantity("byte/s", 1.0, 1e9)
-PORT: Final = Quantity("", 0, 65_535)
+BIT_RATE: Final = NumberRange("bit/s", 1, 1_000_000_000)
+BYTE_RATE: Final = NumberRange("byte/s", 1.0, 1e9)
+PORT: Final = NumberRange("", 0, 65_535)
 """TCP port."""
-SIZE_BYTES: Final = Quantity("byte", 1e6, 1e15)
+SIZE_BYTES: Final = NumberRange("byte", 1e6, 1e15)
 """Memory limit."""
 
 # --- counts and factors
 
-FRACTION: Final = Quantity("", 0.0, 1.0)
-POSITIVE_SHARE: Final = Quantity("", 1e-6, 1.0)
-PERCENT: Final = Quantity("%", 1.0, 100.0)
-SEED: Final = Quantity("", 0, (1 << 63) - 1)
-SAMPLE_COUNT: Final = Quantity("samples", 1, 10_000_000_000)
+FRACTION: Final = NumberRange("", 0.0, 1.0)
+POSITIVE_SHARE: Final = NumberRange("", 1e-6, 1.0)
+PERCENT: Final = NumberRange("%", 1.0, 100.0)
+SEED: Final = NumberRange("", 0, (1 << 63) - 1)
+SAMPLE_COUNT: Final = NumberRange("samples", 1, 10_000_000_000)
 """Length of a simulated recording."""
-COUNTER_MODULUS: Final = Quantity("counts", 2, 1 << 62)
+COUNTER_MODULUS: Final = NumberRange("counts", 2, 1 << 62)
 """Number of counts after which a device counter starts again at 0."""
-COUNTER_STEP: Final = Quantity("counts", 1e-9, 1 << 62)
+COUNTER_STEP: Final = NumberRange("counts", 1e-9, 1 << 62)
 """Counts of a device counter from one sample to the next."""
-SOURCE_ADDRESS: Final = Quantity("", 0, 255)
+SOURCE_ADDRESS: Final = NumberRange("", 0, 255)
 """Source address of SAE J1939."""
-HEADER_LINES: Final = Quantity("lines", 0, 1_000_000)
-ALARMS_PER_DAY: Final = Quantity("a day", 1e-6, 1e4, zero=True)
+HEADER_LINES: Final = NumberRange("lines", 0, 1_000_000)
+ALARMS_PER_DAY: Final = NumberRange("a day", 1e-6, 1e4, zero=True)
 """Rate of false alarms; 0: detection is off."""
-REPLAY_SPEED: Final = Quantity("times", 1e-3, 1e6)
+REPLAY_SPEED: Final = NumberRange("times", 1e-3, 1e6)
 """Speed of a replay relative to real time."""
-SIMULATION_SPEED: Final = Quantity("times", 1e-3, 1e4)
-RATE_RATIO: Final = Quantity("", 1e-3, 1e3)
+SIMULATION_SPEED: Final = NumberRange("times", 1e-3, 1e4)
+RATE_RATIO: Final = NumberRange("", 1e-3, 1e3)
 """True sample rate divided by the stated one."""
-CLOCK_RATIO: Final = Quantity("", 0.5, 2.0)
-INFLATION: Final = Quantity("", 1.0, 1e6)
-SCALE: Final = Quantity("", 1e-15, 1e15, signed=True)
+CLOCK_RATIO: Final = NumberRange("", 0.5, 2.0)
+INFLATION: Final = NumberRange("", 1.0, 1e6)
+SCALE: Final = NumberRange("", 1e-15, 1e15, signed=True)
 """Factor from the numbers of a device to a unit."""
-NOISE_RATIO: Final = Quantity("times", 1e-6, 1e6)
+NOISE_RATIO: Final = NumberRange("times", 1e-6, 1e6)
 """Ratio of two amounts of noise."""
 
 # --- what a sensor measures
 
-FULL_SCALE: Final = Quantity("", 1e-3, 1e6)
+FULL_SCALE: Final = NumberRange("", 1e-3, 1e6)
 """Full scale of a sensor, in g or °/s."""
-COEFFICIENT: Final = Quantity("", 1e-30, 1e30)
+COEFFICIENT: Final = NumberRange("", 1e-30, 1e30)
 """Noise coefficient in an SI unit. The range is far beyond every sensor, and squares and quotients stay finite."""
-PARAMETER: Final = Quantity("", 1e-30, 1e30, zero=True, signed=True)
+PARAMETER: Final = NumberRange("", 1e-30, 1e30, zero=True, signed=True)
 """Parameter of a noise model in SI units."""
-FIT_NUMBER: Final = Quantity("", 0.0, 1e30, signed=True)
+FIT_NUMBER: Final = NumberRange("", 0.0, 1e30, signed=True)
 """Number of a fitted model that was written to a file."""
-TEMPERATURE_C: Final = Quantity("°C", -273.15, 2_000.0)
+TEMPERATURE_C: Final = NumberRange("°C", -273.15, 2_000.0)
 
 
 def format_value(value: object) -> str:
