@@ -130,7 +130,7 @@ def slope_of_recording(values: Floats) -> Floats:
     return np.where(whole, (parts[2][1] - parts[0][1]) / (2.0 * third), np.nan)
 
 
-def slope_per_tau(values: Floats, factors: Ints) -> Floats:
+def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
     """Return the slope of the rate as seen by each τ: the mean second difference of phase divided by m².
 
     The sum of all second differences telescopes to four blocks of phase at the ends, so one pass serves all τ. Missing
@@ -138,7 +138,7 @@ def slope_per_tau(values: Floats, factors: Ints) -> Floats:
 
     Parameters
     ----------
-    values : ndarray of float, shape (n, k)
+    rates : ndarray of float, shape (n, k)
         Rates of k axes; values that are not finite are missing.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
@@ -148,11 +148,11 @@ def slope_per_tau(values: Floats, factors: Ints) -> Floats:
     ndarray of float64, shape (m, k)
         Slope in units per sample; NaN where no term is complete, and for axes with more than a fiftieth missing.
 
-    >>> slope_per_tau(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
+    >>> rate_slope_per_tau(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
     [0.5, 0.5]
     """
     m = np.asarray(factors, np.int64)
-    rates = np.ascontiguousarray(values, np.float64)
+    rates = np.ascontiguousarray(rates, np.float64)
     terms = len(rates) + 1 - 2 * m
     ends = np.stack([np.zeros_like(m), m, 2 * m, terms, terms + m, terms + 2 * m])
     places, at = np.unique(ends, return_inverse=True)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
-from monitor.estimation.allan.uncertainty import intervals
+from monitor.estimation.allan.uncertainty import deviation_intervals
 from monitor.estimation.fit.coefficient_fit import TO_SI
 
 NUM_COEFFICIENTS: Final = 5
@@ -94,7 +94,7 @@ def variance_of_sums(sums: Floats, terms: Ints, factors: Ints, squared_weights: 
         return np.asarray(np.where(terms > 0, sums / (squared_weights * factors[:, None] ** 2 * terms), np.nan))
 
 
-def per_sample(theta: Floats, rate_hz: float) -> Floats:
+def theta_per_sample(theta: Floats, rate_hz: float) -> Floats:
     """Convert θ of a fit from SI to units of one sample. A negative Q² stands for a band limit and becomes 0.
 
     Parameters
@@ -143,11 +143,11 @@ def correct_bias(
         edf = np.where(variance > 0.0, 2.0 * mean * mean / square * (terms / whole), np.nan)
         corrected = variance * (allan / mean)
     edf[~np.isfinite(edf)] = np.nan
-    lo, hi = intervals(corrected, edf)
+    lo, hi = deviation_intervals(corrected, edf)
     return corrected, edf, lo, hi
 
 
-def autocovariance(t: Floats) -> Floats:
+def phase_autocovariance(t: Floats) -> Floats:
     """Return the generalised autocovariance of phase [4, …] for unit Q N B K at lags t in samples.
 
     The noises are discrete sums of white noise.

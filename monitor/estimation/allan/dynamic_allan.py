@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from drivers.errors import ConfigError, NotReady
 from drivers.sample import Floats
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
-from monitor.estimation.allan.uncertainty import covariance_table, intervals
+from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
-from monitor.estimation.fit.coefficient_fit import design, fit
+from monitor.estimation.fit.coefficient_fit import fit, make_design
 
 STEPS_PER_WINDOW: Final = 20
 """Default number of steps per window length."""
@@ -94,7 +94,7 @@ def compute_dynamic_allan(
     ends = _ends(len(values), length, rate_hz, step_s)
     factors = cluster_sizes(length, rate_hz, tau)
     window = AllanWindow(length, factors)
-    columns, covariances = design(factors, rate_hz), covariance_table(length, factors)
+    columns, covariances = make_design(factors, rate_hz), covariance_table(length, factors)
     steps, taus, axes = ends.size, factors.size, values.shape[1]
     deviation, lo, hi = np.full((3, steps, taus, axes), np.nan)
     value, value_lo, value_hi = np.full((3, steps, 5, axes), np.nan)
@@ -104,11 +104,11 @@ def compute_dynamic_allan(
     for row, end in enumerate(ends.tolist()):
         window.update(values[start:end])
         start = end
-        avar, (slope, slopes) = window.avar(), window.slopes()
+        avar, (slope, slopes) = window.avar(), window.slopes_of_axes_and_taus()
         found = fit(columns, covariances, avar, window.terms(), entered, slope * rate_hz, slopes * rate_hz)
         entered = found.entered
         deviation[row] = np.sqrt(avar)
-        lo[row], hi[row] = intervals(avar, found.edf)
+        lo[row], hi[row] = deviation_intervals(avar, found.edf)
         known = found.coefficients
         value[row], value_lo[row], value_hi[row], status[row] = known.value, known.lo, known.hi, known.status
         if progress is not None:

@@ -23,12 +23,12 @@ from monitor.estimation.allan.difference_moments import (
     NUM_COEFFICIENTS,
     Moments,
     PhaseRing,
-    autocovariance,
     correct_bias,
     integrate_to_phase,
     octaves,
-    per_sample,
+    phase_autocovariance,
     quadrature_nodes,
+    theta_per_sample,
     variance_of_sums,
 )
 
@@ -121,7 +121,7 @@ def make_curve(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Flo
         Number of terms.
     """
     each = list(known)
-    _, edf, lo, hi = correct_bias(each, per_sample(theta, rate_hz), raw, terms)
+    _, edf, lo, hi = correct_bias(each, theta_per_sample(theta, rate_hz), raw, terms)
     factors = np.array([one.factor for one in each])
     return HadamardCurve(factors / rate_hz, factors, raw, terms, edf, lo, hi)
 
@@ -146,7 +146,7 @@ def moments(n: int, factor: int) -> Moments:
     lags, weights = quadrature_nodes(0, min(terms, MAX_LAG_CLUSTERS * factor), [factor, 2 * factor, 3 * factor])
     shared = np.zeros((4, lags.size))
     for p, weight in zip(range(-3, 4), (-1.0, 6.0, -15.0, 20.0, -15.0, 6.0, -1.0), strict=True):
-        shared += weight * autocovariance(lags + p * factor)
+        shared += weight * phase_autocovariance(lags + p * factor)
     pairs = weights * (terms - lags) * np.where(lags > 0.0, 2.0, 1.0)
     scale = 1.0 / (6.0 * factor**2)
     mean, covariance = np.zeros(NUM_COEFFICIENTS), np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS))

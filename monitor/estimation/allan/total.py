@@ -34,12 +34,12 @@ from monitor.estimation.allan.difference_moments import (
     NUM_COEFFICIENTS,
     Moments,
     PhaseRing,
-    autocovariance,
     correct_bias,
     integrate_to_phase,
     octaves,
-    per_sample,
+    phase_autocovariance,
     quadrature_nodes,
+    theta_per_sample,
     variance_of_sums,
 )
 
@@ -139,7 +139,7 @@ def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Float
     """
     each = list(known)
     enough = terms >= MIN_SHARE * np.array([one.terms for one in each])[:, None]
-    tvar, edf, lo, hi = correct_bias(each, per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
+    tvar, edf, lo, hi = correct_bias(each, theta_per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
     factors = np.array([one.factor for one in each])
     unsure = 2 * factors > np.array([one.n for one in each])
     lo[unsure] = hi[unsure] = np.nan
@@ -179,7 +179,7 @@ def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
 def _squares(points: Floats, signs: Floats) -> Floats:
     """Return the mean squares [5, i] of differences for each unit coefficient."""
     lags = points[:, :, None] - points[:, None, :]
-    random = np.einsum("ip,iq,aipq->ai", signs, signs, autocovariance(lags))
+    random = np.einsum("ip,iq,aipq->ai", signs, signs, phase_autocovariance(lags))
     ramp = (signs * 0.5 * points**2).sum(axis=1) ** 2
     return np.concatenate([random, ramp[None]])
 
@@ -211,7 +211,7 @@ def _pair_sums(n: int, m: int, step: float) -> Floats:
     their number grows with the step, while the number of pairs grows with its square.
     """
     at = np.arange(n + 1)
-    lags = autocovariance(step * np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]
+    lags = phase_autocovariance(step * np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]
     points, signs = _points(np.arange(1.0, n), n, m)
     rows = points.astype(np.int64)
     random = _combine_points(_combine_points(lags, rows, signs).transpose(0, 2, 1), rows, signs)

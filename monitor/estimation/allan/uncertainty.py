@@ -88,7 +88,7 @@ class CovarianceTables:
             known = self._table = covariance_table(n, self._factors)
         return known
 
-    def valid_for(self, n: int) -> int:
+    def remaining_valid_samples(self, n: int) -> int:
         """Return for how many samples ``at(n)`` stays valid, including sample n.
 
         The number is ``UNLIMITED_SAMPLES`` for a full window.
@@ -114,7 +114,7 @@ class AxisCovarianceTables:
         self._shared = CovarianceTables(factors, capacity)
         self._own = [CovarianceTables(factors, capacity) for _ in AXES]
 
-    def of(self, axis: int, n: int, filled: int) -> CovarianceTables:
+    def of_axis(self, axis: int, n: int, window_samples: int) -> CovarianceTables:
         """Return the tables of an axis.
 
         Parameters
@@ -123,10 +123,10 @@ class AxisCovarianceTables:
             Index of the axis.
         n : int
             Number of newest samples that this axis uses.
-        filled : int
+        window_samples : int
             Number of samples in the window.
         """
-        return self._shared if n == filled else self._own[axis]
+        return self._shared if n == window_samples else self._own[axis]
 
 
 def covariance_table(n: int, factors: Ints) -> CovarianceTable:
@@ -199,7 +199,7 @@ def _bend_covariance(n: int, m: int) -> Floats:
     return np.array([float((weight * part).sum()) for part in parts])
 
 
-class SpanDegreesOfFreedom:
+class PerTauSpanDegreesOfFreedom:
     """Degrees of freedom of a curve whose τ use different spans.
 
     Parameters
@@ -241,7 +241,7 @@ class SpanDegreesOfFreedom:
             return np.where(terms > 0, whole * terms / self._terms[:, None], np.nan)
 
 
-def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Floats, Floats]:
+def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Floats, Floats]:
     """Return the ends of the two-sided χ² interval of the Allan deviation, edf s²/χ² (NIST SP 1065 eq. 45).
 
     Parameters
@@ -258,7 +258,7 @@ def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Flo
     lo, hi : ndarray of float64
         Ends of the interval of the deviation, in the shape of ``avar``.
 
-    >>> lo, hi = intervals(np.array([1.0]), np.array([10.0]))
+    >>> lo, hi = deviation_intervals(np.array([1.0]), np.array([10.0]))
     >>> print(f"{lo[0]:.3f} {hi[0]:.3f}")
     0.699 1.755
     """

@@ -42,8 +42,8 @@ from monitor.estimation.allan.window_kernel import (
     WIDTH,
     WindowBuffers,
     advance,
-    discard,
-    slopes_of_axes,
+    keep_newest,
+    slopes_of_axes_and_taus,
     view_arrays,
 )
 
@@ -158,12 +158,12 @@ class AllanWindow:
         self.reset()
 
     @property
-    def n(self) -> int:
+    def samples_in_window(self) -> int:
         """Number of samples in the window, including missing ones."""
         return min(int(self._state[TOTAL]), self.length)
 
     @property
-    def total(self) -> int:
+    def samples_since_reset(self) -> int:
         """Number of samples since the last reset, including missing ones."""
         return int(self._state[TOTAL])
 
@@ -222,7 +222,7 @@ class AllanWindow:
         for start in range(0, n, SKIP_BLOCK_ROWS):
             self.update(hole[: n - start])
 
-    def discard(self, axis: int, n: int) -> None:
+    def keep_newest(self, axis: int, n: int) -> None:
         """Discard all but the newest samples of one axis, and count the older ones as missing.
 
         The cost is one pass over the window plus the cost of n samples.
@@ -234,8 +234,8 @@ class AllanWindow:
         n : int
             Number of newest samples to keep.
         """
-        if n < self.n:
-            discard(self._ints, self._floats, self._missing, self._taus, axis, n)
+        if n < self.samples_in_window:
+            keep_newest(self._ints, self._floats, self._missing, self._taus, axis, n)
 
     def avar(self) -> Floats:
         """Return the Allan variance [m, 6] in squared units of the axis; NaN where no term is complete."""
@@ -247,12 +247,12 @@ class AllanWindow:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.where(terms > 0, sums / (2.0 * m * m * terms), np.nan)
 
-    def slopes(self, lengths: Ints | None = None) -> tuple[Floats, Floats]:
+    def slopes_of_axes_and_taus(self, lengths: Ints | None = None) -> tuple[Floats, Floats]:
         """Return the slope of the rate of each axis over its newest samples, and the slope that each τ sees.
 
         The slope of an axis is the mean of the last third minus the mean of the first third, divided by two thirds of
         the duration (``batch.slope_of_recording``). The slope that τ sees is the mean second difference of phase
-        divided by m² (``batch.slope_per_tau``).
+        divided by m² (``batch.rate_slope_per_tau``).
 
         Parameters
         ----------
@@ -267,15 +267,15 @@ class AllanWindow:
             Slope that each τ sees, in the same unit.
         """
         slope, slopes = np.empty(AXES), np.empty((self._taus, AXES))
-        lengths = np.full(AXES, self.n) if lengths is None else lengths
-        slopes_of_axes(self._ints, self._floats, self._missing, self._taus, lengths, slope, slopes)
+        lengths = np.full(AXES, self.samples_in_window) if lengths is None else lengths
+        slopes_of_axes_and_taus(self._ints, self._floats, self._missing, self._taus, lengths, slope, slopes)
         return slope / self._scale[:AXES], slopes / self._scale[:AXES]
 
     def terms(self) -> Ints:
         """Return the number of second differences averaged, shape (m, 6)."""
         return self._terms[:, :AXES].copy()
 
-    def newest(self, axis: int, n: int) -> Floats:
+    def newest_samples(self, axis: int, n: int) -> Floats:
         """Return up to n of the newest samples of one axis from its phase; NaN means missing.
 
         Parameters
@@ -286,7 +286,7 @@ class AllanWindow:
             Maximum number of samples.
         """
         places = self._phase.size // LANES
-        at = (int(self._state[NEWEST]) - np.arange(min(n, self.n), -1, -1)) % places
+        at = (int(self._state[NEWEST]) - np.arange(min(n, self.samples_in_window), -1, -1)) % places
         phase, missing = self._phase[at * LANES + axis], self._missing[at * LANES + axis]
         return np.where(np.diff(missing) > 0, np.nan, np.diff(phase) / self._scale[axis])
 
@@ -307,7 +307,7 @@ class AllanWindow:
         rows = (self._phase.size // LANES, LANES)
         phase, missing = self._phase.reshape(rows), self._missing.reshape(rows)
         phase.flags.writeable = missing.flags.writeable = False
-        return phase, missing, (int(self._state[NEWEST]) - self.n) % rows[0], 1.0 / self._scale[:AXES]
+        return phase, missing, (int(self._state[NEWEST]) - self.samples_in_window) % rows[0], 1.0 / self._scale[:AXES]
 
 
 def _aligned(size: int, dtype: type[np.generic]) -> NDArray[Any]:

@@ -310,7 +310,7 @@ def _replace_terms(
 
 
 @compiled
-def discard(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, axis: int, n: int) -> None:
+def keep_newest(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, axis: int, n: int) -> None:
     """Mark all but the newest n samples of one axis as missing, and recompute the sums from those n.
 
     Parameters
@@ -405,7 +405,7 @@ def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
 
 
 @compiled
-def slopes_of_axes(
+def slopes_of_axes_and_taus(
     ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, lengths: Ints, slope: Floats, slopes: Floats
 ) -> None:
     """Compute the slope of each axis over its newest samples, and the slope that each τ sees.

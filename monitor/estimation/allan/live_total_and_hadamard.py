@@ -55,7 +55,7 @@ class _Result:
     moments: Moments
 
 
-class LiveTotalHadamard:
+class LiveTotalAndHadamard:
     """Total and Hadamard variance of a window, computed in rounds.
 
     Parameters
@@ -123,7 +123,7 @@ class LiveTotalHadamard:
     def _steps(self) -> Iterator[None]:
         """Run rounds without end, and yield after each step. The window length at its start sets the τ of a round."""
         while True:
-            n = self._window.n
+            n = self._window.samples_in_window
             totals = [m for m in self._factors[TOTAL] if m < n]
             hadamards = [m for m in self._factors[HADAMARD] if 3 * m <= n]
             if n < MIN_SAMPLES or not totals or not hadamards:
@@ -166,7 +166,7 @@ class LiveTotalHadamard:
     def _ring(self) -> tuple[PhaseRing, Floats]:
         """Return the phase of the window, and the size of one unit of phase [6]."""
         phase, missing, first, unit = self._window.view_ring()
-        return PhaseRing(phase, missing, first, self._window.n), unit
+        return PhaseRing(phase, missing, first, self._window.samples_in_window), unit
 
     def _result(self, statistic: int, n: int, m: int, sums: Floats, terms: Ints) -> _Result:
         """Convert the sums of one statistic at one cluster size to variances."""
