@@ -166,7 +166,7 @@ def of_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list
         return []
     times = "once" if len(motions) == 1 else f"{len(motions)} times"
     seconds = sum(motion.seconds for motion in motions)
-    done = "removed out" if removed else "left in; --rest strikes it out"
+    done = "struck out" if removed else "left in; --rest strikes it out"
     notes = [f"the sensor moved {times}, {seconds:.3g} s in all: {done}"]
     notes += [f"at {motion.since / rate_hz:.1f} s: {motion.text}" for motion in motions[:MAX_NOTES]]
     return notes + _count_omitted(len(motions), "motions")
