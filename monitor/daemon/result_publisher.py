@@ -179,6 +179,6 @@ class ResultPublisher:
         if self.withholds_coefficients:
             gap = replace(gap, axes={})
         events = self._agreement.update(gap)
-        gap = replace(gap, agrees=self._agreement.verdicts)
+        gap = replace(gap, agrees=self._agreement.decisions)
         self._result(gap.t_ns, gap)
         self.events(events)

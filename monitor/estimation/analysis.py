@@ -24,18 +24,24 @@ from monitor.estimation.allan.batch import (
     TauGrid,
     cluster_sizes,
     overlapping_avar,
+    rate_slope_per_tau,
     slope_of_recording,
-    slope_per_tau,
 )
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.allan.uncertainty import covariance_table, intervals
+from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.detection.change_detection import Change, ChangeDetector
 from monitor.estimation.detection.line_detection import detect_lines, outlier_share
 from monitor.estimation.detection.motion_detection import Motion, detect_motion
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.bandwidth import LowPass, find_low_pass, is_contradicted, power_spectrum, with_bandwidth
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, design, fit
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit, make_design
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
+from monitor.estimation.fit.low_pass_search import (
+    LowPass,
+    apply_low_passes,
+    find_low_pass,
+    is_contradicted,
+    power_spectrum,
+)
 from monitor.estimation.regular_grid import resample_to_grid
 
 MIN_SAMPLES: Final = 50
@@ -66,7 +72,7 @@ def analyze(
     tau: TauGrid = "octave",
     notes: Iterable[str] = (),
     each: EachAxis = map,
-    rest: bool = False,
+    remove_motion: bool = False,
 ) -> Analysis:
     """Compute the Allan curve of a recording and fit the coefficients to it.
 
@@ -82,7 +88,7 @@ def analyze(
         Notes from reading the file. They come first in the notes of the result.
     each : EachAxis
         Function that maps over the axes. The ``map`` of an executor computes them in parallel.
-    rest : bool
+    remove_motion : bool
         True to remove the samples during which the sensor moved.
 
     Raises
@@ -96,9 +102,9 @@ def analyze(
     if len(values) < MIN_SAMPLES:
         raise NotReady(f"{len(values)} samples; at least {MIN_SAMPLES} are needed to say anything")
     motions: tuple[Motion, ...] = ()
-    if rest:
+    if remove_motion:
         values, motions = _without_motion(values, rate)
-        found = [*found, *analysis_notes.of_motions(motions, rate, struck=True)]
+        found = [*found, *analysis_notes.of_motions(motions, rate, removed=True)]
     curve, fitted, filters = _fit_curve(values, rate, cluster_sizes(len(values), rate, tau), each)
     estimate = Estimate(
         int(blocks[-1].t_ns[-1]), rate, curve.n / rate, sum(len(samples) for samples in blocks),
@@ -106,9 +112,16 @@ def analyze(
     )  # fmt: skip
     bandwidth_hz = np.array([np.nan if one is None else one.cutoff * rate for one in filters])
     few = [f"{len(curve.tau_s)} averaging times are too few to fit five terms; at least {MIN_ROWS} are needed"]
-    said = few if len(curve.tau_s) < MIN_ROWS else analysis_notes.of_fit(curve, fitted, filters, rate)
+    said = few if len(curve.tau_s) < MIN_ROWS else analysis_notes.of_unexplained_curve(curve, fitted, filters, rate)
     return Analysis(
-        estimate, estimate.window_s, (*notes, *found, *said), values, fitted, bandwidth_hz, motions, motion_removed=rest
+        estimate,
+        estimate.window_s,
+        (*notes, *found, *said),
+        values,
+        fitted,
+        bandwidth_hz,
+        motions,
+        motion_removed=remove_motion,
     )
 
 
@@ -128,7 +141,7 @@ def detect_events(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analy
     if not result.motion_removed:
         moving, listed = detect_motion(result.values, rate)
         motions = tuple(listed)
-        notes += analysis_notes.of_motions(motions, rate, struck=False)
+        notes += analysis_notes.of_motions(motions, rate, removed=False)
     detector = ChangeDetector(rate, alarms_per_day)
     for begin in range(0, len(result.values), DETECTOR_CHUNK_ROWS):
         rows, struck = result.values[begin : begin + DETECTOR_CHUNK_ROWS], moving[begin : begin + DETECTOR_CHUNK_ROWS]
@@ -138,23 +151,23 @@ def detect_events(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analy
     found = detect_lines(result.values, moving, rate, result.estimate.curve)
     moved = bool(motions) and not result.motion_removed
     notes = analysis_notes.replace_guessed_causes(notes, result.estimate.curve, result.fit, found, moved)
-    notes += analysis_notes.of_departures(found, outlier_share(result.values, moving))
+    notes += analysis_notes.of_lines_and_outliers(found, outlier_share(result.values, moving))
     return replace(result, notes=tuple(notes), motions=motions, changes=changes)
 
 
-def refit(result: Analysis, values: Floats, each: EachAxis = map) -> Fit:
+def fit_other_samples(result: Analysis, samples: Floats, each: EachAxis = map) -> Fit:
     """Fit other samples at the averaging times of an analysis.
 
     Parameters
     ----------
     result : Analysis
         Result of ``analyze``, which gives the sample rate and the cluster sizes.
-    values : ndarray of float64, shape (n, 6)
+    samples : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s², for example the samples of ``result`` after a correction. NaN means missing.
     each : EachAxis
         Function that maps over the axes.
     """
-    _, found, _ = _fit_curve(values, result.estimate.rate_hz, result.estimate.curve.factors, each)
+    _, found, _ = _fit_curve(samples, result.estimate.rate_hz, result.estimate.curve.factors, each)
     return found
 
 
@@ -173,9 +186,9 @@ def _fit_curve(
     """Return the Allan curve with its intervals, the fit, and the low-pass of each axis that shows one."""
     n = len(values)
     avar, terms = overlapping_avar(values, factors, each)
-    columns, covariances = design(factors, rate_hz), covariance_table(n, factors)
+    columns, covariances = make_design(factors, rate_hz), covariance_table(n, factors)
     measured = MeasuredCurve(
-        avar, terms, slope_of_recording(values) * rate_hz, slope_per_tau(values, factors) * rate_hz
+        avar, terms, slope_of_recording(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
     )
     found = fit(columns, covariances, avar, terms, slope=measured.slope, slopes=measured.slopes)
     filters = [
@@ -184,6 +197,6 @@ def _fit_curve(
         else None
         for axis in range(values.shape[1])
     ]
-    found, filters = with_bandwidth(columns, covariances, measured, found, filters)
-    lo, hi = intervals(avar, found.edf)
+    found, filters = apply_low_passes(columns, covariances, measured, found, filters)
+    lo, hi = deviation_intervals(avar, found.edf)
     return AllanCurve(factors / rate_hz, factors, avar, terms, found.edf, lo, hi, n), found, filters

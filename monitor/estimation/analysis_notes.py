@@ -17,10 +17,10 @@ from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.line_detection import OUTLIER_SIGMA, Line, line_share
 from monitor.estimation.detection.motion_detection import Motion
-from monitor.estimation.fit.bandwidth import LowPass
 from monitor.estimation.fit.coefficient_fit import Fit
 from monitor.estimation.fit.coefficients import Status
 from monitor.estimation.fit.least_squares import K, Q
+from monitor.estimation.fit.low_pass_search import LowPass
 
 Run = tuple[int, int]
 """Row numbers of the first and the last τ of a range."""
@@ -51,7 +51,7 @@ MIN_DEPARTURE_RATIO: Final = 0.5
 """Averaging times are reported together with the worst one if they depart to the same side by this share of it."""
 
 
-def of_fit(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass | None], rate_hz: float) -> list[str]:
+def of_unexplained_curve(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass | None], rate_hz: float) -> list[str]:
     """Describe where the sum of the five terms does not explain the curve. Axes with the same note share it.
 
     Parameters
@@ -134,7 +134,7 @@ def replace_guessed_causes(
     Parameters
     ----------
     notes : sequence of str
-        Notes that include those of ``of_fit``.
+        Notes that include those of ``of_unexplained_curve``.
     curve : AllanCurve
         Curve from which these notes were made.
     fit : Fit
@@ -150,7 +150,7 @@ def replace_guessed_causes(
     return kept + [note for note in known if note not in kept] + of_quantization(curve, fit, found)
 
 
-def of_motions(motions: Sequence[Motion], rate_hz: float, struck: bool) -> list[str]:
+def of_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list[str]:
     """Report how often and how long the sensor moved, and how these samples were treated.
 
     Parameters
@@ -159,14 +159,14 @@ def of_motions(motions: Sequence[Motion], rate_hz: float, struck: bool) -> list[
         Episodes of motion.
     rate_hz : float
         Sample rate in Hz.
-    struck : bool
+    removed : bool
         True if the samples in motion have been removed.
     """
     if not motions:
         return []
     times = "once" if len(motions) == 1 else f"{len(motions)} times"
     seconds = sum(motion.seconds for motion in motions)
-    done = "struck out" if struck else "left in; --rest strikes it out"
+    done = "struck out" if removed else "left in; --rest strikes it out"
     notes = [f"the sensor moved {times}, {seconds:.3g} s in all: {done}"]
     notes += [f"at {motion.since / rate_hz:.1f} s: {motion.text}" for motion in motions[:MAX_NOTES]]
     return notes + _count_omitted(len(motions), "motions")
@@ -193,7 +193,7 @@ def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
     return notes
 
 
-def of_departures(found: Sequence[Line], far: Floats) -> list[str]:
+def of_lines_and_outliers(found: Sequence[Line], far: Floats) -> list[str]:
     """Report spectral lines, one note for all axes of one frequency, and the share of outliers.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Result of the estimator at one moment: ``Estimate``, and the per-sample coefficients ``CoefficientHistory``."""
+"""Result of the estimator at one moment: ``Estimate``, and the per-sample coefficients ``PerSampleCoefficients``."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -12,18 +12,18 @@ from monitor.estimation.fit.coefficients import Coefficients, Status
 
 
 @dataclass(frozen=True, slots=True)
-class CoefficientHistory:
+class PerSampleCoefficients:
     """Coefficients after each of n consecutive samples."""
 
     t_ns: Ints  # [n] host monotonic clock, nanoseconds
     value: Floats  # [n, 5, 6] Q N B K R in SI; NaN where not estimated
 
 
-def concatenate_histories(courses: Collection[CoefficientHistory]) -> CoefficientHistory | None:
+def concatenate_coefficients(courses: Collection[PerSampleCoefficients]) -> PerSampleCoefficients | None:
     """Concatenate courses. Return None if there are none."""
     if not courses:
         return None
-    return CoefficientHistory(
+    return PerSampleCoefficients(
         np.concatenate([part.t_ns for part in courses]), np.concatenate([part.value for part in courses])
     )
 
@@ -41,7 +41,7 @@ class Estimate:
     coefficients: Coefficients
     k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
     display_curve: AllanCurve | None = None  # same τ, each over its own shorter span; see ``window.display_spans``
-    history: CoefficientHistory | None = None  # since the previous estimate, if a fit at every sample is requested
+    history: PerSampleCoefficients | None = None  # since the previous estimate, if a fit at every sample is requested
 
     def without_coefficients(self) -> "Estimate":
         """Return a copy with the curve alone: no fit, and every coefficient unestimated."""

@@ -23,14 +23,25 @@ from drivers.sample import Floats, Ints, SampleBlock
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
-from monitor.estimation.allan.live_total_hadamard import LiveTotalHadamard
+from monitor.estimation.allan.live_total_and_hadamard import LiveTotalAndHadamard
 from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.allan.uncertainty import AxisCovarianceTables, CovarianceTable, SpanDegreesOfFreedom, intervals
+from monitor.estimation.allan.uncertainty import (
+    AxisCovarianceTables,
+    CovarianceTable,
+    PerTauSpanDegreesOfFreedom,
+    deviation_intervals,
+)
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow, display_spans
-from monitor.estimation.estimate import CoefficientHistory, Estimate, concatenate_histories
-from monitor.estimation.fit.bandwidth import LowPass, is_contradicted, power_spectrum, search_low_pass, with_bandwidth
-from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, concatenate_fits, design, empty_fit, fit
+from monitor.estimation.estimate import Estimate, PerSampleCoefficients, concatenate_coefficients
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, concatenate_fits, empty_fit, fit, make_design
 from monitor.estimation.fit.continuous_refit import ContinuousRefit
+from monitor.estimation.fit.low_pass_search import (
+    LowPass,
+    apply_low_passes,
+    is_contradicted,
+    power_spectrum,
+    search_low_pass,
+)
 from monitor.estimation.window_snapshot import WindowSnapshot, copy_window
 
 SETTLING_FITS: Final = 10
@@ -74,15 +85,15 @@ class Estimator:
         rows, lengths = np.tile(factors, 2), np.concatenate([np.full(self._m, length), spans])
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
-        self._design = design(factors, rate_hz)
+        self._design = make_design(factors, rate_hz)
         self._tables = AxisCovarianceTables(factors, length)
-        self._spans = SpanDegreesOfFreedom(factors, spans, self._design.columns)
+        self._spans = PerTauSpanDegreesOfFreedom(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
         self._lengths = np.zeros(6, np.int64)  # samples of each axis since its last restart, limited to the window
         self._refit = ContinuousRefit(self._window, self._m, self._tables) if every_sample else None
-        self._history: deque[CoefficientHistory] = deque()
+        self._history: deque[PerSampleCoefficients] = deque()
         self._history_samples = 0  # total number of samples in ``_history``
-        self._total_hadamard = LiveTotalHadamard(self._window)
+        self._total_hadamard = LiveTotalAndHadamard(self._window)
         self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
         self._contradicting: list[tuple[CovarianceTable, MeasuredCurve] | None] = [
             None
@@ -99,12 +110,12 @@ class Estimator:
         return self._samples
 
     @property
-    def filled(self) -> int:
+    def samples_in_window(self) -> int:
         """Number of samples in the window, including missing ones."""
-        return self._window.n
+        return self._window.samples_in_window
 
     @property
-    def length(self) -> int:
+    def window_samples(self) -> int:
         """Number of samples in the full window."""
         return self._window.length
 
@@ -119,13 +130,15 @@ class Estimator:
         elif samples.lost:
             self._window.skip(samples.lost)
             self._lengths += samples.lost
-        np.minimum(self._lengths, self._window.n, out=self._lengths)
+        np.minimum(self._lengths, self._window.samples_in_window, out=self._lengths)
         if self._refit is None:
             self._window.update(samples.values)
             self._lengths += len(samples)
         else:
             self._history.append(
-                CoefficientHistory(samples.t_ns, self._refit.update(self._design, samples.values, self._lengths))
+                PerSampleCoefficients(
+                    samples.t_ns, self._refit.advance_and_refit(self._design, samples.values, self._lengths)
+                )
             )
             self._history_samples += len(samples)
             while self._history_samples - len(self._history[0].t_ns) >= MAX_HISTORY_SAMPLES:
@@ -151,7 +164,7 @@ class Estimator:
         samples : int
             Number of newest samples to keep.
         """
-        self._window.discard(axis, samples)
+        self._window.keep_newest(axis, samples)
         self._lengths[axis] = min(samples, self._lengths[axis])
         self._entered[:, axis], self._theta[:, axis] = False, np.nan
         if self._refit is not None:
@@ -178,15 +191,15 @@ class Estimator:
             Squared coefficients Q², N², B², K², R² in SI.
         """
         self._entered, self._theta = entered.copy(), theta.copy()
-        if self._window.n >= MIN_SAMPLES:
+        if self._window.samples_in_window >= MIN_SAMPLES:
             for _ in range(SETTLING_FITS):
                 self.get()
 
-    def set_rate(self, rate_hz: float) -> None:
+    def refine_rate(self, rate_hz: float) -> None:
         """Set a more accurate sample rate. The clusters of samples stay the same; τ and the units change."""
         self.rate_hz = rate_hz
         self.window_s = self._window.length / rate_hz
-        self._design = design(self._factors, rate_hz)
+        self._design = make_design(self._factors, rate_hz)
 
     def get(self, fitted: bool = True) -> Estimate:
         """Return the Allan curve of the window and the coefficients fitted to it.
@@ -201,7 +214,7 @@ class Estimator:
         NotReady
             If the window holds fewer than ``MIN_SAMPLES`` samples.
         """
-        n = self._window.n
+        n = self._window.samples_in_window
         if n < MIN_SAMPLES:
             raise NotReady(f"{n} of at least {MIN_SAMPLES} samples")
         avar, terms = self._window.avar(), self._window.terms()
@@ -210,7 +223,7 @@ class Estimator:
         curve = self._curve(avar[own], terms[own], result.edf, n)
         quick_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent])
         quick = self._curve(avar[recent], terms[recent], quick_edf, n)
-        history = concatenate_histories(self._history)
+        history = concatenate_coefficients(self._history)
         self._history.clear()
         self._history_samples = 0
         return Estimate(
@@ -221,8 +234,8 @@ class Estimator:
     def step_slow_statistics(self) -> tuple[TotalCurve, HadamardCurve] | None:
         """Run one step of the slow computations.
 
-        These are the total and Hadamard deviations (see ``live_total_hadamard``) and the search for the low-pass of the
-        sensor.
+        The slow computations are the total and Hadamard deviations (``live_total_and_hadamard``) and the search for the
+        low-pass filter of the sensor.
 
         Returns
         -------
@@ -231,7 +244,7 @@ class Estimator:
         """
         rounds = self._total_hadamard.rounds
         self._total_hadamard.step()
-        self._seek_bandwidth()
+        self._step_low_pass_search()
         return (
             self._total_hadamard.get(self.rate_hz, np.where(self._entered, self._theta, 0.0))
             if self._total_hadamard.rounds > rounds
@@ -240,16 +253,16 @@ class Estimator:
 
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
         """Fit all axes that fill the window together. Fit each restarted axis with covariances of its own length."""
-        lengths = np.minimum(self._lengths, self._window.n)
-        slope, slopes = self._window.slopes(lengths)
+        lengths = np.minimum(self._lengths, self._window.samples_in_window)
+        slope, slopes = self._window.slopes_of_axes_and_taus(lengths)
         before = self._entered if self._refit is None else self._refit.entered
-        shorter = [axis for axis in range(len(lengths)) if lengths[axis] < self._window.n]
-        groups = [np.flatnonzero(lengths == self._window.n), *(np.array([axis]) for axis in shorter)]
+        shorter = [axis for axis in range(len(lengths)) if lengths[axis] < self._window.samples_in_window]
+        groups = [np.flatnonzero(lengths == self._window.samples_in_window), *(np.array([axis]) for axis in shorter)]
         groups = [axes for axes in groups if axes.size]
         fits = []
         for axes in groups:
             n = int(lengths[axes[0]])
-            table = self._tables.of(int(axes[0]), n, self._window.n).at(n)
+            table = self._tables.of_axis(int(axes[0]), n, self._window.samples_in_window).at(n)
             measured = MeasuredCurve(
                 avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[: self._m, axes] * self.rate_hz,
                 before[:, axes],
@@ -262,13 +275,13 @@ class Estimator:
             for column, axis in enumerate(axes.tolist()):
                 self._contradicting[axis] = (table, measured.axis(column)) if is_contradicted(one, column) else None
             fits.append(
-                with_bandwidth(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
+                apply_low_passes(self._design, table, measured, one, [self._low_passes[axis] for axis in axes])[0]
             )
         result = fits[0] if len(fits) == 1 else concatenate_fits(fits, np.concatenate(groups))
         self._entered = result.entered
         return result
 
-    def _seek_bandwidth(self) -> None:
+    def _step_low_pass_search(self) -> None:
         """Run one part of the low-pass search of one axis.
 
         When a search ends, the next axis whose shortest τ contradict its fit is searched.
@@ -287,12 +300,12 @@ class Estimator:
                 self._search = search_low_pass(
                     self._design,
                     *contradicting,
-                    power_spectrum(self._window.newest(self._search_axis, SPECTRUM_SAMPLES)),
+                    power_spectrum(self._window.newest_samples(self._search_axis, SPECTRUM_SAMPLES)),
                 )
                 return
             self._low_passes[self._search_axis] = None
 
     def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
         """Build an ``AllanCurve`` with confidence intervals."""
-        lo, hi = intervals(avar, edf)
+        lo, hi = deviation_intervals(avar, edf)
         return AllanCurve(self._factors / self.rate_hz, self._factors, avar, terms, edf, lo, hi, n)

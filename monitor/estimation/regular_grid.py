@@ -1,7 +1,7 @@
 """Resampling of a recording to a regular grid by the clock that stamps live samples. Missing samples become NaN.
 
 The live clock treats a time step of two periods as a gap, because it must place the next sample at once. In a complete
-recording, each gap is checked again for samples that were only late (``missing_samples``).
+recording, each gap is checked again for samples that were only late (``missing_sample_count``).
 
 Rows with the values and the time stamp of an earlier row are removed. Rows that repeat the previous values at a later
 time are kept, because the sensor returned these values. A stated rate is used even if the time stamps contradict it.
@@ -23,9 +23,9 @@ from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
 from drivers.timing.sender_times import FORWARD_JUMP_S
 from monitor.common.units import format_rate, format_two_digits
-from monitor.estimation.detection.repeated_samples import repeated_share
+from monitor.estimation.detection.repeated_share import estimate_repeated_share
 from monitor.estimation.detection.resolution import QuantizationStep, find_coarse_axes
-from monitor.estimation.missing_samples import count_missing_samples
+from monitor.estimation.missing_sample_count import count_missing_samples
 
 MIN_RATE_DEVIATION: Final = 0.002
 """Relative deviation of the stated rate from the time stamps that is reported if the time stamps are that accurate."""
@@ -211,7 +211,7 @@ def _late_notes(late: int) -> list[str]:
 
 def _repeated_notes(values: Floats) -> list[str]:
     """Format the note on rows that repeat the previous one."""
-    share = repeated_share(values)
+    share = estimate_repeated_share(values)
     if share < MIN_REPEATED_SHARE:
         return []
     percent = 100.0 * share

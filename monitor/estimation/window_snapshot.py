@@ -68,7 +68,7 @@ def copy_window(window: AllanWindow, rate_hz: float) -> WindowSnapshot:
         Sample rate in Hz.
     """
     phase, missing, first, unit = window.view_ring()
-    end = first + window.n + 1
+    end = first + window.samples_in_window + 1
     # the window may wrap around the end of the ring
     rows = [slice(first, min(end, len(phase))), slice(0, max(end - len(phase), 0))]
     return WindowSnapshot(
@@ -136,7 +136,7 @@ class TemperatureRing:
     >>> newest = TemperatureRing(3)
     >>> newest.push(0, np.array([20.0, 21.0]))
     >>> newest.push(1, np.array([22.0]))
-    >>> newest.newest(3).tolist()
+    >>> newest.newest_temperatures(3).tolist()
     [21.0, nan, 22.0]
     """
 
@@ -158,7 +158,7 @@ class TemperatureRing:
             self._write(np.full(min(lost, self._ring.size), np.nan))
         self._write(temperature_c[-self._ring.size :])
 
-    def newest(self, n: int) -> Floats:
+    def newest_temperatures(self, n: int) -> Floats:
         """Return the temperatures of the newest n samples in °C, oldest first; NaN means not measured."""
         return self._ring[(self._next - np.arange(n, 0, -1)) % self._ring.size].astype(np.float64)
 

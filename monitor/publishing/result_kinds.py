@@ -15,7 +15,7 @@ from monitor.common.health import Health
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalUpdate
 from monitor.estimation.detection.model_gap import ModelGap
-from monitor.estimation.estimate import Estimate, concatenate_histories
+from monitor.estimation.estimate import Estimate, concatenate_coefficients
 from monitor.publishing.messages.message import Message
 from monitor.publishing.messages.results import (
     AllanMessage,
@@ -91,7 +91,7 @@ def keep_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
         if isinstance(previous, Estimate):
             unix_s, estimate = new
             histories = [one for one in (previous.history, estimate.history) if one is not None]
-            new = unix_s, replace(estimate, history=concatenate_histories(histories))
+            new = unix_s, replace(estimate, history=concatenate_coefficients(histories))
     waiting.append(new)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from drivers.sample import AXES
-from monitor.estimation.estimate import CoefficientHistory, Estimate
+from monitor.estimation.estimate import Estimate, PerSampleCoefficients
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
@@ -45,7 +45,7 @@ class Kept(Caught):
 
     def __init__(self) -> None:
         super().__init__()
-        self.course: list[CoefficientHistory] = []
+        self.course: list[PerSampleCoefficients] = []
 
     def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         super().result(device, unix_s, received, result)

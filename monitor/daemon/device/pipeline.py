@@ -21,7 +21,7 @@ from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.drift.thermal.live_thermal import LiveThermal, ThermalUpdate
-from monitor.estimation.detection.model_gap import ModelComparison
+from monitor.estimation.detection.model_gap import PreparedModel
 from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import Estimator
 from monitor.estimation.window_snapshot import TemperatureRing, WindowSnapshot
@@ -64,7 +64,7 @@ class DevicePipeline:
         self.signal_monitor: SignalMonitor | None = None
         self.thermal: LiveThermal | None = None
         self.compensation: LiveCompensation | None = None
-        self.model_in_force: ModelComparison | None = None
+        self.model_in_force: PreparedModel | None = None
         self.refusal_reason = ""
         """Reason why no estimate is possible; empty if it is."""
         self.advanced = False
@@ -83,7 +83,7 @@ class DevicePipeline:
         self._interprets = False
         self._temperatures: TemperatureRing | None = None  # of the samples in the window
         self._thermal_intervals: list[ThermalUpdate] = []  # thermal intervals that were not taken yet
-        self._handled = 0  # last seen value of ``signal_monitor.handled``
+        self._handled = 0  # last seen value of ``signal_monitor.orientation_changes``
         self._pieces: deque[SampleBlock] = deque()  # samples of a recording that wait for the thermal model
         self._replaying = False
 
@@ -203,16 +203,16 @@ class DevicePipeline:
         """Set the sample rate to a more accurate value."""
         if self.estimator is None or rate_hz == self.estimator.rate_hz:
             return
-        self.estimator.set_rate(rate_hz)
+        self.estimator.refine_rate(rate_hz)
         for one in (self.signal_monitor, self.thermal, self.compensation):
             if one is not None:
                 one.set_rate(rate_hz)
 
     def window_snapshot(self) -> tuple[WindowSnapshot, Floats] | None:
         """Return a copy of the window and its temperature, float64 [n] in °C; None if the window is empty."""
-        if self.estimator is None or self._temperatures is None or not self.estimator.filled:
+        if self.estimator is None or self._temperatures is None or not self.estimator.samples_in_window:
             return None
-        return self.estimator.copy_window(), self._temperatures.newest(self.estimator.filled)
+        return self.estimator.copy_window(), self._temperatures.newest_temperatures(self.estimator.samples_in_window)
 
     def take_events(self) -> list[Event]:
         """Return the events that were detected since the last call."""
@@ -237,9 +237,9 @@ class DevicePipeline:
         device = self._device
         try:
             self.estimator = Estimator(rate_hz, device.window_s, device.tau, every_sample=device.refit_s == 0.0)
-            self._temperatures = TemperatureRing(self.estimator.length)
+            self._temperatures = TemperatureRing(self.estimator.window_samples)
             if self._model is not None:
-                self.model_in_force = ModelComparison(self._model, self.estimator.length)
+                self.model_in_force = PreparedModel(self._model, self.estimator.window_samples)
         except ConfigError as error:  # the configured τ do not suit the measured rate; samples are still published
             self.refusal_reason = f"no estimate: {error}"
             return False
@@ -251,7 +251,9 @@ class DevicePipeline:
             return
         device, rate_hz = self._device, self.estimator.rate_hz
         wanted = device.thermal_s is not None
-        self.signal_monitor = SignalMonitor(rate_hz, device.leave_out_motion, device.alarms_per_day, keep_still=wanted)
+        self.signal_monitor = SignalMonitor(
+            rate_hz, device.leave_out_motion, device.alarms_per_day, keep_samples_at_rest=wanted
+        )
         self.thermal = None if device.thermal_s is None else LiveThermal(rate_hz, device.thermal_s)
         self.compensation = LiveCompensation(rate_hz) if device.compensate else None
 
@@ -278,8 +280,8 @@ class DevicePipeline:
         """Pass the samples at rest to the thermal model."""
         if self.signal_monitor is None or self.thermal is None:
             return
-        if self.signal_monitor.handled != self._handled:
-            self._handled = self.signal_monitor.handled
+        if self.signal_monitor.orientation_changes != self._handled:
+            self._handled = self.signal_monitor.orientation_changes
             self.thermal.learn_new_offset()
         for samples in self.signal_monitor.take_samples_at_rest():
             self._thermal_intervals += self.thermal.update(samples)

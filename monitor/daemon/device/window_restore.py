@@ -120,7 +120,7 @@ class WindowRestore:
             shape = (-1, len(AXES))
             theta = np.array(state.theta, np.float64).reshape(shape)
             pipeline.estimator.restore_fit(np.array(state.entered).reshape(shape), theta)
-        filled_s = pipeline.estimator.filled / pipeline.estimator.rate_hz
+        filled_s = pipeline.estimator.samples_in_window / pipeline.estimator.rate_hz
         return f"{filled_s:.6g} s of the window were rebuilt from the recording"
 
 

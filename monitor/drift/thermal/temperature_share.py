@@ -25,7 +25,7 @@ from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means, fit_ther
 from monitor.drift.thermal.thermal_model import predict
 from monitor.drift.thermal.thermal_study import round_interval_s
 from monitor.estimation.allan.batch import EachAxis
-from monitor.estimation.analysis import Analysis, refit
+from monitor.estimation.analysis import Analysis, fit_other_samples
 from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 
 SLOW_LETTERS: Final = ("K", "R")
@@ -134,7 +134,7 @@ def remove_temperature(result: Analysis, temperature_c: Floats, each: EachAxis =
     before, k_or_r = result.estimate.coefficients, result.estimate.k_or_r
     after = before
     if models:
-        fit = refit(result, values, each)
+        fit = fit_other_samples(result, values, each)
         after, k_or_r = fit.coefficients, fit.k_or_r
     return TemperatureShare(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
 

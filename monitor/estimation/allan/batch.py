@@ -1,26 +1,27 @@
 """Overlapping Allan variance of a whole recording in floating point, the reference for the sliding window.
 
 The module shares no arithmetic with ``window``, which uses integers. Three measures keep the precision for 10⁷ samples
-and more, even for noise of 1e-4 m/s² on a mean of 9.81 m/s²:
+and more, even for noise of 1e-4 m/s² on a mean of 9.81 m/s².
 
 - A term never contains a missing sample, so each run of samples without a gap is treated as a separate recording. The
   mean of the run is subtracted first. The subtraction is exact if the noise is small compared with the mean (Sterbenz),
   and second differences do not depend on the mean.
-- Phase is the running sum of the remainder. The rounding errors of all steps are summed separately and added back
-  (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005). Phase is therefore correct to
-  its last digit.
-- Squares are added in ``LANES`` separate sums, which NumPy adds in pairs.
+- Phase is the running sum of the rates without the mean. The rounding errors of all steps are summed separately and
+  added back (Ogita, Rump & Oishi, "Accurate sum and dot product", SIAM J. Sci. Comput. 26(6), 2005). Each value of
+  phase is therefore correct to the last digit.
+- The squares are added in ``LANES`` separate sums. NumPy adds these sums pairwise.
 
 Compared with exact sums in whole numbers, σ² is correct to 1e-15 for stationary noise and to 1e-12 under a random walk.
-The remaining error is the last digit of phase. It is largest if the mean is not constant: 1e-10 for a rate that ramps
-through 20 000 times its noise.
+The remaining error comes from the rounding of phase to double precision. The error is largest for a rate with a strong
+ramp. If the ramp rises by 20 000 times the noise, the error is 1e-10.
 
 One float64 per sample and axis is allocated in addition to the samples. The kernel releases the GIL and computes one
-axis per call, so a thread pool can compute the axes in parallel: ``overlapping(values, factors, each=pool.map)``.
+axis per call. A thread pool can therefore compute the axes in parallel with ``overlapping_avar(values, factors,
+each=pool.map)``.
 
-A run is processed in blocks, with all τ per block. Phase is then read from memory only once for all τ shorter than a
-block. For longer octaves, two of the three points of a term are still in the cache from the previous octave. Processing
-one τ at a time would be limited by the memory bandwidth.
+A run is processed in blocks, and all τ of a block are computed together. Phase is then read from memory only once for
+all τ shorter than a block. At longer τ, each second difference needs three phase points, and two of them are still in
+the cache from the previous octave. Processing one τ at a time would be limited by the memory bandwidth.
 """
 
 from collections.abc import Callable, Iterable
@@ -48,15 +49,16 @@ BLOCK: Final = 16_384
 LANES: Final = 512
 """Number of separate sums of squares per τ.
 
-A row of this length is worth the set-up of a vector loop and fits the first-level cache.
+With this number, the set-up of a vector loop pays off, and the sums fit the first-level cache.
 """
 
 
 def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tuple[Floats, Ints]:
-    """Return the overlapping Allan variance of rates and the number of its terms.
+    """Return the overlapping Allan variance of rates and the number of terms.
 
-    NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C), with phase x in samples of the
-    rate, so that τ0 does not enter. Values that are not finite are missing, and terms that touch them are left out.
+    NIST SP 1065 eq. 11 on rates: σ²(m) = Σ (x_{k+2m} - 2x_{k+m} + x_k)² / (2 m² C). Here x is phase and C is the number
+    of terms. The sample interval is the unit of time, so τ0 does not occur. Values that are not finite are missing.
+    Second differences that contain a missing sample are left out.
 
     Parameters
     ----------
@@ -65,7 +67,7 @@ def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tup
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples, at least 1.
     each : EachAxis
-        Function that maps over the axes. The ``map`` of an executor computes them in parallel.
+        Function that maps over the axes. With the ``map`` method of a thread pool, the axes are computed in parallel.
 
     Returns
     -------
@@ -82,7 +84,7 @@ def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tup
 
 
 def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
-    """Return the overlapping Allan variance of one axis and the number of its terms, see ``overlapping_avar``.
+    """Return the overlapping Allan variance of one axis and the number of terms, as ``overlapping_avar`` does.
 
     Parameters
     ----------
@@ -109,11 +111,12 @@ def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
 
 
 def slope_of_recording(values: Floats) -> Floats:
-    """Return the slope of the rate [k] over a recording [n, k] in units per sample, from its first and last third.
+    """Return the slope of the rates of a recording, estimated from the first and the last third.
 
     The slope is the mean of the last third minus the mean of the first third, divided by two thirds of the duration T.
-    Under white noise its variance is 13.5 N²/T³, compared with 12 N²/T³ for a regression. Under rate random walk, the
-    variances are 5/4 and 6/5 of K²/T. The slope is NaN if more than a fiftieth of the samples is missing.
+    For white noise, the variance of this slope is 13.5 N²/T³, compared with 12 N²/T³ for a linear regression. For rate
+    random walk, the variances are 5/4 K²/T and 6/5 K²/T. The slope [k] of the rates [n, k] is in units per sample. It
+    is NaN if more than 2 % of the samples are missing.
 
     >>> slope_of_recording(0.5 * np.arange(9.0)[:, None]).tolist()
     [0.5]
@@ -130,15 +133,17 @@ def slope_of_recording(values: Floats) -> Floats:
     return np.where(whole, (parts[2][1] - parts[0][1]) / (2.0 * third), np.nan)
 
 
-def slope_per_tau(values: Floats, factors: Ints) -> Floats:
-    """Return the slope of the rate as seen by each τ: the mean second difference of phase divided by m².
+def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
+    """Return the slope of the rates that contributes to the Allan variance at each τ.
 
-    The sum of all second differences telescopes to four blocks of phase at the ends, so one pass serves all τ. Missing
-    samples are replaced by the mean.
+    The slope is the mean second difference of phase, divided by m².
+
+    The sum of all second differences telescopes to four blocks of phase at the ends, so one pass over the samples is
+    enough for all τ. Missing samples are replaced by the mean.
 
     Parameters
     ----------
-    values : ndarray of float, shape (n, k)
+    rates : ndarray of float, shape (n, k)
         Rates of k axes; values that are not finite are missing.
     factors : ndarray of int64, shape (m,)
         Cluster sizes in samples.
@@ -146,13 +151,14 @@ def slope_per_tau(values: Floats, factors: Ints) -> Floats:
     Returns
     -------
     ndarray of float64, shape (m, k)
-        Slope in units per sample; NaN where no term is complete, and for axes with more than a fiftieth missing.
+        Slope in units per sample; NaN where no second difference is complete, and for axes with more than 2 % of the
+        samples missing.
 
-    >>> slope_per_tau(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
+    >>> rate_slope_per_tau(0.5 * np.arange(90.0)[:, None], np.array([1, 8])).round(12).ravel().tolist()
     [0.5, 0.5]
     """
     m = np.asarray(factors, np.int64)
-    rates = np.ascontiguousarray(values, np.float64)
+    rates = np.ascontiguousarray(rates, np.float64)
     terms = len(rates) + 1 - 2 * m
     ends = np.stack([np.zeros_like(m), m, 2 * m, terms, terms + m, terms + 2 * m])
     places, at = np.unique(ends, return_inverse=True)
@@ -165,16 +171,16 @@ def slope_per_tau(values: Floats, factors: Ints) -> Floats:
 
 
 def _present_mean(values: Floats) -> Floats:
-    """Return the mean [k] of the present values of [n, k]; NaN where too many are missing."""
+    """Return the mean [k] of the finite values of each column [n, k]; NaN where too many values are missing."""
     count, mean = _mean(values)
     return np.where(count < MIN_PRESENT_SHARE * len(values), np.nan, mean)
 
 
 @compiled
 def _mean(values: Floats) -> tuple[Ints, Floats]:
-    """Return the number of finite values and their mean, [k] each.
+    """Return the number [k] and the mean [k] of the finite values of each column.
 
-    Differences from the first value are summed, which keeps the precision.
+    The kernel sums differences from the first value, because this keeps the precision.
     """
     n, k = values.shape
     first, total, count = np.zeros(k), np.zeros(k), np.zeros(k, np.int64)
@@ -190,7 +196,7 @@ def _mean(values: Floats) -> tuple[Ints, Floats]:
 
 @compiled
 def _sums_of_phase(values: Floats, mean: Floats, places: Ints) -> Floats:
-    """Return the running sum of phase before each of the ascending ``places``.
+    """Return the running sum of phase before each point of ``places``, which must ascend.
 
     Phase is the running sum of the mean-free rates [n, k].
     """
@@ -214,7 +220,7 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
     """Return the cluster sizes m = τ · rate of a grid of averaging times.
 
     The grid ``octave`` is 1, 2, 4, …, and ``decade10`` has ten sizes per decade. A grid ends at a quarter of the
-    window, where each variance still averages several independent terms. Averaging times requested by the user may
+    window, where each variance is still a mean of several independent terms. Averaging times requested by the user may
     reach half the window.
 
     Parameters
@@ -254,9 +260,9 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
 
 @compiled
 def _add_runs(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
-    """Add all terms of the rates ``phase[1:]``, which are replaced by phase.
+    """Add the squared second differences of all runs. ``phase[1:]`` holds rates on input and phase on return.
 
-    The phase of each run starts at 0 in the slot before the run.
+    The phase of each run starts at 0 in the element before the run.
     """
     before = 0
     while before + 1 < phase.size:
@@ -273,7 +279,10 @@ def _add_runs(phase: Floats, factors: Ints, lanes: Floats, terms: Ints) -> None:
 
 @compiled
 def _integrate(phase: Floats, before: int) -> int:
-    """Replace the run of finite rates after a slot by phase. Return its last slot, or ``before`` if it is empty."""
+    """Replace the run of finite rates after index ``before`` by phase, and return the last index of the run.
+
+    If the run is empty, ``before`` is returned.
+    """
     total, last = 0.0, before
     while last + 1 < phase.size and np.isfinite(phase[last + 1]):
         last += 1
@@ -293,7 +302,7 @@ def _integrate(phase: Floats, before: int) -> int:
 
 @compiled
 def _add_squares(phase: Floats, first: int, end: int, m: int, lanes: Floats) -> None:
-    """Add the squared second differences that end at first … end - 1 to the lanes in turn.
+    """Add the squared second differences that end at indices first ≤ i < end, distributed over the lanes in turn.
 
     An index that could be negative would make the inner loop scalar.
     """

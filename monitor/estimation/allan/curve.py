@@ -1,4 +1,4 @@
-"""``AllanCurve``: Allan variance of a window or a recording at each τ, with degrees of freedom and intervals."""
+"""Allan variance of a window or a recording at each τ, with degrees of freedom and confidence intervals."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ class AllanCurve:
     factors: Ints  # [m] cluster sizes in samples
     avar: Floats  # [m, 6] Allan variance, squared unit of the axis; NaN while the window is too short
     terms: Ints  # [m, 6] number of second differences averaged
-    edf: Floats  # [m, 6] equivalent degrees of freedom; NaN where avar is
+    edf: Floats  # [m, 6] equivalent degrees of freedom; NaN where ``avar`` is NaN
     lo: Floats  # [m, 6] lower end of the 95 % interval of the Allan deviation
     hi: Floats  # [m, 6] upper end of the same interval
     n: int  # number of samples in the window, including missing ones

@@ -1,18 +1,19 @@
 """Mean and covariance of squared phase differences, for the bias and the degrees of freedom of a variance.
 
-A variance of the Allan family is a mean of squared differences d_k². Each difference d_k = Σ_p w_p x(k_p) is a weighted
-sum of a few phase points. The differences do not depend on a constant rate, because Σ w_p = Σ w_p k_p = 0.
+A variance of the Allan family is a mean of squared differences d_k². Each difference d_k = Σ_p w_p x(k_p) is a sum of a
+few phase points x(k_p) with the weights w_p. A constant rate has no effect on the differences, because Σ w_p = Σ w_p
+k_p = 0.
 
-The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q). G is the generalised autocovariance of
-phase (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12). This formula also holds for points reflected at the ends of a
-record. For Gaussian noise (Isserlis), Cov(d_j², d_k²) = 2 Cov(d_j, d_k)².
+The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q). Here G is the generalised autocovariance
+of phase, see ``phase_autocovariance``. This formula also holds for points reflected at the ends of a record. For
+Gaussian noise, the theorem of Isserlis gives Cov(d_j², d_k²) = 2 Cov(d_j, d_k)².
 
-``Moments`` holds the mean of the variance and of the Allan variance for unit coefficients at one cluster size. It also
-holds the quadratic form of the variance of the estimate. A ramp shifts a second difference by a known amount. The
-square of this amount adds to the mean, and the product of this amount with the noise adds to the variance. A ramp
-without noise adds no variance.
+For one cluster size and unit coefficients, ``Moments`` contains the expectation of the variance estimate and the Allan
+variance. ``Moments`` also contains the quadratic form that gives the variance of the estimate. A ramp adds a known
+offset to each second difference. The square of the offset increases the mean, and the product of offset and noise
+increases the variance of the estimate. A ramp without noise adds no variance.
 
-All quantities are in units of one sample: τ0 = 1, and θ = Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
+All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
 """
 
 from collections.abc import Iterable
@@ -24,14 +25,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import Floats, Ints
-from monitor.estimation.allan.uncertainty import intervals
+from monitor.estimation.allan.uncertainty import deviation_intervals
 from monitor.estimation.fit.coefficient_fit import TO_SI
 
 NUM_COEFFICIENTS: Final = 5
 """Number of coefficients Q N B K R, in the order of θ."""
 
 _BLOCK_GROWTH: Final = 1.5
-"""Ratio by which blocks of terms grow with their distance from a kink."""
+"""Ratio of the lengths of successive blocks, which grow with the distance from a kink."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,7 @@ class Moments:
     factor: int  # cluster size in samples
     terms: int  # number of differences averaged
     mean: Floats  # [5] expectation of the variance for each unit coefficient
-    allan: Floats  # [5] Allan variance for the same coefficients, which a corrected variance estimates
+    allan: Floats  # [5] Allan variance for each unit coefficient, which the corrected variance estimates
     covariance: Floats  # [5, 5] C of the quadratic form Var = Σ_ab θ_a θ_b C_ab
 
 
@@ -94,8 +95,8 @@ def variance_of_sums(sums: Floats, terms: Ints, factors: Ints, squared_weights: 
         return np.asarray(np.where(terms > 0, sums / (squared_weights * factors[:, None] ** 2 * terms), np.nan))
 
 
-def per_sample(theta: Floats, rate_hz: float) -> Floats:
-    """Convert θ of a fit from SI to units of one sample. A negative Q² stands for a band limit and becomes 0.
+def theta_per_sample(theta: Floats, rate_hz: float) -> Floats:
+    """Convert θ of a fit from SI to units of one sample. A negative Q², which represents a band limit, becomes 0.
 
     Parameters
     ----------
@@ -112,7 +113,8 @@ def correct_bias(
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Correct measured variances for bias, and compute their degrees of freedom and intervals.
 
-    The degrees of freedom are edf = 2 E²/Var for the noise θ, in proportion to the terms present.
+    A variance with expectation E and variance Var has edf = 2 E²/Var degrees of freedom. Missing terms reduce the
+    degrees of freedom in proportion.
 
     Parameters
     ----------
@@ -143,14 +145,14 @@ def correct_bias(
         edf = np.where(variance > 0.0, 2.0 * mean * mean / square * (terms / whole), np.nan)
         corrected = variance * (allan / mean)
     edf[~np.isfinite(edf)] = np.nan
-    lo, hi = intervals(corrected, edf)
+    lo, hi = deviation_intervals(corrected, edf)
     return corrected, edf, lo, hi
 
 
-def autocovariance(t: Floats) -> Floats:
-    """Return the generalised autocovariance of phase [4, …] for unit Q N B K at lags t in samples.
+def phase_autocovariance(t: Floats) -> Floats:
+    """Return the generalised autocovariance of phase [4, …] for Q, N, B and K of size one, at lags t in samples.
 
-    The noises are discrete sums of white noise.
+    The autocovariances of discrete sums of white noise are δ(t), −|t|/2, t² ln|t| / 2π and (|t|³ − |t|)/12.
     """
     t = np.abs(t)
     flicker = t * t * np.log(np.where(t == 0.0, 1.0, t)) / (2.0 * np.pi)
@@ -160,9 +162,9 @@ def autocovariance(t: Floats) -> Floats:
 def quadrature_nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats, Floats]:
     """Return nodes and weights that sum a function over begin ≤ k < end. The function is smooth except at the kinks.
 
-    The blocks grow with the distance to the nearest kink. Each block uses the three-point Gauss rule of L equally
-    spaced points, which is exact to degree 5. The second and fourth moments of these points are (L² − 1)/12 and (L² −
-    1)(3L² − 7)/240.
+    The range is divided into blocks, whose length grows with the distance to the nearest kink. The sum over the L
+    points of a block is replaced by a three-point Gauss rule, which is exact for polynomials of degree 5. The second
+    and fourth central moments of L equally spaced points are (L² − 1)/12 and (L² − 1)(3L² − 7)/240.
 
     Parameters
     ----------

@@ -1,14 +1,14 @@
 """Dynamic Allan variance of a whole recording: Allan deviation and coefficients Q N B K R as functions of time.
 
 A window slides along the recording in steps. At each step, the overlapping Allan variance of the window is computed and
-fitted, as in the live ``Estimator``. The variance is updated sample by sample, and a least-squares fit follows
-("Dynamic extraction of random drift error coefficients of MEMS gyroscopes"). The result shows changes that are averaged
-out in the Allan variance of the whole recording. The terms use the hysteresis of a repeated fit, so each fit receives
-the terms of the previous fit.
+fitted, as in the live ``Estimator``. The method, a variance that is updated with every sample and a least-squares fit,
+follows "Dynamic extraction of random drift error coefficients of MEMS gyroscopes". The result shows changes that are
+averaged out in the Allan variance of the whole recording. Each fit receives the terms of the previous fit, because
+terms are added and dropped with hysteresis.
 
 Only full windows are reported, so that all time steps have the same uncertainty. The number of steps is limited to
 ``MAX_STEPS``, so the memory does not grow with the length of the recording. A change is fully visible one window length
-after it happened. Until then, the window contains old and new noise.
+after it happened. During this time, the window contains noise from before and after the change.
 """
 
 from collections.abc import Callable
@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 from drivers.errors import ConfigError, NotReady
 from drivers.sample import Floats
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
-from monitor.estimation.allan.uncertainty import covariance_table, intervals
+from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
-from monitor.estimation.fit.coefficient_fit import design, fit
+from monitor.estimation.fit.coefficient_fit import fit, make_design
 
 STEPS_PER_WINDOW: Final = 20
 """Default number of steps per window length."""
@@ -36,14 +36,17 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True)
 class DynamicAllan:
-    """Dynamic Allan variance at T times. Columns are gx … az, rows of the coefficients are Q N B K R, all in SI."""
+    """Dynamic Allan variance at T times.
+
+    The last index is the axis, gx to az. The coefficients are in the order Q N B K R. All quantities are in SI units.
+    """
 
     t_s: Floats  # [T] END of each window in seconds since the first sample
     window_s: float  # length of the window
     rate_hz: float
     tau_s: Floats  # [m]
     deviation: Floats  # [T, m, 6] Allan deviation, unit of the axis; NaN if no term is complete
-    lo: Floats  # [T, m, 6] lower end of its 95 % interval
+    lo: Floats  # [T, m, 6] lower end of the 95 % interval of the deviation
     hi: Floats  # [T, m, 6] upper end
     value: Floats  # [T, 5, 6] coefficients; NaN unless estimated
     value_lo: Floats  # [T, 5, 6] lower end of the 95 % interval; 0 for an upper bound
@@ -94,7 +97,7 @@ def compute_dynamic_allan(
     ends = _ends(len(values), length, rate_hz, step_s)
     factors = cluster_sizes(length, rate_hz, tau)
     window = AllanWindow(length, factors)
-    columns, covariances = design(factors, rate_hz), covariance_table(length, factors)
+    columns, covariances = make_design(factors, rate_hz), covariance_table(length, factors)
     steps, taus, axes = ends.size, factors.size, values.shape[1]
     deviation, lo, hi = np.full((3, steps, taus, axes), np.nan)
     value, value_lo, value_hi = np.full((3, steps, 5, axes), np.nan)
@@ -104,11 +107,11 @@ def compute_dynamic_allan(
     for row, end in enumerate(ends.tolist()):
         window.update(values[start:end])
         start = end
-        avar, (slope, slopes) = window.avar(), window.slopes()
+        avar, (slope, slopes) = window.avar(), window.slopes_of_axes_and_taus()
         found = fit(columns, covariances, avar, window.terms(), entered, slope * rate_hz, slopes * rate_hz)
         entered = found.entered
         deviation[row] = np.sqrt(avar)
-        lo[row], hi[row] = intervals(avar, found.edf)
+        lo[row], hi[row] = deviation_intervals(avar, found.edf)
         known = found.coefficients
         value[row], value_lo[row], value_hi[row], status[row] = known.value, known.lo, known.hi, known.status
         if progress is not None:
@@ -131,7 +134,7 @@ def _length(rate_hz: float, window_s: float) -> int:
 
 
 def _ends(n: int, length: int, rate_hz: float, step_s: float | None) -> NDArray[np.int64]:
-    """Return the number of samples passed at each step: the first full window, then equal steps."""
+    """Return the end index of the window at each step. The first window ends as soon as it is full."""
     if step_s is not None and not 0.0 < step_s < np.inf:
         raise ConfigError(f"step of {step_s:g} s; it must be above 0")
     if n < length:

@@ -1,14 +1,14 @@
 """Overlapping Hadamard variance: mean square of third phase differences, insensitive to a linear drift of the rate.
 
-NIST SP 1065 eq. 20 on rates: σ²(m) = mean of (x_{i+3m} − 3 x_{i+2m} + 3 x_{i+m} − x_i)² / 6m² over every i, m ≤ n/3.
-With the divisor 6, white noise has the same value as in the Allan variance. Beyond the first few samples, the Hadamard
-variance is 10/9 of the Allan variance for quantization, 0.811 for flicker and 0.5 for random walk. The Hadamard
-deviation is therefore shown beside the Allan deviation and is not corrected. It shows the noise without a ramp or slow
-heating.
+The variance of NIST SP 1065 eq. 20, applied to rates, is σ²(m) = mean of (x_{i+3m} − 3 x_{i+2m} + 3 x_{i+m} − x_i)² /
+6m² over all i, with m ≤ n/3. With the divisor 6, white noise has the same Hadamard variance as Allan variance. Except
+at m of a few samples, the Hadamard variance is 10/9 of the Allan variance for quantization noise, 0.811 for flicker
+noise and 0.5 for random walk. The Hadamard deviation is therefore shown beside the Allan deviation and is not
+corrected. The Hadamard deviation shows the noise without the effect of a ramp or of slow heating.
 
-The degrees of freedom are 2 E²/Var of the fitted mixture, from the exact covariance of the terms. The formula of
-Greenhall & Riley (PTTI 2003, d = 3) holds only for one power law at a time. Terms that touch a missing sample are left
-out.
+The degrees of freedom are computed for the fitted mixture of noise terms, from the exact covariance of the third
+differences. The formula of Greenhall & Riley (PTTI 2003, d = 3) holds only for a single power law. Third differences
+that contain a missing sample are left out.
 """
 
 from collections.abc import Iterable
@@ -23,12 +23,12 @@ from monitor.estimation.allan.difference_moments import (
     NUM_COEFFICIENTS,
     Moments,
     PhaseRing,
-    autocovariance,
     correct_bias,
     integrate_to_phase,
     octaves,
-    per_sample,
+    phase_autocovariance,
     quadrature_nodes,
+    theta_per_sample,
     variance_of_sums,
 )
 
@@ -36,9 +36,9 @@ SQUARED_WEIGHTS: Final = 6.0
 """Factor in the definition of the Hadamard variance, σ² = mean of d² / (6 m²)."""
 
 MAX_LAG_CLUSTERS: Final = 16
-"""Distance in clusters beyond which terms count as uncorrelated.
+"""Distance in clusters beyond which third differences are treated as uncorrelated.
 
-For flicker, the squared correlation at this distance is 1e-9 of that of one term.
+For flicker noise, the squared correlation coefficient at this distance is 1e-9.
 """
 
 
@@ -56,7 +56,7 @@ class HadamardCurve:
 
 
 def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
-    """Return the overlapping Hadamard variance of rates and the number of its terms.
+    """Return the overlapping Hadamard variance of rates and the number of terms.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     Returns
     -------
     hvar : ndarray of float64, shape (m, k)
-        Hadamard variance in squared units of the axis. It does not depend on τ0.
+        Hadamard variance in squared units of the axis.
     terms : ndarray of int64, shape (m, k)
         Number of terms.
 
@@ -105,7 +105,7 @@ def hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints 
 
 
 def make_curve(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> HadamardCurve:
-    """Return Hadamard variances as a curve with degrees of freedom and intervals.
+    """Compute degrees of freedom and confidence intervals of Hadamard variances.
 
     Parameters
     ----------
@@ -121,15 +121,16 @@ def make_curve(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Flo
         Number of terms.
     """
     each = list(known)
-    _, edf, lo, hi = correct_bias(each, per_sample(theta, rate_hz), raw, terms)
+    _, edf, lo, hi = correct_bias(each, theta_per_sample(theta, rate_hz), raw, terms)
     factors = np.array([one.factor for one in each])
     return HadamardCurve(factors / rate_hz, factors, raw, terms, edf, lo, hi)
 
 
 def moments(n: int, factor: int) -> Moments:
-    """Return mean and covariance of the Hadamard variance. The computation takes a millisecond.
+    """Return the mean and the covariance of the Hadamard variance at one cluster size, which takes a millisecond.
 
-    In the example, white noise at m = 1 has edf = 18/35 of the terms, because neighbouring terms overlap.
+    The example computes edf for white noise at m = 1 and 35 000 terms. The result is 18/35 of the number of terms,
+    because neighbouring terms overlap.
 
     Parameters
     ----------
@@ -146,7 +147,7 @@ def moments(n: int, factor: int) -> Moments:
     lags, weights = quadrature_nodes(0, min(terms, MAX_LAG_CLUSTERS * factor), [factor, 2 * factor, 3 * factor])
     shared = np.zeros((4, lags.size))
     for p, weight in zip(range(-3, 4), (-1.0, 6.0, -15.0, 20.0, -15.0, 6.0, -1.0), strict=True):
-        shared += weight * autocovariance(lags + p * factor)
+        shared += weight * phase_autocovariance(lags + p * factor)
     pairs = weights * (terms - lags) * np.where(lags > 0.0, 2.0, 1.0)
     scale = 1.0 / (6.0 * factor**2)
     mean, covariance = np.zeros(NUM_COEFFICIENTS), np.zeros((NUM_COEFFICIENTS, NUM_COEFFICIENTS))

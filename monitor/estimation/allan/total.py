@@ -1,25 +1,27 @@
-"""Total variance of a rate: Allan variance of a record reflected at both ends, for τ up to the record length.
+"""Total variance of a rate, which is the Allan variance of a record reflected at both ends, for τ up to the record length.
 
 "Applications of total variance method in random error analysis of the fiber optic gyro signal" shows that a rate must
-be reflected as a rate (y*_{-j} = y_{j-1}) and not as a phase. That paper uses differences of cluster sums, D_k(m) =
-(1/m) Σ_{i≤m} (y*_{k+i+m} − y*_{k+i}), with σ² = mean of D²/2. Here the mean is taken over every k, which is Howe's
-TOTVAR on the integrated rate (NIST SP 1065 eq. 25). The terms are second differences of phase, d_i = x*_{i-m} − 2 x*_i
-+ x*_{i+m}, at every inner point i. The reflected phase is x*_{-j} = 2 x_0 − x_j at the front, and likewise at the back.
-For m ≤ i ≤ n − m the terms are those of the overlapping Allan variance.
+be reflected as a rate (y*_{-j} = y_{j-1}) and not as a phase. The paper defines σ² as the mean of D²/2, where D_k(m) =
+(1/m) Σ_{i≤m} (y*_{k+i+m} − y*_{k+i}) is a difference of cluster means. This module takes the mean over all k, which
+gives Howe's TOTVAR of the integrated rate (NIST SP 1065 eq. 25). The terms are second differences of phase, d_i =
+x*_{i-m} − 2 x*_i + x*_{i+m}, at every inner point i. The reflected phase before the start is x*_{-j} = 2 x_0 − x_j. The
+phase after the end is reflected in the same way. For m ≤ i ≤ n − m, the terms are the same as in the overlapping Allan
+variance.
 
-``total_variance`` returns the uncorrected variances. ``total_curve`` corrects them to the Allan variance of the same
-noise. E[TOTVAR] is computed exactly for any mixture of noises. For τ ≤ T/2 it is AVAR (1 − a τ/T), with a = 0, 0.481
-and 0.750 for white, flicker and random walk noise (SP 1065 table 7) and −4/3 for quantization. The degrees of freedom
-are exact as well. For mixed noise, formulas for a single power law are inaccurate.
+``total_variance`` returns uncorrected variances. ``total_curve`` corrects the bias with respect to the Allan variance
+of the same noise. The expectation of the total variance is computed exactly for any mixture of noise terms. For τ ≤
+T/2, the expectation is the Allan variance times 1 − a τ/T. The factor a is 0 for white noise, 0.481 for flicker noise,
+0.750 for random walk (SP 1065 table 7) and −4/3 for quantization noise. The degrees of freedom are exact as well. For
+mixed noise, formulas for a single power law are inaccurate.
 
-The intervals are χ² intervals and end at T/2. If the noise is known, they are correct up to T, but the correction
-relies on the noise fitted to the same record. Beyond T/2, nominal 95 % intervals contain the true value in only 67 to
-92 of 100 records, so the value is given without an interval. A ramp R adds a known amount to every term. The square of
-this amount is included in the mean exactly (R²τ²/2 where nothing is reflected, less at the ends). The product of this
-amount with the noise is included in the degrees of freedom.
+The χ² intervals are given for τ up to T/2. The bias correction uses the noise that was fitted to the same record.
+Beyond T/2, nominal 95 % intervals therefore contain the true value in only 67 to 92 of 100 records, so the value is
+given without an interval. A ramp R adds a known offset to every term. The mean includes the exact square of the offset,
+which is R²τ²/2 for terms without reflection and less at the ends. The degrees of freedom include the product of offset
+and noise.
 
-Terms that touch a missing sample are left out. Bias and degrees of freedom per term are those of a record without gaps.
-If fewer than ``MIN_SHARE`` of the terms remain, neither correction nor interval is given.
+Terms that contain a missing sample are left out. The bias and the degrees of freedom per term are computed as for a
+record without gaps. If fewer than ``MIN_SHARE`` of the terms remain, the corrected variance and the interval are NaN.
 """
 
 from collections.abc import Iterable
@@ -34,23 +36,26 @@ from monitor.estimation.allan.difference_moments import (
     NUM_COEFFICIENTS,
     Moments,
     PhaseRing,
-    autocovariance,
     correct_bias,
     integrate_to_phase,
     octaves,
-    per_sample,
+    phase_autocovariance,
     quadrature_nodes,
+    theta_per_sample,
     variance_of_sums,
 )
 
 MIN_SHARE: Final = 0.5
-"""Minimum share of terms for a correction.
+"""Minimum share of the terms for a bias correction.
 
 With fewer terms, the reflected terms have more weight than the correction assumes. If a gap in the middle leaves half
 of the terms, the variance of random walk is 18 % too low and that of quantization 21 % too high (3000 records).
 """
 MAX_EXACT_TERMS: Final = 256
-"""Maximum number of terms whose covariances are summed one by one. A longer record is sampled on a grid this coarse."""
+"""Maximum number of terms whose covariances are summed one by one.
+
+Longer records use a coarser grid of phase points.
+"""
 MIN_CLUSTER_POINTS: Final = 32
 """Minimum number of grid points in a cluster if the record is much longer than the cluster."""
 SQUARED_WEIGHTS: Final = 2.0
@@ -61,19 +66,19 @@ _RAMP: Final = NUM_COEFFICIENTS - 1
 
 @dataclass(frozen=True, slots=True)
 class TotalCurve:
-    """Total variance of k axes at m averaging times, corrected for bias: an estimate of the Allan variance."""
+    """Total variance of k axes at m averaging times, corrected for bias so that it estimates the Allan variance."""
 
     tau_s: Floats  # [m]
     factors: Ints  # [m] cluster sizes in samples
     tvar: Floats  # [m, k] squared unit of the axis; NaN if the noise is unknown or too few terms remain
     terms: Ints  # [m, k] number of differences averaged
-    edf: Floats  # [m, k] equivalent degrees of freedom; NaN where tvar is
+    edf: Floats  # [m, k] equivalent degrees of freedom; NaN where ``tvar`` is NaN
     lo: Floats  # [m, k] lower end of the 95 % interval of the deviation; NaN beyond half the record
     hi: Floats  # [m, k] upper end of the same interval
 
 
 def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
-    """Return the uncorrected total variance of rates and the number of its terms.
+    """Return the uncorrected total variance of rates and the number of terms.
 
     Parameters
     ----------
@@ -85,7 +90,7 @@ def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     Returns
     -------
     tvar : ndarray of float64, shape (m, k)
-        Biased total variance in squared units of the axis. It does not depend on τ0.
+        Biased total variance in squared units of the axis.
     terms : ndarray of int64, shape (m, k)
         Number of terms.
 
@@ -122,7 +127,7 @@ def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | N
 
 
 def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> TotalCurve:
-    """Correct uncorrected total variances for bias and return them as a curve.
+    """Correct total variances for bias, and compute degrees of freedom and confidence intervals.
 
     Parameters
     ----------
@@ -139,7 +144,7 @@ def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Float
     """
     each = list(known)
     enough = terms >= MIN_SHARE * np.array([one.terms for one in each])[:, None]
-    tvar, edf, lo, hi = correct_bias(each, per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
+    tvar, edf, lo, hi = correct_bias(each, theta_per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
     factors = np.array([one.factor for one in each])
     unsure = 2 * factors > np.array([one.n for one in each])
     lo[unsure] = hi[unsure] = np.nan
@@ -147,7 +152,7 @@ def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Float
 
 
 def moments(n: int, factor: int) -> Moments:
-    """Return mean and covariance of the total variance. The computation takes a few milliseconds.
+    """Return the mean and the covariance of the total variance at one cluster size, which takes a few milliseconds.
 
     Parameters
     ----------
@@ -169,7 +174,7 @@ def moments(n: int, factor: int) -> Moments:
 
 
 def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
-    """Return the phase points [i, 5] of the terms at ``places`` and their weights, including the reflection points."""
+    """Return the phase points [i, 5] of the terms at ``places``, with the ends of the record, and the weights of the points."""
     front, behind = places < m, places > n - m
     points = [0.0 * places, np.abs(places - m), places, np.minimum(places + m, 2 * n - m - places), n + 0.0 * places]
     signs = [2.0 * front, 1.0 - 2.0 * front, -2.0 + 0.0 * places, 1.0 - 2.0 * behind, 2.0 * behind]
@@ -177,19 +182,19 @@ def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
 
 
 def _squares(points: Floats, signs: Floats) -> Floats:
-    """Return the mean squares [5, i] of differences for each unit coefficient."""
+    """Return the mean squares [5, i] of weighted sums of phase points, for each coefficient of size one."""
     lags = points[:, :, None] - points[:, None, :]
-    random = np.einsum("ip,iq,aipq->ai", signs, signs, autocovariance(lags))
+    random = np.einsum("ip,iq,aipq->ai", signs, signs, phase_autocovariance(lags))
     ramp = (signs * 0.5 * points**2).sum(axis=1) ** 2
     return np.concatenate([random, ramp[None]])
 
 
 def _covariance(n: int, m: int) -> Floats:
-    """Return the quadratic form [5, 5] of the variance of the total variance.
+    """Return the quadratic form [5, 5] that gives the variance of the total variance.
 
     Up to ``MAX_EXACT_TERMS`` samples, all pairs of terms are summed. Longer records use pairs on a coarse grid, because
     the autocovariances are smooth. In a record of more than ``MAX_EXACT_TERMS`` / ``MIN_CLUSTER_POINTS`` clusters, the
-    ends are the same as in a shorter record, and each further term adds the same amount.
+    ends contribute as in a shorter record, and each additional term adds the same amount.
     """
     scale = 2.0 * (0.5 / (m * m * (n - 1.0))) ** 2
     if n <= MAX_EXACT_TERMS:
@@ -205,13 +210,14 @@ def _covariance(n: int, m: int) -> Floats:
 
 
 def _pair_sums(n: int, m: int, step: float) -> Floats:
-    """Return Σ_jk r^a_jk r^b_jk [5, 5] over all pairs of terms of a record sampled every ``step`` samples.
+    """Return the sums [5, 5] of the products of covariances r^a_jk r^b_jk over all pairs j, k of terms.
 
-    Quantization has two parts. The two ends are common to all reflected terms. Coinciding points lie along lines, so
-    their number grows with the step, while the number of pairs grows with its square.
+    The record is sampled every ``step`` samples, so each pair represents step² pairs of terms. The covariance of
+    quantization noise is nonzero only where phase points coincide, and each such pair represents ``step`` pairs. The
+    two ends of the record are an exception, because all reflected terms contain them.
     """
     at = np.arange(n + 1)
-    lags = autocovariance(step * np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]
+    lags = phase_autocovariance(step * np.arange(n + 1.0))[:, np.abs(at[:, None] - at)]
     points, signs = _points(np.arange(1.0, n), n, m)
     rows = points.astype(np.int64)
     random = _combine_points(_combine_points(lags, rows, signs).transpose(0, 2, 1), rows, signs)
@@ -232,7 +238,7 @@ def _pair_sums(n: int, m: int, step: float) -> Floats:
 
 
 def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
-    """Combine rows [4, points, …] of phase points into rows [4, terms, …] of differences."""
+    """Combine the rows of phase points [4, points, …] to weighted sums [4, terms, …]."""
     terms = signs[:, 0, None] * of_points[:, rows[:, 0]]
     for p in range(1, rows.shape[1]):
         terms += signs[:, p, None] * of_points[:, rows[:, p]]
@@ -241,7 +247,7 @@ def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
 
 @compiled
 def add_total(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
-    """Add the squares of the terms begin ≤ i < end of the total variance.
+    """Add the squares of a range of terms of the total variance.
 
     Parameters
     ----------
@@ -250,7 +256,7 @@ def add_total(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms
     m : int
         Cluster size in samples.
     begin, end : int
-        Range of terms.
+        Range begin ≤ i < end of the terms.
     sums : ndarray of float64, shape (k,)
         Sums of squares, updated in place.
     terms : ndarray of int64, shape (k,)
@@ -267,10 +273,11 @@ def add_total(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms
 
 @compiled
 def _add_run(ring: PhaseRing, m: int, begin: int, end: int, sums: Floats, terms: Ints) -> None:
-    """Add a run of terms of one kind, except those with a missing sample between their first and last point.
+    """Add the squares of a run of terms that are all reflected in the same way, except incomplete terms.
 
-    A term reflected at the front begins with the record, and a term reflected at the back ends with it. The reflected
-    neighbour of a term enters with the opposite sign, together with twice the phase at the end.
+    The first phase point of a term that is reflected at the front is the start of the record, and correspondingly at
+    the back. The reflected point has the opposite sign, and twice the phase at the end of the record is added. A term
+    is incomplete if a sample between the first and the last point is missing.
     """
     phase, missing, first, n = ring.phase, ring.missing, ring.first, ring.n
     places = phase.shape[0]

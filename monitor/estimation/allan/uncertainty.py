@@ -1,20 +1,20 @@
 """Uncertainty of an Allan variance: covariances of the estimates, degrees of freedom and χ² intervals.
 
-The covariance of two overlapping Allan variances of Gaussian noise is a quadratic form in the variances θ = (Q², N²,
-B², K²) of its terms (Isserlis: Cov(d², e²) = 2 Cov(d, e)²),
+For Gaussian noise, the covariance of two overlapping Allan variances is a quadratic form in θ = (Q², N², B², K²),
+because Cov(d², e²) = 2 Cov(d, e)² (Isserlis):
 
     Cov(σ²_i, σ²_j) = Σ_ab θ_a θ_b C^ab_ij,   C^ab_ij = 1/(2 M_i M_j) Σ_c w(c) r^a_ij(c) r^b_ij(c).
 
 Here r denotes the second differences of the generalised autocovariance of phase, over clusters of m_i and m_j samples.
-The autocovariances are those of discrete sums of white noise (Q δ, N −|t|/2, B t² ln|t| / 2π, K (|t|³ − |t|)/12). w(c)
-is the number of pairs of terms that are c samples apart, and M is the number of terms. ``covariance_table`` computes C
-once for a window length and a list of cluster sizes, so that a fit needs only products.
+Phase is a discrete sum of white noise. The autocovariances of Q, N, B and K are δ(t), −|t|/2, t² ln|t| / 2π and (|t|³ −
+|t|)/12. The factor w(c) is the number of pairs of terms that are c samples apart, and M is the number of terms.
+``covariance_table`` computes C once for a window length and a list of cluster sizes, so that a fit needs only products.
 
-The result is the exact number of degrees of freedom of mixed noise, edf = 2 σ⁴ / Cov_ii. The usual formulas (Greenhall
-& Riley, PTTI 2003) hold for one power law at a time and are 15–25 % off near m = 1. They are not used, because the
-exact sum takes only milliseconds.
+The variance Cov_ii of the Allan variance σ² at one τ gives the exact degrees of freedom of mixed noise, edf = 2 σ⁴ /
+Cov_ii. The usual formulas of Greenhall & Riley (PTTI 2003) hold for a single power law and have an error of 15–25 %
+near m = 1. The exact sum takes only milliseconds.
 
-All quantities are in units of one sample: τ0 = 1, and θ stands for Q²/τ0², N²/τ0, B², K² τ0, R² τ0².
+All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
 """
 
 import math
@@ -32,37 +32,40 @@ from monitor.noise.effects.ieee952.bias_instability import FLICKER_AVAR, BiasIns
 Q, N, B, K, R = range(5)
 
 NOISES: Final = 4
-"""Number of random terms in the table, Q N B K. The ramp R is deterministic and adds no variance of its own."""
+"""Number of random terms in the table, Q N B K. The ramp R is deterministic and adds no variance."""
 
 PAIRS: Final = ((0, 0), (0, 1), (0, 2), (0, 3), (1, 1), (1, 2), (1, 3), (2, 2), (2, 3), (3, 3))
-"""Pairs a ≤ b of noises, in the order of the last index of the table."""
+"""Pairs a ≤ b of noise terms, in the order of the last index of the table."""
 
 LAG_STEP: Final = 0.5
-"""Lags are summed in blocks whose length is this share of their distance to the nearest kink of r."""
+"""Ratio of the length of a block of lags to the distance from the nearest kink of r."""
 
 TAIL: Final = 8.0
 """Lag in units of (m_i + m_j) beyond which the differences of t² ln t are computed from their series."""
 
 UNLIMITED_SAMPLES: Final = 1 << 62
-"""Number of samples that stands for an unlimited time."""
+"""Number of samples that means "without limit"."""
 
 TABLE_STEP: Final = 1.1
 """Ratio of window lengths at which the table of a growing window is recomputed.
 
-In between, the covariances are scaled by the number of terms.
+Between two tables, the covariances are scaled by the number of terms.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class CovarianceTable:
-    """Covariances of the Allan variances of unit noise for one window length. The arrays are read-only."""
+    """Covariances of the Allan variances for one window length and coefficients of size one.
+
+    The arrays are read-only.
+    """
 
     n: int  # samples in the window
     factors: Ints  # [m] cluster sizes in samples
     terms: Ints  # [m] number of second differences in a window without gaps; ≤ 0 if the window is too short
     covariance: Floats  # [m, m, 10] C^ab_ij of the pairs a ≤ b; NaN if the window is too short
-    slope: Floats  # [4] variance of the slope of thirds, for unit θ
-    bend: Floats  # [m, 4] covariance of this slope with the slope seen by each τ (see ``window_kernel``)
+    slope: Floats  # [4] variance of ``batch.slope_of_recording``, for unit θ
+    bend: Floats  # [m, 4] covariance of this slope with ``batch.rate_slope_per_tau``
 
 
 class CovarianceTables:
@@ -82,16 +85,16 @@ class CovarianceTables:
         self._table: CovarianceTable | None = None
 
     def at(self, n: int) -> CovarianceTable:
-        """Return a table for n samples. While the window grows, the table may be for up to a tenth fewer samples."""
+        """Return the table for n samples. While the window grows, a table for up to 10 % fewer samples is used."""
         known = self._table
         if known is None or not (known.n == n or known.n < n < min(self._capacity, TABLE_STEP * known.n)):
             known = self._table = covariance_table(n, self._factors)
         return known
 
-    def valid_for(self, n: int) -> int:
-        """Return for how many samples ``at(n)`` stays valid, including sample n.
+    def remaining_valid_samples(self, n: int) -> int:
+        """Return for how many samples the table of ``at(n)`` stays valid, including sample n.
 
-        The number is ``UNLIMITED_SAMPLES`` for a full window.
+        The table of a full window stays valid without limit, so the result is ``UNLIMITED_SAMPLES``.
         """
         known = self.at(n)
         if n >= self._capacity:
@@ -100,7 +103,9 @@ class CovarianceTables:
 
 
 class AxisCovarianceTables:
-    """Covariance tables of six axes. Axes that fill the window share one, and each restarted axis has its own.
+    """Covariance tables of six axes.
+
+    Axes that use the whole window share a table. A restarted axis has a separate table.
 
     Parameters
     ----------
@@ -114,7 +119,7 @@ class AxisCovarianceTables:
         self._shared = CovarianceTables(factors, capacity)
         self._own = [CovarianceTables(factors, capacity) for _ in AXES]
 
-    def of(self, axis: int, n: int, filled: int) -> CovarianceTables:
+    def of_axis(self, axis: int, n: int, window_samples: int) -> CovarianceTables:
         """Return the tables of an axis.
 
         Parameters
@@ -122,17 +127,18 @@ class AxisCovarianceTables:
         axis : int
             Index of the axis.
         n : int
-            Number of newest samples that this axis uses.
-        filled : int
+            Number of newest samples that the axis uses.
+        window_samples : int
             Number of samples in the window.
         """
-        return self._shared if n == filled else self._own[axis]
+        return self._shared if n == window_samples else self._own[axis]
 
 
 def covariance_table(n: int, factors: Ints) -> CovarianceTable:
     """Return the covariances of overlapping Allan variances of n samples.
 
-    In the example, white noise at m = 1 has edf = 2/3 of the terms, because neighbouring terms share one sample.
+    The example computes edf for white noise at m = 1 and 30 000 terms. The result is 2/3 of the number of terms,
+    because neighbouring terms share one sample.
 
     Parameters
     ----------
@@ -148,7 +154,7 @@ def covariance_table(n: int, factors: Ints) -> CovarianceTable:
     factors = np.ascontiguousarray(factors, np.int64)
     covariance = np.full((factors.size, factors.size, len(PAIRS)), np.nan)
     _fill(n, factors, covariance)
-    # t² ln t is continuous 1/f noise; sampled noise has none above half the rate, so less at the shortest τ
+    # t² ln t describes continuous 1/f noise. Sampled noise ends at half the rate and is weaker at the shortest τ.
     share = np.array([_sampled_flicker(m) for m in factors.tolist()])
     for pair, (a, b) in enumerate(PAIRS):
         covariance[:, :, pair] *= np.outer(share, share) ** ((a == B) + (b == B))
@@ -161,15 +167,18 @@ def covariance_table(n: int, factors: Ints) -> CovarianceTable:
 
 @cache
 def _sampled_flicker(m: int) -> float:
-    """Return the deviation of sampled over continuous 1/f noise; the ratio is one except at the shortest τ."""
+    """Return the ratio of the Allan deviations of sampled and continuous 1/f noise.
+
+    It differs from 1 only at short τ.
+    """
     return float(np.sqrt(BiasInstability(B=1.0).avar(np.array([float(m)]), 1.0)[0] / FLICKER_AVAR))
 
 
 def _slope_variance(n: int) -> Floats:
-    """Return the variance of ``batch.slope_of_recording`` for unit Q² N² B² K², τ0 = 1.
+    """Return the variance [4] of ``batch.slope_of_recording`` for Q, N, B and K of size one at τ0 = 1.
 
-    The variance follows from the autocovariances of phase. With τ = n/3, the sums over the four points are 4, 2τ,
-    (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3, divided by (2τ²)².
+    The slope is a weighted sum of four phase points with the spacing τ = n/3. The autocovariances of phase give the
+    variances 4, 2τ, (9 ln 3 − 8 ln 2) τ²/π and 5τ³/3 of this sum. They are divided by (2τ²)².
     """
     if n < 3:
         return np.full(NOISES, np.nan)
@@ -179,11 +188,11 @@ def _slope_variance(n: int) -> Floats:
 
 
 def _bend_covariance(n: int, m: int) -> Floats:
-    """Return the covariance of the slope of thirds and the mean second difference over m², for unit Q² N² B² K².
+    """Return the covariance [4] of ``batch.slope_of_recording`` and ``batch.rate_slope_per_tau`` at one cluster size.
 
-    Both are sums over a few points of phase. The covariance is therefore a sum of the generalised autocovariances over
-    the lags between these points. About sixty points represent each block of m points of a mean second difference. τ0 =
-    1.
+    The coefficients Q, N, B and K have the size one, and τ0 = 1. Each of the two slopes is a weighted sum of phase
+    points, so the covariance is a sum of autocovariances of phase. About sixty phase points represent each block of m
+    points of the mean second difference.
     """
     if n < 3 or n + 1 <= 2 * m:
         return np.full(NOISES, np.nan)
@@ -199,8 +208,8 @@ def _bend_covariance(n: int, m: int) -> Floats:
     return np.array([float((weight * part).sum()) for part in parts])
 
 
-class SpanDegreesOfFreedom:
-    """Degrees of freedom of a curve whose τ use different spans.
+class PerTauSpanDegreesOfFreedom:
+    """Degrees of freedom of an Allan curve in which each τ uses a different number of newest samples.
 
     Parameters
     ----------
@@ -209,7 +218,7 @@ class SpanDegreesOfFreedom:
     spans : ndarray of int64, shape (m,)
         Number of samples that each τ uses.
     columns : ndarray of float64, shape (m, 4 or more)
-        Allan variance of unit Q N B K at τ0 = 1.
+        Allan variance of Q, N, B and K of size one at τ0 = 1.
     """
 
     def __init__(self, factors: Ints, spans: Ints, columns: Floats) -> None:
@@ -221,7 +230,7 @@ class SpanDegreesOfFreedom:
     def edf(self, theta: Floats, rate_hz: float, terms: Ints) -> Floats:
         """Return the degrees of freedom [m, k] for noise with the relative shares of ``theta``.
 
-        White noise is assumed where nothing has been fitted.
+        White noise is assumed for axes that have not been fitted.
 
         Parameters
         ----------
@@ -241,8 +250,8 @@ class SpanDegreesOfFreedom:
             return np.where(terms > 0, whole * terms / self._terms[:, None], np.nan)
 
 
-def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Floats, Floats]:
-    """Return the ends of the two-sided χ² interval of the Allan deviation, edf s²/χ² (NIST SP 1065 eq. 45).
+def deviation_intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Floats, Floats]:
+    """Return the ends of the two-sided χ² confidence interval of the Allan deviation (NIST SP 1065 eq. 45).
 
     Parameters
     ----------
@@ -258,14 +267,14 @@ def intervals(avar: Floats, edf: Floats, probability: float = 0.95) -> tuple[Flo
     lo, hi : ndarray of float64
         Ends of the interval of the deviation, in the shape of ``avar``.
 
-    >>> lo, hi = intervals(np.array([1.0]), np.array([10.0]))
+    >>> lo, hi = deviation_intervals(np.array([1.0]), np.array([10.0]))
     >>> print(f"{lo[0]:.3f} {hi[0]:.3f}")
     0.699 1.755
     """
     tail = (1.0 - probability) / 2.0
     safe = np.where(edf > 0.0, edf, np.nan)
     low, high = chi2_quantile(safe, tail), chi2_quantile(safe, 1.0 - tail)
-    # with a fraction of one degree of freedom there is no upper bound, even if all terms are zero
+    # With less than one degree of freedom there may be no upper bound, even if the variance is zero.
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         lo, hi = np.sqrt(avar * safe / high), np.sqrt(avar * safe / low)
     return lo, np.where((low == 0.0) & (avar >= 0.0), np.inf, hi)
@@ -289,7 +298,11 @@ def _fill(n: int, factors: Ints, covariance: Floats) -> None:
 
 @compiled
 def _sum_lags(n: int, small: int, large: int, sums: Floats) -> None:
-    """Sum w(c) r^a(c) r^b(c) over all lags c of the centres of the terms: kinks one by one, and blocks between them."""
+    """Sum w(c) r^a(c) r^b(c) over the lags c between two terms.
+
+    The functions r have kinks at a few lags. The kinks are added one by one, and the smooth ranges between them in
+    blocks.
+    """
     for pair in range(10):
         sums[pair] = 0.0
     end = n + 1 - small - large  # w(end) = 0
@@ -312,10 +325,10 @@ def _sum_lags(n: int, small: int, large: int, sums: Floats) -> None:
 
 @compiled
 def _add_blocks(kink: int, count: int, side: float, n: int, small: int, large: int, sums: Floats) -> None:
-    """Add ``count`` lags beside a kink in growing blocks, each by the three-point Gauss rule of a block.
+    """Add ``count`` lags that follow a kink, in blocks that grow with the distance from the kink.
 
-    Nodes and weights integrate polynomials of degree 5 exactly over L equally spaced points. The second and fourth
-    moments are (L² − 1)/12 and (L² − 1)(3L² − 7)/240.
+    The sum over the L points of a block is replaced by the three-point Gauss rule of
+    ``difference_moments.quadrature_nodes``.
     """
     done = 0
     while done < count:
@@ -335,7 +348,7 @@ def _add_blocks(kink: int, count: int, side: float, n: int, small: int, large: i
 
 @compiled
 def _add(lag: float, weight: float, n: int, small: int, large: int, sums: Floats) -> None:
-    """Add one lag: the products of the differences of every two noises, times the number of pairs at this lag."""
+    """Add one lag to the sums of all pairs of noise terms, weighted with the number of pairs of terms at this lag."""
     weight *= min(n + 1.0 - 2 * large, n + 1.0 - small - large - lag)
     if lag > TAIL * (small + large):
         r = small * large / (np.pi * lag * lag) * (1.0 + 0.5 * (small * small + large * large) / (lag * lag))

@@ -1,7 +1,7 @@
-"""Compiled kernels of ``AllanWindow``: they append phase to the ring and update the sums of all cluster sizes.
+"""Compiled kernels of ``AllanWindow``, which append phase to the ring buffer and update the sums of all cluster sizes.
 
 The arithmetic is described in ``window``. All data of a window are stored in three arrays (``WindowBuffers``), because
-passing one array from Python to compiled code takes 50 ns.
+each array that Python passes to compiled code costs 50 ns.
 """
 
 from typing import Final, NamedTuple
@@ -18,31 +18,34 @@ LANES: Final = 8
 TOTAL, NEWEST, LAST_MISSING, WIDTH = 0, 1, 2, 3
 """Indices of the state array.
 
-They are: samples since the last reset, row of the newest phase point, newest sample that was missing on any axis, and
-``LANES``. ``LANES`` is stored there so that the compiler does not know it. Otherwise it would turn a vector loop into
-eight scalar statements.
+The elements are the number of samples since the last reset, the row of the newest phase point, the newest sample that
+was missing on any axis, and ``LANES``. The kernel reads ``LANES`` from the array, because the compiler would turn a
+loop of known length 8 into scalar statements.
 """
 RUN_SAMPLES: Final = 64
 """Maximum number of samples whose phase is written before the sums are updated."""
 STAGE_SAMPLES: Final = 512
 """Maximum number of samples passed to the kernel at a time."""
 LINE: Final = 8
-"""Number of 8-byte numbers in a cache line. A row of phase fills one line and must not cross into a second."""
+"""Number of 8-byte numbers in a cache line. A row of phase fills exactly one line."""
 MIN_PRESENT_SHARE: Final = 0.98
 """Minimum share of samples that must be present for a slope.
 
 Gaps shift the centre of the remaining samples by less than this share.
 """
 LEVEL: Final = 64
-"""Number of samples averaged for the reference level. At full scale in the finest phase, the sum fits 64 bits."""
+"""Number of samples averaged for the reference level. At full scale and the finest unit, the sum fits into 64 bits."""
 NEVER: Final = 1 << 62
-"""Marker for "no level": no sample of the reference level is present."""
+"""Marker for a missing reference level."""
 BEND_POINTS: Final = 64
-"""Number of points that represent a block of phase. The sum of the block is exact to a percent of its scatter."""
+"""Number of points that represent a block of phase.
+
+The error of the sum is 1 % of the standard deviation of the sum.
+"""
 
 
 class WindowBuffers(NamedTuple):
-    """Memory of a window in three arrays, the form in which compiled code receives it from Python."""
+    """Memory of a window in the three arrays that Python passes to compiled code."""
 
     ints: Ints  # see ``view_arrays``
     floats: Floats  # see ``view_arrays``
@@ -59,8 +62,8 @@ class WindowArrays(NamedTuple):
     spans: Ints  # [m] number of newest samples that each row uses
     terms: Ints  # [m · LANES] number of second differences in each sum
     phase: Ints  # [places · LANES] ring of integer phase
-    scaling: Floats  # [2 · LANES] units of phase per unit of the axis, and the rounding not yet in phase
-    scratch: Floats  # [2 · RUN_SAMPLES · LANES] squares of a run that are added and evicted
+    scaling: Floats  # [2 · LANES] units of phase per unit of the axis, and rounding errors to add to the next sample
+    scratch: Floats  # [2 · RUN_SAMPLES · LANES] squares that are added to and removed from the sums
     sums: Floats  # [m · LANES] sums of squared second differences
     rest: Floats  # [m · LANES] rounding errors of the sums
     stage: Floats  # [at least STAGE_SAMPLES · AXES] input buffer
@@ -91,11 +94,11 @@ cut_arrays = compiled(view_arrays)
 
 @compiled
 def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, start: int, n: int) -> None:
-    """Advance the window by n samples from the input buffer, from row ``start`` on.
+    """Advance the window by n samples of the input buffer, starting at row ``start``.
 
-    Phase is first written for a run of up to ``RUN_SAMPLES`` samples. Then each τ takes its terms along that run. This
-    keeps the number of memory streams small, so that the processor can prefetch them. A loop over all τ per sample
-    would need a hundred streams.
+    The kernel first appends the phase of up to ``RUN_SAMPLES`` samples. It then updates the sums of one τ after another
+    for all these samples. The processor can prefetch the few memory ranges that one τ reads. A loop over all τ for each
+    sample would read from a hundred memory ranges at the same time.
 
     Parameters
     ----------
@@ -106,7 +109,7 @@ def advance(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, s
     n : int
         Number of rows.
     """
-    # one statement, because each access to a field counts a reference
+    # One statement, because each access to a field changes a reference count.
     state, factors, spans, terms, phase, scaling, scratch, sums, rest, stage, missing = cut_arrays(
         ints, floats, missing, taus
     )
@@ -145,7 +148,7 @@ def _add_run(
     rest: Floats,
     lanes: int,
 ) -> None:
-    """Update the sums of each τ by ``run`` samples whose phase begins at row ``first``.
+    """Update the sums of each τ for ``run`` new samples, whose phase is stored from row ``first`` on.
 
     ``count`` is the number of earlier samples.
     """
@@ -154,7 +157,7 @@ def _add_run(
         row = max(0, 2 * factors[i] - 1 - count)  # first row with a complete term
         own = slice(i * LANES, (i + 1) * LANES)
         while row < run:
-            # up to the row at which a stream reaches the end of the ring or the span becomes full
+            # up to the row at which one of the ranges reaches the end of the ring, or the span becomes full
             now = first + row if first + row < places else first + row - places
             leaving = count + row >= spans[i]
             end = run if leaving else min(run, spans[i] - count)
@@ -166,7 +169,7 @@ def _add_run(
 
 @compiled
 def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.int32], state: Ints) -> None:
-    """Write one phase point and the running count of missing samples."""
+    """Append one phase point and the running count of missing samples to the ring."""
     before = LANES * state[NEWEST]
     now = before + LANES if before + LANES < phase.size else 0
     state[TOTAL] += 1
@@ -182,7 +185,7 @@ def _append(sample: Floats, scaling: Floats, phase: Ints, missing: NDArray[np.in
             phase[now + lane] = phase[before + lane]
             count = missing[before + lane] + 1
             state[LAST_MISSING] = state[TOTAL]
-        if missing[now + lane] != count:  # not written while it is 0, so that the system does not allocate the memory
+        if missing[now + lane] != count:  # Zeros are not written, so that the system does not allocate the memory.
             missing[now + lane] = count
 
 
@@ -202,9 +205,10 @@ def _slide(
     rest: Floats,
     lanes: int,
 ) -> int:
-    """Add the terms that end at up to ``rows`` phase points from row ``now`` on, and evict as many if ``leaving``.
+    """Update the sums of one τ for up to ``rows`` new phase points from row ``now`` on, and return how many were used.
 
-    Return the number of rows processed. It is smaller than ``rows`` if a stream reaches the end of the ring.
+    The number is smaller than ``rows`` if one of the ranges reaches the end of the ring. If ``leaving`` is true, the
+    oldest terms are removed from the sums.
     """
     places = phase.size // LANES
     old = now - span - 1
@@ -230,7 +234,7 @@ def _slide(
 
 @compiled
 def place(index: int, places: int) -> int:
-    """Return the row of a phase point in the ring.
+    """Return the row of a phase point in the ring buffer.
 
     Parameters
     ----------
@@ -244,7 +248,7 @@ def place(index: int, places: int) -> int:
 
 @compiled
 def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> None:
-    """Compute the squared second differences of n numbers; one flat loop, so that it is vectorized."""
+    """Compute the squared second differences of n numbers in one flat loop, which the compiler vectorizes."""
     i0, i1, i2 = np.uintp(at0 * LANES), np.uintp(at1 * LANES), np.uintp(at2 * LANES)
     for i in range(np.uintp(n)):
         d = float(phase[i0 + i] - 2 * phase[i1 + i] + phase[i2 + i])
@@ -255,7 +259,7 @@ def _square(phase: Ints, at0: int, at1: int, at2: int, n: int, out: Floats) -> N
 def _remove_incomplete(
     missing: NDArray[np.int32], at0: int, at2: int, step: int, n: int, squares: Floats, terms: Ints
 ) -> None:
-    """Set to zero the squares that touch a missing sample, and count the others."""
+    """Set the squares that contain a missing sample to zero, and add ``step`` to ``terms`` for each other square."""
     for i in range(n):
         if missing[at0 * LANES + i] == missing[at2 * LANES + i]:
             terms[i % LANES] += step
@@ -265,10 +269,11 @@ def _remove_incomplete(
 
 @compiled
 def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats, lanes: int) -> None:
-    """Compute sums + rest += added - evicted row by row, with the rounding errors collected in ``rest``.
+    """Add the squares ``added`` to the sums, and subtract the squares ``evicted``, row by row.
 
-    TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B. An index that could be negative, or a constant number of ``lanes``,
-    would make the inner loop scalar at three times the cost.
+    The rounding errors are added to ``rest`` (TwoSum: Knuth, TAOCP vol. 2, 4.2.2, theorem B). If an index could be
+    negative, or if ``lanes`` were a constant, the inner loop would not be vectorized and would take three times as
+    long.
     """
     for row in range(np.uintp(0), np.uintp(n), np.uintp(lanes)):
         for lane in range(np.uintp(lanes)):
@@ -286,10 +291,10 @@ def _exchange(added: Floats, evicted: Floats, n: int, sums: Floats, rest: Floats
 def _replace_terms(
     now: int, factors: Ints, spans: Ints, phase: Ints, scratch: Floats, sums: Floats, rest: Floats
 ) -> None:
-    """Update all τ at once for a single sample of a full window without gaps.
+    """Update the sums of all τ for a single sample of a full window without gaps.
 
-    Setting up a vector loop for each τ would cost more than the work itself. The differences are therefore collected
-    one by one, and a single loop updates all sums.
+    The set-up of a vector loop for each τ would cost more than the loop. The differences are therefore computed one by
+    one, and a single loop updates all sums.
     """
     places = phase.size // LANES
     added, evicted = scratch[: RUN_SAMPLES * LANES], scratch[RUN_SAMPLES * LANES :]
@@ -310,8 +315,8 @@ def _replace_terms(
 
 
 @compiled
-def discard(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, axis: int, n: int) -> None:
-    """Mark all but the newest n samples of one axis as missing, and recompute the sums from those n.
+def keep_newest(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, axis: int, n: int) -> None:
+    """Mark all but the newest n samples of one axis as missing, and recompute the sums from the newest n samples.
 
     Parameters
     ----------
@@ -324,7 +329,7 @@ def discard(ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, a
     """
     w = cut_arrays(ints, floats, missing, taus)
     state, places = w.state, w.phase.size // LANES
-    # the count differs from point to point, so no term can begin and end with the same count
+    # The count of missing samples changes at every older point, so every term that contains one is incomplete.
     oldest = place(state[NEWEST] - n, places) * LANES + axis
     for back in range(1, min(state[TOTAL], places - 1 - RUN_SAMPLES) - n + 1):
         missing[place(state[NEWEST] - n - back, places) * LANES + axis] = missing[oldest] - back
@@ -356,7 +361,7 @@ def _recompute_sum(w: WindowArrays, i: int, axis: int, n: int) -> None:
 def _reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> int:
     """Return the mean of the newest samples of an axis in integer units, or ``NEVER`` if all of them are missing.
 
-    The level is close enough to the mean of the axis for differences to fit 64 bits.
+    The sum of the differences from this mean fits into 64 bits.
     """
     places = phase.size // LANES
     last, first = newest * LANES + axis, place(newest - min(n, LEVEL), places) * LANES + axis
@@ -366,7 +371,7 @@ def _reference_level(phase: Ints, missing: NDArray[np.int32], newest: int, n: in
 
 @inlined
 def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int, axis: int) -> float:
-    """Return the slope of the last n samples from the means of the first and the last third.
+    """Return the slope of the rate over the last n samples, from the means of the first and the last third.
 
     Parameters
     ----------
@@ -398,17 +403,17 @@ def slope_of_thirds(phase: Ints, missing: NDArray[np.int32], newest: int, n: int
         or 3 * third - (missing[at0] - missing[at3]) < MIN_PRESENT_SHARE * 3 * third
     ):
         return np.nan
-    # phase and level · count both wrap modulo 2⁶⁴; their difference is small and is taken before the conversion
+    # Phase and middle · count wrap modulo 2⁶⁴. The difference is small and is computed before the conversion.
     rise = float(phase[at0] - phase[at1] - middle * late) / late
     rise -= float(phase[at2] - phase[at3] - middle * early) / early
     return float(rise / (2.0 * third))
 
 
 @compiled
-def slopes_of_axes(
+def slopes_of_axes_and_taus(
     ints: Ints, floats: Floats, missing: NDArray[np.int32], taus: int, lengths: Ints, slope: Floats, slopes: Floats
 ) -> None:
-    """Compute the slope of each axis over its newest samples, and the slope that each τ sees.
+    """Compute the slope of the rate of each axis, and the slope that contributes to the Allan variance at each τ.
 
     Parameters
     ----------
@@ -434,8 +439,8 @@ def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int,
     """Return the mean second difference of phase over clusters of m samples, divided by m².
 
     The sum of all second differences telescopes to four blocks of m points at the ends. Only ``BEND_POINTS`` points of
-    a long block are used, because phase is smooth enough for them to represent the block. A missing sample counts as
-    one of the level.
+    a long block are used, because phase is smooth enough for them to represent the block. A missing sample is replaced
+    by the mean of the newest samples.
 
     Parameters
     ----------
@@ -471,5 +476,5 @@ def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int,
         absent = missing[at0] - missing[at1] - missing[at2] + missing[at3]
         total += float(phase[at0] - phase[at1] - phase[at2] + phase[at3] + middle * absent)
     points = (m + stride - 1) // stride
-    # the blocks are n + 1 − 2m points apart, which is the number of second differences
+    # n + 1 − 2m is the number of second differences
     return total / points * m / (n + 1.0 - 2 * m) / (float(m) * m)

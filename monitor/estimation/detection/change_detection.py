@@ -7,7 +7,7 @@ its last change. The detector returns a ``Change`` of one of three kinds:
 - ``bias_stepped``: with the means on both sides.
 - ``outlier_burst``: with the number and the size of the outliers.
 
-``change_kernel`` computes the statistics, ``change_size`` the coefficients.
+``change_kernel`` computes the statistics, ``changed_coefficients`` the coefficients.
 
 - **False alarms.** ``alarms_per_day`` of six axes with constant noise is divided among noise changes (eight tenths),
   steps and bursts. The threshold for noise changes is h = ln(looks per day · RATE_AT_ZERO / alarms per day). The
@@ -18,8 +18,8 @@ its last change. The detector returns a ``Change`` of one of three kinds:
   terms. A change within this time is not detected. The reference is kept while nothing is detected, so it becomes more
   accurate. A slow drift of the noise is eventually reported as a change, because it is compared with all earlier
   samples. Noise that fluctuates more slowly than the learning time is reported as well.
-- **After a change**, the samples since the onset are the new reference. Octaves too long for these samples start
-  without a reference.
+- **After a change**, the samples since the onset are the new reference. Octaves that are too long for these
+  samples start without a reference.
 - **A burst** raises the share of extreme differences while the median stays the same. After its end, the burst is
   removed from the reference.
 
@@ -72,7 +72,7 @@ from monitor.estimation.detection.change_kernel import (
     make_state,
     set_due,
 )
-from monitor.estimation.detection.change_size import Octaves, identify_noise_change
+from monitor.estimation.detection.changed_coefficients import HaarVariancesBeforeAfter, identify_noise_change
 
 MAX_CLUSTER_S: Final = 300.0
 """Longest cluster in seconds. Longer ones would learn for days and show temperature rather than noise."""
@@ -99,7 +99,7 @@ MAX_CLIPPED_RATIO: Final = 4.0
 """Ratio of the clipped variances above which clipping biases the size of a change. Unclipped squares are then used."""
 
 Q_OR_VIBRATION: Final = "quantization noise or vibration near Nyquist"
-"""Name of a change of Q. Octaves cannot distinguish the two causes (``change_size``)."""
+"""Name of a change of Q. HaarVariancesBeforeAfter cannot distinguish the two causes (``changed_coefficients``)."""
 NOISE_NAMES: Final = {
     "g": {"Q": Q_OR_VIBRATION, "N": "angle random walk", "B": "bias instability", "K": "rate random walk"},
     "a": {
@@ -177,16 +177,16 @@ class ChangeDetector:
         return int(self._state.clock[TOTAL])
 
     @property
-    def watched(self) -> NDArray[np.bool_]:
+    def watched_octaves(self) -> NDArray[np.bool_]:
         """True for octaves [J, 6] (clusters of 2^j samples) whose reference is long enough for an alarm."""
         band = self._state.band
         known = (band[:, :, N] >= MIN_REFERENCE_TERMS * band[:, :, F] ** 2) & (band[:, :, S] > 0.0)
         return np.asarray((known & self._is_old_enough[:, None]).T)
 
     @property
-    def learned(self) -> NDArray[np.bool_]:
+    def learned_axes(self) -> NDArray[np.bool_]:
         """True for axes [6] on which at least the shortest octave can raise an alarm."""
-        return np.asarray(self.watched[0])
+        return np.asarray(self.watched_octaves[0])
 
     @property
     def _is_old_enough(self) -> NDArray[np.bool_]:
@@ -285,7 +285,7 @@ class ChangeDetector:
             if np.nanmax(np.where(v0 > 0, v1 / v0, np.nan)) > MAX_CLIPPED_RATIO:
                 v1 = after[:, UNIT_RAW] / after[:, UNIT_N]
             v1 = np.where(after[:, UNIT_N] > 0, v1, 0.0)
-        octaves = Octaves(v0, np.maximum(before_n, 0.0) / spread, v1, after[:, UNIT_N] / spread)
+        octaves = HaarVariancesBeforeAfter(v0, np.maximum(before_n, 0.0) / spread, v1, after[:, UNIT_N] / spread)
         what = identify_noise_change(octaves, self.rate_hz)
         sigma = sqrt(2.0 * max(octaves.evidence(), alarm[EVIDENCE]))
         text = f"{AXES[axis]} {_noise_text(AXES[axis], what)}"

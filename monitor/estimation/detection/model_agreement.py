@@ -41,7 +41,7 @@ class ModelAgreement:
         self._axes = {axis: _Axis() for axis in AXES}
 
     @property
-    def verdicts(self) -> Mapping[str, bool]:
+    def decisions(self) -> Mapping[str, bool]:
         """Current decision for each axis that has one: True if it agrees with its model."""
         return {axis: one.agrees for axis, one in self._axes.items() if one.agrees is not None}
 

@@ -64,7 +64,7 @@ class AxisGap:
     samples: int  # samples of this axis in the window
 
     @property
-    def passes(self) -> bool:
+    def exceeds_threshold(self) -> bool:
         """True if the gap exceeds the threshold, so that chance does not explain it."""
         return self.gap > self.threshold
 
@@ -88,7 +88,7 @@ class ModelGap:
     agrees: Mapping[str, bool] = field(default_factory=dict)  # current decisions, see ``model_agreement``
 
 
-class ModelComparison:
+class PreparedModel:
     """Noise model prepared for comparison with the curves of one window.
 
     Parameters
@@ -114,10 +114,10 @@ class ModelComparison:
         for axis, expected in self._expected.items():
             i = AXES.index(axis)
             terms = curve.terms[:, i]
-            n = samples_of(curve, i)
+            n = samples_of_axis(curve, i)
             if n < MIN_SAMPLES:
                 continue
-            edf = expected.edf(tables.of(i, n, curve.n).at(n), terms)
+            edf = expected.edf(tables.of_axis(i, n, curve.n).at(n), terms)
             one = _axis_gap(axis, curve.tau_s, curve.avar[:, i], expected.avar, edf, n, len(self._expected))
             if one is not None:
                 found[axis] = one
@@ -138,7 +138,7 @@ class ModelComparison:
         return self._tables
 
 
-def samples_of(curve: AllanCurve, axis: int) -> int:
+def samples_of_axis(curve: AllanCurve, axis: int) -> int:
     """Return the number of samples of an axis in the window. It is less than ``curve.n`` if the axis was restarted.
 
     Parameters

@@ -69,7 +69,7 @@ class MotionDetector:
     >>> rest = MotionDetector(100.0)
     >>> still = np.random.default_rng(0).normal(0.0, 1e-3, (2000, 6))
     >>> still[1000:1200, 0] += np.sin(np.arange(200) / 20)
-    >>> out = rest.update(make_block(np.arange(2000), still)) + rest.flush()
+    >>> out = rest.advance_and_take_decided(make_block(np.arange(2000), still)) + rest.flush()
     >>> [motion.text for motion in rest.take()]
     ['moved for 2.0 s: gx up to 57 °/s']
     >>> rest.moved_samples, sum(int(np.isnan(one.values[:, 0]).sum()) for one in out)
@@ -91,7 +91,7 @@ class MotionDetector:
         """True if the newest decided block belongs to an episode of motion."""
         return bool(self._state.place[BEGAN] >= 0)
 
-    def update(self, samples: SampleBlock) -> list[SampleBlock]:
+    def advance_and_take_decided(self, samples: SampleBlock) -> list[SampleBlock]:
         """Process a block, and return the samples that have become final, oldest first."""
         first = self._index + samples.lost
         self._held.append((first, samples))

@@ -22,7 +22,7 @@ After a longer gap, the detector starts again.
 
 
 @dataclass(frozen=True, slots=True)
-class Restart:
+class RestartRequest:
     """Request to restart the estimate of one axis."""
 
     axis: int  # index into AXES
@@ -36,29 +36,33 @@ class SignalMonitor:
     ----------
     rate_hz : float
         Sample rate in Hz.
-    leave_out : bool
+    remove_motion : bool
         True to return samples in motion as missing. False to return all samples at once and unchanged.
     alarms_per_day : float
         Accepted false alarms of the change detector per day. 0 disables the change detection.
-    keep_still : bool
-        True to make the samples at rest available from ``take_samples_at_rest``, independent of ``leave_out``.
+    keep_samples_at_rest : bool
+        True to make the samples at rest available from ``take_samples_at_rest``, independent of ``remove_motion``.
     """
 
     def __init__(
-        self, rate_hz: float, leave_out: bool = False, alarms_per_day: float = 1.0 / 30.0, keep_still: bool = False
+        self,
+        rate_hz: float,
+        remove_motion: bool = False,
+        alarms_per_day: float = 1.0 / 30.0,
+        keep_samples_at_rest: bool = False,
     ) -> None:
         self._rate_hz = rate_hz
-        self._leave_out = leave_out
+        self._remove_motion = remove_motion
         self._alarms_per_day = alarms_per_day
-        self._keep_still = keep_still
+        self._keep_samples_at_rest = keep_samples_at_rest
         self._still: list[SampleBlock] = []
-        self.handled = 0
+        self.orientation_changes = 0
         """Number of times that the device was left in another orientation."""
         self._received = 0  # samples since the start, including missing ones
         self._newest_ns = 0
         self._moved_before = 0
         self._events: list[Event] = []
-        self._restarts: list[Restart] = []
+        self._restarts: list[RestartRequest] = []
         self._pending: list[SampleBlock] = []  # delayed at the previous rate, returned with the next block
         self._begin()
 
@@ -87,22 +91,22 @@ class SignalMonitor:
         """Process a block, and return the blocks to be estimated now."""
         self._received += samples.lost + len(samples)
         self._newest_ns = int(samples.t_ns[-1])
-        still = self._rest.update(samples)
+        still = self._rest.advance_and_take_decided(samples)
         self._search(still)
-        return self._with_pending(still) if self._leave_out else [samples]
+        return self._with_pending(still) if self._remove_motion else [samples]
 
     def flush(self) -> list[SampleBlock]:
         """Return the delayed samples at the end of the stream."""
         still = self._rest.flush()
         self._search(still)
-        return self._with_pending(still) if self._leave_out else []
+        return self._with_pending(still) if self._remove_motion else []
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call."""
         events, self._events = self._events, []
         return events
 
-    def take_restarts(self) -> list[Restart]:
+    def take_restarts(self) -> list[RestartRequest]:
         """Return the requests to restart an axis since the last call."""
         restarts, self._restarts = self._restarts, []
         return restarts
@@ -130,10 +134,10 @@ class SignalMonitor:
 
     def _search(self, still: list[SampleBlock]) -> None:
         """Collect the episodes of motion, and pass the samples at rest to the change detector."""
-        if self._keep_still:
+        if self._keep_samples_at_rest:
             self._still += still
         motions = self._rest.take()
-        self.handled += sum(motion.kind == "handling/orientation" for motion in motions)
+        self.orientation_changes += sum(motion.kind == "handling/orientation" for motion in motions)
         self._events += [self._motion_event(motion) for motion in motions]
         if self._changes is None:
             return
@@ -151,8 +155,8 @@ class SignalMonitor:
         for change in changes.take():
             self._events.append(self._change_event(change))
             if change.kind == "noise_changed":
-                handed_on = changes.samples if self._leave_out else self._received - self._began - self._first
-                self._restarts.append(Restart(change.axis, handed_on - change.since))
+                handed_on = changes.samples if self._remove_motion else self._received - self._began - self._first
+                self._restarts.append(RestartRequest(change.axis, handed_on - change.since))
 
     def _motion_event(self, motion: Motion) -> Event:
         """Convert an episode of motion to an event."""

@@ -35,7 +35,13 @@ from numpy.typing import NDArray
 from drivers.sample import Floats, Ints
 from monitor.estimation.allan.uncertainty import NOISES, CovarianceTable
 from monitor.estimation.fit.coefficients import Coefficients, Status
-from monitor.estimation.fit.fit_arrays import AxisCurves, FitOptions, SharedInputs, empty_fit_output, empty_gains
+from monitor.estimation.fit.fit_arrays import (
+    CurvesOfAxes,
+    FitOptions,
+    SharedInputs,
+    empty_fit_output,
+    empty_solution_maps,
+)
 from monitor.estimation.fit.fit_kernel import WHITE, fit_axes
 from monitor.estimation.fit.least_squares import N, R
 from monitor.noise.standard_terms import unit_allan_variances
@@ -78,7 +84,7 @@ class Fit:
     k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
 
 
-def design(factors: Ints, rate_hz: float) -> Design:
+def make_design(factors: Ints, rate_hz: float) -> Design:
     """Return the columns of the fit from the Allan variances of the noise terms.
 
     Parameters
@@ -214,13 +220,13 @@ def _fit(
     found = empty_fit_output(
         axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C")
     )
-    frozen = empty_gains(axes, m)
+    frozen = empty_solution_maps(axes, m)
     if start is not None:
         found.theta[:] = start.T / design.rate_hz ** (2.0 * TO_SI)
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
     slope, slopes = measured.slope / design.rate_hz, np.ascontiguousarray(measured.slopes.T) / design.rate_hz
     options = FitOptions(*(THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED), full, start is not None)
-    fit_axes(0, axes, shared, AxisCurves(curves, counts, slope, slopes), options, found, frozen)
+    fit_axes(0, axes, shared, CurvesOfAxes(curves, counts, slope, slopes), options, found, frozen)
     to_si = design.rate_hz**TO_SI
     value = np.where(found.status == Status.ESTIMATED, np.sqrt(np.maximum(found.theta, 0.0)), np.nan)
     coefficients = Coefficients((value * to_si).T, (found.lo * to_si).T, (found.hi * to_si).T, found.status.T)

@@ -26,7 +26,7 @@ MIN_CUBE_ROOT_FACTOR: Final = 0.05
 
 
 @compiled
-def quantile(z: float, skewness: float) -> float:
+def pearson_quantile(z: float, skewness: float) -> float:
     """Return the quantile of probability Φ(z) of the standardized Pearson III distribution.
 
     The distribution is a χ² with 8/skewness² degrees of freedom, in the approximation of Wilson & Hilferty (1931).
@@ -58,7 +58,7 @@ def interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> 
     z : float
         Normal quantile, positive for the lower end and negative for the upper end.
     """
-    k = quantile(z, 2.0 * np.sqrt(c2))
+    k = pearson_quantile(z, 2.0 * np.sqrt(c2))
     a = 1.0 - k * k * c2
     b = estimate + 0.5 * k * k * c1
     root = b * b - a * (estimate * estimate - k * k * c0)

@@ -1,8 +1,8 @@
 """Per-sample update of the coefficients in compiled code: the window advances by one sample, and the fit follows.
 
-For fixed weights, the normal equations of the fit are linear in the Allan variance. ``Gains`` holds this linear map,
-which takes about eighty products per axis. The non-negative solution is a problem with four unknowns. If another set of
-terms becomes positive, the equations are solved again with the same weights.
+For fixed weights, the normal equations of the fit are linear in the Allan variance. ``SolutionMaps`` holds this linear
+map, which takes about eighty products per axis. The non-negative solution is a problem with four unknowns. If another
+set of terms becomes positive, the equations are solved again with the same weights.
 
 Weights and the selection of terms are recomputed in the following cases:
 
@@ -14,7 +14,7 @@ Weights and the selection of terms are recomputed in the following cases:
 Between two computations, outdated weights add at most 2 % to the error of a coefficient, because the error depends on
 the weights only in second order.
 
-The kernel returns when an axis needs new gains, and ``fit_axes`` is then called from Python. These calls are rare, and
+The kernel returns when an axis needs new maps, and ``fit_axes`` is then called from Python. These calls are rare, and
 ``fit_axes`` would otherwise be compiled a second time as a part of the kernel.
 
 The result contains Q N B K R for every sample, with NaN where a coefficient is not estimated. Intervals are computed
@@ -47,26 +47,26 @@ from monitor.estimation.fit.coefficient_fit import THRESHOLDS_WATCHED, TO_SI, De
 from monitor.estimation.fit.coefficients import Status
 from monitor.estimation.fit.fit_arrays import (
     LIMIT_COUNT,
-    AxisCurves,
+    CurvesOfAxes,
     FitOptions,
     FitOutput,
-    Gains,
     SharedInputs,
+    SolutionMaps,
     empty_fit_output,
-    empty_gains,
+    empty_solution_maps,
 )
 from monitor.estimation.fit.fit_kernel import fit_axes
-from monitor.estimation.fit.least_squares import Q, R, invert, nonzero_terms, solve_nonnegative
+from monitor.estimation.fit.least_squares import Q, R, invert_on_subset, nonzero_term_bits, solve_nonnegative
 
 REFRESH: Final = 2
-"""Minimum number of times that the gains are recomputed within one window length."""
+"""Minimum number of times that the maps are recomputed within one window length."""
 PATIENCE: Final = 64
 """Number of attempts per window length for an axis without a solution, or with a misfit of the five terms.
 
-The gains cannot detect that a band limit, a spectral line or a transient has disappeared.
+The maps cannot detect that a band limit, a spectral line or a transient has disappeared.
 """
 OPTIONS: Final = FitOptions(*THRESHOLDS_WATCHED, full=False, warm=True)
-"""Options of the fits that recompute the gains."""
+"""Options of the fits that recompute the maps."""
 
 U0, U1, U2, U3 = (np.uintp(a) for a in range(NOISES))
 
@@ -74,13 +74,13 @@ U0, U1, U2, U3 = (np.uintp(a) for a in range(NOISES))
 class RefitState(NamedTuple):
     """State of the fit of all axes."""
 
-    curves: AxisCurves  # curves and slopes at the last fit of each axis, except for the slope of the newest window
+    curves: CurvesOfAxes  # curves and slopes at the last fit of each axis, except for the slope of the newest window
     output: FitOutput
-    gains: Gains
+    maps: SolutionMaps
     ages: Ints  # [6] number of samples since the last fit of each axis
 
 
-class CurveScale(NamedTuple):
+class SumsToVariances(NamedTuple):
     """Factors that convert the sums of the window to Allan variances."""
 
     unit: Floats  # [6, m] 2 m² in squared units of phase
@@ -103,14 +103,14 @@ class ContinuousRefit:
     def __init__(self, window: AllanWindow, rows: int, tables: AxisCovarianceTables) -> None:
         self._window, self._rows, self._tables = window, rows, tables
         avar, terms, slopes = np.zeros((3, AXES, rows))
-        self._curves = AxisCurves(avar, terms, np.zeros(AXES), slopes)
+        self._curves = CurvesOfAxes(avar, terms, np.zeros(AXES), slopes)
         self._ages = np.zeros(AXES, np.int64)
         self.reset()
 
     def reset(self) -> None:
         """Restart the fit of all axes, without any term."""
         output = empty_fit_output(AXES, self._rows, np.zeros((AXES, 5), np.bool_))
-        self._state = RefitState(self._curves, output, empty_gains(AXES, self._rows), self._ages)
+        self._state = RefitState(self._curves, output, empty_solution_maps(AXES, self._rows), self._ages)
         self._used: list[CovarianceTable | None] = [None] * AXES  # tables from which ``_known`` was computed
         self._known: list[SharedInputs] = []
 
@@ -125,14 +125,14 @@ class ContinuousRefit:
         """Terms in the fit, shape (5, 6)."""
         return self._state.output.entered.T
 
-    def update(self, design: Design, values: Floats, lengths: Ints) -> Floats:
+    def advance_and_refit(self, design: Design, samples: Floats, lengths: Ints) -> Floats:
         """Advance the window by samples and return the coefficients after each.
 
         Parameters
         ----------
         design : Design
             Columns of the fit.
-        values : ndarray of float64, shape (n, 6)
+        samples : ndarray of float64, shape (n, 6)
             Samples in rad/s and m/s²; NaN means missing.
         lengths : ndarray of int64, shape (6,)
             Number of samples of each axis in the window, updated in place.
@@ -142,10 +142,10 @@ class ContinuousRefit:
         ndarray of float64, shape (n, 5, 6)
             Coefficients in SI; NaN where not estimated.
         """
-        coefficients = np.empty((len(values), 5, AXES))
-        for start in range(0, len(values), STAGE_SAMPLES):
+        coefficients = np.empty((len(samples), 5, AXES))
+        for start in range(0, len(samples), STAGE_SAMPLES):
             part = slice(start, start + STAGE_SAMPLES)
-            self._advance(design, values[part], lengths, coefficients[part])
+            self._advance(design, samples[part], lengths, coefficients[part])
         return coefficients
 
     def _advance(self, design: Design, values: Floats, lengths: Ints, coefficients: Floats) -> None:
@@ -164,28 +164,28 @@ class ContinuousRefit:
         """Fit some axes to their curves, and write the estimated coefficients into ``coefficients`` [5, 6]."""
         output = self._state.output
         for axis in axes:
-            fit_axes(axis, axis + 1, self._known[axis], self._curves, OPTIONS, output, self._state.gains)
+            fit_axes(axis, axis + 1, self._known[axis], self._curves, OPTIONS, output, self._state.maps)
         size = np.sqrt(np.maximum(output.theta[axes], 0.0)) * to_si
         coefficients[:, axes] = np.where(output.status[axes] == Status.ESTIMATED, size, np.nan).T
 
     def _find_tables(self, design: Design, lengths: Ints) -> int:
         """Find the table of every axis, and return for how many samples all tables stay valid."""
-        filled = min(self._window.n + 1, self._window.length)
+        filled = min(self._window.samples_in_window + 1, self._window.length)
         lasts = UNLIMITED_SAMPLES
         for axis in range(AXES):
             n = min(int(lengths[axis]) + 1, filled)
-            tables = self._tables.of(axis, n, filled)
+            tables = self._tables.of_axis(axis, n, filled)
             table = tables.at(n)
             if table is not self._used[axis]:
                 self._used[axis] = table
                 self._request_fit(axis)
                 self._known[axis : axis + 1] = [shared_inputs(design, table)]
-            lasts = min(lasts, tables.valid_for(n))
+            lasts = min(lasts, tables.remaining_valid_samples(n))
         return lasts
 
     def _request_fit(self, axis: int) -> None:
         """Request a fit of one axis at the next sample."""
-        self._state.gains.used[axis] = 0
+        self._state.maps.used[axis] = 0
         self._ages[axis] = self._window.length
 
 
@@ -199,18 +199,18 @@ def _follow(
     axes as a bit set.
     """
     w = cut_arrays(buffers.ints, buffers.floats, buffers.missing, buffers.taus)
-    curves, output, gains, ages = state
+    curves, output, maps, ages = state
     ints, floats, missing, taus, window = buffers
     # local names, because each access to a field in a loop counts a reference
     counters, phase, scaling, terms, slope = w.state, w.phase, w.scaling, curves.terms, curves.slope
-    used, free, misfit, theta, status = gains.used, gains.free, output.misfit, output.theta, output.status
+    used, free, misfit, theta, status = maps.used, maps.free, output.misfit, output.theta, output.status
     right, valid, m = np.empty((AXES, 5)), np.empty(AXES, np.bool_), terms.shape[1]
     unit, inverse = np.empty((AXES, m)), np.empty((AXES, m))
     for axis in range(AXES):
         for i in range(m):
             unit[axis, i] = 2.0 * (w.factors[i] * scaling[axis]) ** 2
             inverse[axis, i] = 1.0 / (unit[axis, i] * terms[axis, i])
-    scale = CurveScale(unit, inverse)
+    scale = SumsToVariances(unit, inverse)
     for row in range(start, end):
         due = 0
         advance(ints, floats, missing, taus, row, 1)
@@ -218,8 +218,8 @@ def _follow(
         for axis in range(AXES):
             lengths[axis] = min(lengths[axis] + 1, filled)
             slope[axis] = slope_of_thirds(phase, missing, counters[NEWEST], lengths[axis], axis) / scaling[axis]
-        _project(w, scale, curves, gains, right)
-        _apply_gains(right, slope, gains, output, valid)
+        _project(w, scale, curves, maps, right)
+        _apply_maps(right, slope, maps, output, valid)
         for axis in range(AXES):
             ages[axis] += 1
             solved = used[axis, 1] > used[axis, 0]
@@ -237,7 +237,7 @@ def _follow(
 
 
 @compiled
-def _copy_curve(w: WindowArrays, scale: CurveScale, curves: AxisCurves, axis: int, length: int) -> None:
+def _copy_curve(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, axis: int, length: int) -> None:
     """Copy the curve of one axis and the slopes that its τ see from the window."""
     for i in range(curves.avar.shape[1]):
         at = i * LANES + axis
@@ -251,13 +251,13 @@ def _copy_curve(w: WindowArrays, scale: CurveScale, curves: AxisCurves, axis: in
 
 
 @inlined
-def _project(w: WindowArrays, scale: CurveScale, curves: AxisCurves, gains: Gains, right: Floats) -> None:
+def _project(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, maps: SolutionMaps, right: Floats) -> None:
     """Compute r = Xᵀ V⁻¹ y [axes, NOISES] of the current curve."""
     lanes = np.uintp(LANES)  # unsigned, because checks for negative indices would cost as much as the arithmetic
     # local names, because each access to a field in a loop counts a reference
     sums, rest, counts, terms, slope = w.sums, w.rest, w.terms, curves.terms, curves.slope
-    unit, inverse, used = scale.unit, scale.inverse, gains.used
-    rows, ramp, twist = gains.rows, gains.ramp, gains.twist
+    unit, inverse, used = scale.unit, scale.inverse, maps.used
+    rows, ramp, twist = maps.rows, maps.ramp, maps.twist
     for axis in range(np.uintp(AXES)):
         q = n = b = k = 0.0
         for i in range(np.uintp(used[axis, 0]), np.uintp(used[axis, 1])):
@@ -276,13 +276,13 @@ def _project(w: WindowArrays, scale: CurveScale, curves: AxisCurves, gains: Gain
 
 
 @inlined
-def _apply_gains(right: Floats, slope: Floats, gains: Gains, output: FitOutput, valid: NDArray[np.bool_]) -> None:
-    """Compute θ [axes, 5] from the gains, and whether the gains are still valid [axes].
+def _apply_maps(right: Floats, slope: Floats, maps: SolutionMaps, output: FitOutput, valid: NDArray[np.bool_]) -> None:
+    """Compute θ [axes, 5] from the maps, and whether the maps are still valid [axes].
 
-    If another set of terms is now positive, θ is solved again with the same weights. Without gains, θ is not changed.
+    If another set of terms is now positive, θ is solved again with the same weights. Without maps, θ is not changed.
     """
-    normal, inverse, whole, low, high = gains.normal, gains.inverse, gains.whole, gains.low, gains.high
-    used, free, straight, theta, entered = gains.used, gains.free, gains.straight, output.theta, output.entered
+    normal, inverse, whole, low, high = maps.normal, maps.inverse, maps.whole, maps.low, maps.high
+    used, free, straight, theta, entered = maps.used, maps.free, maps.straight, output.theta, output.entered
     for axis in range(np.uintp(AXES)):
         if used[axis, 1] <= used[axis, 0]:
             valid[axis] = False
@@ -314,7 +314,7 @@ def _apply_gains(right: Floats, slope: Floats, gains: Gains, output: FitOutput, 
                 same = same and pull <= 1e-9 * abs(right[axis, a])
         if holds and not same:
             solve_nonnegative(normal[axis], right[axis], free[axis], theta[axis])
-            invert(normal[axis], nonzero_terms(theta[axis]), inverse[axis])
+            invert_on_subset(normal[axis], nonzero_term_bits(theta[axis]), inverse[axis])
         for a in range(np.uintp(NOISES)):
             holds = holds and low[axis, a] <= theta[axis, a] <= high[axis, a]
         theta[axis, R] = s * s if entered[axis, R] else 0.0

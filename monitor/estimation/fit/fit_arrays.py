@@ -13,7 +13,7 @@ from drivers.sample import Floats, Ints
 from monitor.estimation.allan.uncertainty import NOISES
 
 LIMIT_COUNT: Final = 2 * NOISES
-"""Number of quantities with limits in ``Gains``: θ of Q N B K, then the unconstrained solution û of Q N B K."""
+"""Number of quantities with limits in ``SolutionMaps``: θ of Q N B K, then the unconstrained solution û of Q N B K."""
 
 
 class SharedInputs(NamedTuple):
@@ -28,7 +28,7 @@ class SharedInputs(NamedTuple):
     ask: bool  # True to leave out short τ that contradict the fit
 
 
-class AxisCurves(NamedTuple):
+class CurvesOfAxes(NamedTuple):
     """Measured curves and slopes, with one row per axis."""
 
     avar: Floats  # [axes, m] Allan variance
@@ -93,7 +93,7 @@ class TermTests(NamedTuple):
     enter_limit: Floats  # [4] value of û above which an absent term is added
 
 
-class Gains(NamedTuple):
+class SolutionMaps(NamedTuple):
     """Solution as a linear map from curve to coefficients, with the limits of its validity, and one row per axis.
 
     With r = Xᵀ V⁻¹ y of the normal equations, θ = ``inverse`` r on the terms that are not zero, and û = ``whole`` r.
@@ -131,8 +131,8 @@ def empty_fit_output(axes: int, m: int, entered: NDArray[np.bool_]) -> FitOutput
     return FitOutput(entered, theta, lo, hi, status, edf, fitted, left_out, np.ones(axes), np.full(axes, np.inf))
 
 
-def empty_gains(axes: int, m: int) -> Gains:
-    """Allocate gains that are not valid yet.
+def empty_solution_maps(axes: int, m: int) -> SolutionMaps:
+    """Allocate maps that are not valid yet.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def empty_gains(axes: int, m: int) -> Gains:
     inverse, whole = np.zeros((2, axes, NOISES, NOISES))
     limits = np.full((axes, LIMIT_COUNT + 1), np.inf)
     free, straight, either = np.zeros((3, axes), np.bool_)
-    return Gains(
+    return SolutionMaps(
         np.zeros((axes, m, NOISES)), ramp, twist, np.zeros((axes, 5, 5)), inverse, whole, limits, -limits,
         np.zeros((axes, 2), np.int64), free, straight, either,
     )  # fmt: skip

@@ -16,12 +16,12 @@ from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES, PAIRS
 from monitor.estimation.fit.confidence_bounds import bound_by_first_point, limit_by_curve
 from monitor.estimation.fit.fit_arrays import (
-    AxisCurves,
+    CurvesOfAxes,
     FitOptions,
     FitOutput,
-    Gains,
     LeastSquares,
     SharedInputs,
+    SolutionMaps,
     TermResults,
 )
 from monitor.estimation.fit.least_squares import (
@@ -29,12 +29,12 @@ from monitor.estimation.fit.least_squares import (
     Q,
     R,
     compute_normal_equations,
-    compute_variances,
+    compute_observation_variances,
     compute_weights,
     solve_nonnegative,
 )
 from monitor.estimation.fit.term_selection import (
-    limit_linear_map,
+    compute_map_validity_limits,
     select_ramp,
     select_terms,
     store_linear_map,
@@ -66,10 +66,10 @@ def fit_axes(
     first: int,
     end: int,
     shared: SharedInputs,
-    curves: AxisCurves,
+    curves: CurvesOfAxes,
     options: FitOptions,
     output: FitOutput,
-    gains: Gains,
+    maps: SolutionMaps,
 ) -> None:
     """Fit the axes first ≤ axis < end.
 
@@ -79,22 +79,22 @@ def fit_axes(
         Range of axes.
     shared : SharedInputs
         Inputs that are the same for all axes.
-    curves : AxisCurves
+    curves : CurvesOfAxes
         Measured curves and slopes.
     options : FitOptions
         Thresholds and weights.
     output : FitOutput
         Results, updated in place.
-    gains : Gains
+    maps : SolutionMaps
         Linear map of the solution, updated in place.
     """
     for axis in range(first, end):
-        _fit_axis(axis, shared, curves, options, output, gains)
+        _fit_axis(axis, shared, curves, options, output, maps)
 
 
 @compiled
 def _fit_axis(
-    axis: int, shared: SharedInputs, curves: AxisCurves, options: FitOptions, output: FitOutput, gains: Gains
+    axis: int, shared: SharedInputs, curves: CurvesOfAxes, options: FitOptions, output: FitOutput, maps: SolutionMaps
 ) -> None:
     """Fit one axis. With too few τ, all coefficients are unestimated."""
     curve, slope, m = curves.avar[axis], curves.slope[axis], curves.avar.shape[1]
@@ -105,9 +105,9 @@ def _fit_axis(
         np.empty(m), np.empty((m, 5)), np.empty((5, 5)), np.empty(5),
     )  # fmt: skip
     rows = _prepare_rows(axis, shared, curves, problem)
-    gains.used[axis, 0] = gains.used[axis, 1] = 0
-    gains.either[axis] = False
-    gains.straight[axis] = straight
+    maps.used[axis, 0] = maps.used[axis, 1] = 0
+    maps.either[axis] = False
+    maps.straight[axis] = straight
     if rows.size < MIN_ROWS:
         for a in range(5):
             terms.entered[a], terms.status[a] = False, 0
@@ -121,12 +121,12 @@ def _fit_axis(
     for a in range(5):
         if terms.status[a] == 1 and not terms.hi[a] < np.inf:  # the curve is too short for a bound
             terms.status[a], terms.lo[a], terms.hi[a] = 0, np.nan, np.nan
-    noise, most, gains.either[axis] = select_ramp(slope, shared.slope_variance, options, terms)
-    compute_variances(problem, rows, terms.theta)
+    noise, most, maps.either[axis] = select_ramp(slope, shared.slope_variance, options, terms)
+    compute_observation_variances(problem, rows, terms.theta)
     _draw(axis, rows, shared.columns, noise, problem.variance, output)
-    gains.free[axis] = free
-    if store_linear_map(axis, used, problem, curves, output, gains):
-        limit_linear_map(gains.low[axis], gains.high[axis], options, tests, most, terms)
+    maps.free[axis] = free
+    if store_linear_map(axis, used, problem, curves, output, maps):
+        compute_map_validity_limits(maps.low[axis], maps.high[axis], options, tests, most, terms)
     if misfit > 1.0:
         limit_by_curve(curve, output.edf[axis], used, shared.columns, FILTER_MEMORY, terms)
     if free:
@@ -135,7 +135,7 @@ def _fit_axis(
 
 
 @compiled
-def _prepare_rows(axis: int, shared: SharedInputs, curves: AxisCurves, problem: LeastSquares) -> Ints:
+def _prepare_rows(axis: int, shared: SharedInputs, curves: CurvesOfAxes, problem: LeastSquares) -> Ints:
     """Return the τ in use, and compute the curve without the line of the measured slope."""
     curve, terms, slope = curves.avar[axis], curves.terms[axis], curves.slope[axis]
     rows, count = np.empty(curve.size, np.int64), 0

@@ -23,7 +23,7 @@ Q, N, B, K, R = range(5)
 
 
 @compiled
-def variance_form(theta: Floats, c: Floats) -> float:
+def allan_covariance(theta: Floats, c: Floats) -> float:
     """Return the covariance of two Allan variances, Σ_ab θ_a θ_b C^ab.
 
     A negative Q² stands for a band limit and adds nothing.
@@ -45,7 +45,7 @@ def variance_form(theta: Floats, c: Floats) -> float:
 
 
 @compiled
-def compute_variances(problem: LeastSquares, rows: Ints, theta: Floats) -> None:
+def compute_observation_variances(problem: LeastSquares, rows: Ints, theta: Floats) -> None:
     """Compute the variances of the observations under a model.
 
     Parameters
@@ -59,7 +59,7 @@ def compute_variances(problem: LeastSquares, rows: Ints, theta: Floats) -> None:
     """
     for i in rows:
         stretch = problem.stretch[i]
-        problem.variance[i] = variance_form(theta, problem.covariance[i, i]) * stretch * stretch
+        problem.variance[i] = allan_covariance(theta, problem.covariance[i, i]) * stretch * stretch
 
 
 @compiled
@@ -77,7 +77,7 @@ def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full: bool
     full : bool
         True to use the covariances, False to use the variances alone.
     """
-    compute_variances(problem, rows, theta)
+    compute_observation_variances(problem, rows, theta)
     if full and _whiten(problem, rows, theta):
         return
     weighted, columns, variance = problem.weighted, problem.columns, problem.variance
@@ -96,7 +96,7 @@ def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
     for k in range(m):
         for j in range(k + 1):
             i, h = rows[k], rows[j]
-            x = variance_form(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
+            x = allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
             factor[k, j] = x / np.sqrt(variance[i] * variance[h])
     if not _factorize(factor, m, SINGULAR_COVARIANCE):
         return False
@@ -156,7 +156,7 @@ def solve_nonnegative(normal: Floats, right: Floats, free: bool, theta: Floats) 
         Solution.
     """
     for subset in range(2**NOISES - 1, 0, -1):
-        if not solve(normal, right, subset, theta):
+        if not solve_on_subset(normal, right, subset, theta):
             continue
         allowed = True
         for a in range(NOISES):
@@ -175,7 +175,7 @@ def solve_nonnegative(normal: Floats, right: Floats, free: bool, theta: Floats) 
 
 
 @compiled
-def solve(normal: Floats, right: Floats, subset: int, solution: Floats) -> bool:
+def solve_on_subset(normal: Floats, right: Floats, subset: int, solution: Floats) -> bool:
     """Solve the normal equations on a subset of the columns by Cholesky decomposition, each column scaled to one.
 
     Parameters
@@ -247,7 +247,7 @@ def _substitute(factor: Floats, n: int, x: Floats) -> None:
 
 
 @compiled
-def nonzero_terms(theta: Floats) -> int:
+def nonzero_term_bits(theta: Floats) -> int:
     """Return the bit set of the terms that are not zero."""
     subset = 0
     for a in range(NOISES):
@@ -257,7 +257,7 @@ def nonzero_terms(theta: Floats) -> int:
 
 
 @compiled
-def invert(normal: Floats, subset: int, inverse: Floats) -> bool:
+def invert_on_subset(normal: Floats, subset: int, inverse: Floats) -> bool:
     """Compute the inverse of the normal matrix on the terms of a subset.
 
     Parameters
@@ -279,7 +279,7 @@ def invert(normal: Floats, subset: int, inverse: Floats) -> bool:
         for b in range(5):
             unit[b] = 1.0 if b == a else 0.0
             solution[b] = 0.0
-        if subset >> a & 1 and not solve(normal, unit, subset, solution):
+        if subset >> a & 1 and not solve_on_subset(normal, unit, subset, solution):
             return False
         for b in range(NOISES):
             inverse[b, a] = solution[b]

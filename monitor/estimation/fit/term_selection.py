@@ -13,14 +13,14 @@ from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
 from monitor.estimation.allan.uncertainty import NOISES
-from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, interval_end, quantile
+from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, interval_end, pearson_quantile
 from monitor.estimation.fit.fit_arrays import (
     LIMIT_COUNT,
-    AxisCurves,
+    CurvesOfAxes,
     FitOptions,
     FitOutput,
-    Gains,
     LeastSquares,
+    SolutionMaps,
     TermResults,
     TermTests,
 )
@@ -30,15 +30,18 @@ from monitor.estimation.fit.least_squares import (
     R,
     compute_normal_equations,
     compute_weights,
-    invert,
-    nonzero_terms,
-    solve,
+    invert_on_subset,
+    nonzero_term_bits,
+    solve_on_subset,
 )
 
 MAX_THETA_CHANGE: Final = 0.4
-"""Gains are recomputed when a θ has moved by this share (a coefficient by a fifth) and by more than its own scatter."""
+"""The linear maps are recomputed when a θ has moved by this share and by more than its own scatter.
+
+A coefficient has then moved by a fifth.
+"""
 MAX_THETA_SIGMA: Final = 1.0
-"""Distance in σ that a θ may move before its gains are recomputed, if this is more than the share ``MAX_THETA_CHANGE``.
+"""Distance in σ that a θ may move before the maps are recomputed, if this is more than the share ``MAX_THETA_CHANGE``.
 """
 DETECTABLE_SIGMA: Final = 3.0
 """Size in σ at which an absent term would be detected."""
@@ -80,7 +83,7 @@ def select_terms(
         if c0 <= 0.0 and c2 <= 0.0:  # there was no solution
             continue
         if a != R:
-            tests.enter_limit[a] = max(options.enter, quantile(Z95, 2.0 * np.sqrt(c2))) * np.sqrt(c0)
+            tests.enter_limit[a] = max(options.enter, pearson_quantile(Z95, 2.0 * np.sqrt(c2))) * np.sqrt(c0)
         _select_term(a, tests.estimate[a], c0, c1, c2, options, terms)
     return tests
 
@@ -162,7 +165,7 @@ def _map_to_term(a: int, problem: LeastSquares, rows: Ints, gain: Floats) -> boo
     """Compute the row of the linear map from curve to û_a, as if each τ had all terms; return False if none exists."""
     unit, solution, weighted = np.zeros(5), np.empty(5), problem.weighted
     unit[a] = 1.0
-    if not solve(problem.normal, unit, (2**NOISES - 1) | (1 << a), solution):
+    if not solve_on_subset(problem.normal, unit, (2**NOISES - 1) | (1 << a), solution):
         return False
     for k in range(rows.size):
         x = 0.0
@@ -255,7 +258,7 @@ def select_ramp(
 
 @compiled
 def store_linear_map(
-    axis: int, rows: Ints, problem: LeastSquares, curves: AxisCurves, output: FitOutput, gains: Gains
+    axis: int, rows: Ints, problem: LeastSquares, curves: CurvesOfAxes, output: FitOutput, maps: SolutionMaps
 ) -> bool:
     """Store the solution of one axis as a linear map.
 
@@ -267,11 +270,11 @@ def store_linear_map(
         Rows in use.
     problem : LeastSquares
         Problem with its weights and normal equations.
-    curves : AxisCurves
+    curves : CurvesOfAxes
         Measured curves and slopes.
     output : FitOutput
         Results of the fit.
-    gains : Gains
+    maps : SolutionMaps
         Linear map, updated in place.
 
     Returns
@@ -283,27 +286,27 @@ def store_linear_map(
         return False  # a τ without terms between others, which only a gap nearly as long as the window can cause
     for a in range(5):
         for b in range(5):
-            gains.normal[axis, a, b] = problem.normal[a, b]
-    subset = nonzero_terms(output.theta[axis])
-    if not invert(problem.normal, 2**NOISES - 1, gains.whole[axis]):
+            maps.normal[axis, a, b] = problem.normal[a, b]
+    subset = nonzero_term_bits(output.theta[axis])
+    if not invert_on_subset(problem.normal, 2**NOISES - 1, maps.whole[axis]):
         return False
-    if not invert(problem.normal, subset, gains.inverse[axis]):
+    if not invert_on_subset(problem.normal, subset, maps.inverse[axis]):
         return False
     for a in range(NOISES):
-        gains.ramp[axis, a] = gains.twist[axis, a] = 0.0
+        maps.ramp[axis, a] = maps.twist[axis, a] = 0.0
         for i in rows:
             weight = problem.weighted[i, a]
-            gains.rows[axis, i, a] = weight
-            if gains.straight[axis]:
+            maps.rows[axis, i, a] = weight
+            if maps.straight[axis]:
                 bend = curves.slopes[axis, i] - curves.slope[axis]
-                gains.ramp[axis, a] += weight * problem.columns[i, R]
-                gains.twist[axis, a] += weight * problem.columns[i, R] * 2.0 * bend
-    gains.used[axis, 0], gains.used[axis, 1] = rows[0], rows[-1] + 1
+                maps.ramp[axis, a] += weight * problem.columns[i, R]
+                maps.twist[axis, a] += weight * problem.columns[i, R] * 2.0 * bend
+    maps.used[axis, 0], maps.used[axis, 1] = rows[0], rows[-1] + 1
     return True
 
 
 @compiled
-def limit_linear_map(
+def compute_map_validity_limits(
     low: Floats, high: Floats, options: FitOptions, tests: TermTests, most: float, terms: TermResults
 ) -> None:
     """Compute the limits within which the linear map of one axis is as good as a new fit.
@@ -311,7 +314,7 @@ def limit_linear_map(
     Parameters
     ----------
     low, high : ndarray of float64, shape (LIMIT_COUNT + 1,)
-        Limits in ``Gains``, overwritten.
+        Limits in ``SolutionMaps``, overwritten.
     options : FitOptions
         Thresholds to add and to drop a term.
     tests : TermTests

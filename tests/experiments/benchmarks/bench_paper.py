@@ -26,7 +26,7 @@ from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table as covariances
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.fit.coefficient_fit import design, fit
+from monitor.estimation.fit.coefficient_fit import fit, make_design
 from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
 
 L: Final = 202
@@ -218,8 +218,8 @@ def each_sample(length: int, taus: int, rounds: int) -> tuple[str, ...]:
         plain.update(samples)
         fitting.update(samples)
     parts = [make_block(np.arange(100), noise(100)) for _ in range(n // 100)]
-    model, table_ = design(sizes, 1.0), covariances(length, sizes)
-    avar, terms, slope = window.avar(), window.terms(), window.slopes()[0]
+    model, table_ = make_design(sizes, 1.0), covariances(length, sizes)
+    avar, terms, slope = window.avar(), window.terms(), window.slopes_of_axes_and_taus()[0]
     took = alternate(
         {
             "kernel": for_each(window.update, [one.values for one in parts]),

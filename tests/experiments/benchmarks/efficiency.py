@@ -30,9 +30,9 @@ import numpy as np
 from scipy.optimize import least_squares, nnls
 
 from drivers.sample import Floats, Ints
-from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording, slope_per_tau
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_per_tau, slope_of_recording
 from monitor.estimation.allan.uncertainty import CovarianceTable, covariance_table
-from monitor.estimation.fit.coefficient_fit import Design, design, fit
+from monitor.estimation.fit.coefficient_fit import Design, fit, make_design
 from monitor.estimation.fit.coefficients import SYMBOLS
 from tests.experiments.benchmarks.records import (
     HOURS_3,
@@ -71,7 +71,7 @@ Estimator = Callable[[Floats, float], Floats]
 @cache
 def _octaves(n: int, rate_hz: float) -> tuple[Ints, Design, CovarianceTable]:
     factors = cluster_sizes(n, rate_hz)
-    return factors, design(factors, rate_hz), covariance_table(n, factors)
+    return factors, make_design(factors, rate_hz), covariance_table(n, factors)
 
 
 def weighed_by_variances(values: Floats, rate_hz: float) -> Floats:
@@ -87,7 +87,7 @@ def weighed_by_covariances(values: Floats, rate_hz: float) -> Floats:
 def _fitted(values: Floats, rate_hz: float, full: bool) -> Floats:
     factors, columns, covariances = _octaves(len(values), rate_hz)
     avar, terms = overlapping_avar(values, factors)
-    straight, each = slope_of_recording(values) * rate_hz, slope_per_tau(values, factors) * rate_hz
+    straight, each = slope_of_recording(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
     found = fit(columns, covariances, avar, terms, slope=straight, slopes=each, full=full)
     return np.asarray(np.sqrt(np.maximum(found.theta, 0.0)))
 

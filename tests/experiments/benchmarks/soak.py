@@ -203,7 +203,7 @@ def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Pa
     for at, name in enumerate(names):
         print(f"{name}: most before the half {early[at]:.1f}, after it {late[at]:.1f}")
     estimator = service.workers[0].pipeline.estimator
-    print(f"the window holds {estimator.filled if estimator is not None else 0} samples")
+    print(f"the window holds {estimator.samples_in_window if estimator is not None else 0} samples")
 
 
 def _sum(counts: Counts, truth: Truth) -> int:

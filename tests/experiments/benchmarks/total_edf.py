@@ -16,13 +16,13 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
-from monitor.estimation.allan.difference_moments import correct_bias, per_sample
+from monitor.estimation.allan.difference_moments import correct_bias, theta_per_sample
 from monitor.estimation.allan.hadamard import hadamard_variance
 from monitor.estimation.allan.hadamard import moments as hadamard_moments
 from monitor.estimation.allan.total import moments as total_moments
 from monitor.estimation.allan.total import total_variance
 from monitor.estimation.allan.uncertainty import covariance_table
-from monitor.estimation.fit.coefficient_fit import design, fit
+from monitor.estimation.fit.coefficient_fit import fit, make_design
 from monitor.noise.effect import Source
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
@@ -56,7 +56,7 @@ def fitted(values: Floats) -> Floats:
     factors = cluster_sizes(len(values), 1.0)
     avar, terms = overlapping_avar(values, factors)
     return fit(
-        design(factors, 1.0), covariance_table(len(values), factors), avar, terms, slope=slope_of_recording(values)
+        make_design(factors, 1.0), covariance_table(len(values), factors), avar, terms, slope=slope_of_recording(values)
     ).theta
 
 
@@ -99,7 +99,7 @@ def main() -> None:
     for name, coefficients in NOISES.items():
         values = records(coefficients, n, arguments.records, rng)
         theta = np.append(np.square(coefficients), 0.0)
-        known, found = np.repeat(theta[:, None], arguments.records, axis=1), per_sample(fitted(values), 1.0)
+        known, found = np.repeat(theta[:, None], arguments.records, axis=1), theta_per_sample(fitted(values), 1.0)
         tvar, terms = total_variance(values, factors)
         totals = correct_bias(own, known, tvar, terms), correct_bias(own, found, tvar, terms)
         line(name, totals, np.stack([one.allan for one in own]) @ theta)

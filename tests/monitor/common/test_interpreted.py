@@ -71,7 +71,10 @@ def results(seed: int) -> list[Any]:
     n = int(rng.integers(200, 700))
     values = signal(rng, n)
     estimator = Estimator(RATE_HZ, float(rng.choice([2.0, 10.0, 60.0])), every_sample=seed % 4 == 0)
-    watch, compensation = SignalMonitor(RATE_HZ, bool(seed % 2), 10.0, keep_still=True), LiveCompensation(RATE_HZ)
+    watch, compensation = (
+        SignalMonitor(RATE_HZ, bool(seed % 2), 10.0, keep_samples_at_rest=True),
+        LiveCompensation(RATE_HZ),
+    )
     found: list[Any] = []
     at = 0
     while at < n:
@@ -85,7 +88,7 @@ def results(seed: int) -> list[Any]:
         for restart in watch.take_restarts():
             estimator.restart(restart.axis, restart.samples)
         found += [compensation.update(samples).values, compensation.take()]
-        if rng.random() < 0.2 and estimator.filled >= MIN_SAMPLES:
+        if rng.random() < 0.2 and estimator.samples_in_window >= MIN_SAMPLES:
             found.append(estimator.get())
     found += [estimator.step_slow_statistics() for _ in range(3)]
     found += [

@@ -157,7 +157,7 @@ def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
     assert 5900 <= motion.since < 6000
     assert "the sensor moved once, 3 s in all: left in; --rest strikes it out" in told.notes
     assert any(note.startswith(f"at {motion.since / 100:.1f} s: moved for 3.0 s: gx") for note in told.notes)
-    struck = detect_events(analyze(blocks, 100.0, rest=True))
+    struck = detect_events(analyze(blocks, 100.0, remove_motion=True))
     assert struck.motions == told.motions
     assert sum("struck out" in note for note in struck.notes) == 1
     assert np.isnan(struck.values[motion.since : motion.until]).all()
@@ -190,7 +190,7 @@ def test_a_sensor_that_never_rests_is_an_answer():
     rng = np.random.default_rng(0)
     values = np.cumsum(rng.standard_normal((120, 6)), axis=0)
     with pytest.raises(NotReady, match=r"\d+ samples at rest; at least 50 are needed"):
-        analyze(recorded_blocks(np.arange(120) / 100, values), 100.0, rest=True)
+        analyze(recorded_blocks(np.arange(120) / 100, values), 100.0, remove_motion=True)
 
 
 def test_axes_side_by_side_give_the_same():

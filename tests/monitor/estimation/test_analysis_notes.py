@@ -12,8 +12,8 @@ from monitor.estimation.analysis import analyze
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.line_detection import Line, detect_lines
 from monitor.estimation.detection.motion_detection import Motion
-from monitor.estimation.fit.bandwidth import LowPass
 from monitor.estimation.fit.coefficients import Status
+from monitor.estimation.fit.low_pass_search import LowPass
 
 RATE_HZ = 100.0
 
@@ -30,7 +30,7 @@ def white(n, seed=1):
 def test_the_sensor_s_own_bandwidth_is_told_once_for_axes_alike():
     axes = [None if i == 2 else LowPass("digital", 1, 0.249 + 0.001 * i) for i in range(6)]
     curve, fit = departing()
-    [note] = analysis_notes.of_fit(curve, fit, axes, RATE_HZ)
+    [note] = analysis_notes.of_unexplained_curve(curve, fit, axes, RATE_HZ)
     assert note == (
         "gx, gy, ax, ay, az: white noise ends below half the sample rate, as behind a first-order low-pass at about "
         "25 Hz; N is the level below it"
@@ -54,7 +54,7 @@ def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
     assert known[0] == "first"
     [known] = [one for one in known if "departs" in one]
     assert known == note.replace("vibration, motion or temperature may be why", "the line at 0.4999 Hz shows there")
-    assert analysis_notes.of_departures(told, np.zeros(6)) == ["a line at 0.4999 Hz: gy 0.11 °/s"]
+    assert analysis_notes.of_lines_and_outliers(told, np.zeros(6)) == ["a line at 0.4999 Hz: gy 0.11 °/s"]
 
 
 def departing(misfit=(1.0,) * 6, at=(2,) * 6, left_out=(0,) * 6, q=()):
@@ -159,7 +159,7 @@ def change(kind="noise_changed"):
 
 
 def test_many_events_are_counted_rather_than_listed():
-    notes = analysis_notes.of_motions([motion(100 * i) for i in range(14)], RATE_HZ, struck=True)
+    notes = analysis_notes.of_motions([motion(100 * i) for i in range(14)], RATE_HZ, removed=True)
     assert notes[0] == "the sensor moved 14 times, 7 s in all: struck out"
     assert notes[1] == "at 0.0 s: moved for 0.5 s: gx up to 5.7 °/s"
     assert notes[-1] == "and 4 more motions"
@@ -176,7 +176,7 @@ def test_outliers_alone_mix_no_before_and_after():
 def test_nothing_found_is_nothing_said():
     quiet = analyzed(white(30_000))
     assert quiet.notes == ()
-    assert analysis_notes.of_motions([], RATE_HZ, struck=False) == analysis_notes.of_changes([], RATE_HZ) == []
+    assert analysis_notes.of_motions([], RATE_HZ, removed=False) == analysis_notes.of_changes([], RATE_HZ) == []
 
 
 def test_a_departure_ends_where_the_curve_comes_back():

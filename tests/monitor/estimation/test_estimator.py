@@ -102,7 +102,7 @@ def test_another_rate_is_another_label():
     one, other = Estimator(RATE, 20.0), Estimator(2 * RATE, 10.0)
     for estimator in (one, other):
         estimator.update(made(0, 2500))
-    one.set_rate(2 * RATE)
+    one.refine_rate(2 * RATE)
     a, b = one.get(), other.get()
     assert (a.rate_hz, a.window_s) == (b.rate_hz, b.window_s) == (200.0, 10.0)
     assert np.array_equal(a.curve.tau_s, b.curve.tau_s)

@@ -94,10 +94,10 @@ def test_temperatures_stand_beside_their_samples() -> None:
         beside.push(lost, t)
         said += [np.nan] * lost + t.tolist()
         held = min(len(said), 100)
-        np.testing.assert_allclose(beside.newest(held), said[-held:], rtol=1e-6)
+        np.testing.assert_allclose(beside.newest_temperatures(held), said[-held:], rtol=1e-6)
     beside.push(10_000, np.array([20.0]))
-    assert np.isnan(beside.newest(100)[:-1]).all()
-    assert beside.newest(1).tolist() == [20.0]
+    assert np.isnan(beside.newest_temperatures(100)[:-1]).all()
+    assert beside.newest_temperatures(1).tolist() == [20.0]
 
 
 def test_values_without_steps_get_none() -> None:

@@ -13,7 +13,7 @@ from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
 from monitor.estimation.allan.total import TotalCurve, total_curve
 from monitor.estimation.analysis import Analysis
-from monitor.estimation.detection.model_gap import ModelComparison, ModelGap
+from monitor.estimation.detection.model_gap import ModelGap, PreparedModel
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
 from monitor.estimation.fit.coefficients import Coefficients, Status
@@ -96,7 +96,7 @@ def look(found: Estimate | None = None, scale: float = 1.0, **agrees: bool) -> M
         f"[{axis}]\n" + "\n".join(f"{name} = {float(letters[row, i])}" for row, name in enumerate(names))
         for i, axis in enumerate(AXES)
     )
-    in_force = ModelComparison(NoiseModel.from_toml(text), 360_000)
+    in_force = PreparedModel(NoiseModel.from_toml(text), 360_000)
     return replace(in_force.compare(found), agrees=agrees)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from monitor.common import topics
-from monitor.estimation.estimate import CoefficientHistory
+from monitor.estimation.estimate import PerSampleCoefficients
 from monitor.publishing.messages import results
 from monitor.publishing.messages.message import Message
 from monitor.publishing.result_kinds import (
@@ -70,7 +70,7 @@ def test_results_that_wait_are_merged() -> None:
 def test_no_value_of_a_single_sample_is_lost_when_estimates_are_merged() -> None:
     waiting: list[TimedResult] = []
     for i in range(3):
-        history = CoefficientHistory(np.array([i]), np.full((1, 5, 6), float(i)))
+        history = PerSampleCoefficients(np.array([i]), np.full((1, 5, 6), float(i)))
         keep_spaced(waiting, (0.1 * i, replace(made.estimate(), history=history)))
     assert [t_s for t_s, _ in waiting] == [0.0, pytest.approx(0.2)]
     assert waiting[-1][1].history.t_ns.tolist() == [1, 2]

@@ -394,7 +394,7 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
         else:
             assert counts.lost <= RATE * (time.monotonic() - begun_s)
         wait_for(lambda: after.work(time.monotonic()) or after.pipeline.estimator.samples >= 6059)
-        assert after.pipeline.estimator.filled == 3000
+        assert after.pipeline.estimator.samples_in_window == 3000
     finally:
         after.stop()
         after.join(PATIENCE_S)
@@ -430,7 +430,7 @@ def test_files_that_are_no_segments_are_passed_over(tmp_path: Path) -> None:
     after = station(tmp_path, Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())]))
     after.restore.resume(after._recorder.tail("bench"))
     after.rebuild()
-    assert after.pipeline.estimator.filled == 3000
+    assert after.pipeline.estimator.samples_in_window == 3000
 
 
 # --- other programs in the same folder

@@ -7,7 +7,7 @@ from allantools.ci import edf_greenhall
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor.estimation.allan.difference_moments import autocovariance
+from monitor.estimation.allan.difference_moments import phase_autocovariance
 from monitor.estimation.allan.hadamard import hadamard_curve, hadamard_variance, moments
 from monitor.estimation.allan.total import moments as total_moments
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
@@ -80,7 +80,7 @@ def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
     rows = np.zeros((starts.size, n + 1))
     for p, weight in enumerate((-1.0, 3.0, -3.0, 1.0)):
         rows[starts, starts + p * m] = weight
-    lags = autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
+    lags = phase_autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
     noise = np.stack([rows @ g @ rows.T for g in lags])
     one = moments(n, m)
     np.testing.assert_allclose(one.mean[:4], noise[:, 0, 0] / (6 * m * m), rtol=1e-9)

@@ -106,7 +106,7 @@ def test_bias_is_the_published_one_up_to_half_the_record():
 @pytest.mark.parametrize(("n", "m"), [(40, 1), (40, 7), (41, 20), (40, 29), (41, 40), (300, 37), (301, 290)])
 def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
     rows = differences(n, m)
-    lags = moments_module.autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
+    lags = moments_module.phase_autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
     noise = np.stack([rows @ g @ rows.T for g in lags])
     ramp = rows @ (0.5 * np.arange(n + 1.0) ** 2)
     mean = np.append(noise.diagonal(axis1=1, axis2=2).mean(axis=1), np.mean(ramp**2)) / (2 * m * m)
@@ -122,7 +122,7 @@ def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
 def test_the_coarse_grid_of_a_long_record_is_good_to_a_few_percent(m):
     n = 700
     rows = differences(n, m)
-    lags = moments_module.autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
+    lags = moments_module.phase_autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
     exact = [2.0 * ((rows @ g @ rows.T) ** 2).sum() / (2 * m * m * (n - 1.0)) ** 2 for g in lags]
     np.testing.assert_allclose(moments(n, m).covariance.diagonal()[:4], exact, rtol=0.05)
 

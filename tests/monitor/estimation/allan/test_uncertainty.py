@@ -7,7 +7,13 @@ from allantools.ci import edf_greenhall
 from scipy.stats import chi2
 
 from monitor.estimation.allan.batch import overlapping_avar
-from monitor.estimation.allan.uncertainty import PAIRS, TABLE_STEP, CovarianceTables, covariance_table, intervals
+from monitor.estimation.allan.uncertainty import (
+    PAIRS,
+    TABLE_STEP,
+    CovarianceTables,
+    covariance_table,
+    deviation_intervals,
+)
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 
 
@@ -83,7 +89,7 @@ def test_covariance_is_that_of_simulated_curves(source, pair):
 
 
 def test_interval_is_chi_square():
-    lo, hi = intervals(np.array([4.0, np.nan]), np.array([7.3, 5.0]), 0.9)
+    lo, hi = deviation_intervals(np.array([4.0, np.nan]), np.array([7.3, 5.0]), 0.9)
     assert lo[0] == pytest.approx(np.sqrt(7.3 * 4.0 / chi2.ppf(0.95, 7.3)))
     assert hi[0] == pytest.approx(np.sqrt(7.3 * 4.0 / chi2.ppf(0.05, 7.3)))
     assert np.isnan([lo[1], hi[1]]).all()
@@ -92,7 +98,7 @@ def test_interval_is_chi_square():
 
 
 def test_a_fraction_of_a_degree_of_freedom_bounds_nothing_from_above_not_even_zeros():
-    lo, hi = intervals(np.array([0.0, 1.0, np.nan, 0.0]), np.array([1e-3, 1e-3, 1e-3, 10.0]))
+    lo, hi = deviation_intervals(np.array([0.0, 1.0, np.nan, 0.0]), np.array([1e-3, 1e-3, 1e-3, 10.0]))
     np.testing.assert_array_equal(lo[[0, 2, 3]], [0.0, np.nan, 0.0])
     np.testing.assert_array_equal(hi, [np.inf, np.inf, np.nan, 0.0])
 

@@ -10,7 +10,7 @@ from hypothesis.extra import numpy as hnp
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
 from drivers.errors import ConfigError
-from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording, slope_per_tau
+from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_per_tau, slope_of_recording
 from monitor.estimation.allan.window import FULL_SCALE, MAX_LENGTH, MIN_LENGTH, AllanWindow, display_spans
 from monitor.estimation.allan.window_kernel import STAGE_SAMPLES, advance
 from tests.experiments.benchmarks import long_run
@@ -130,13 +130,13 @@ def test_growing_full_and_reset():
     assert np.isnan(window.avar()).all()
     assert not window.terms().any()
     window.update(values[:60])
-    assert (window.n, window.total) == (60, 60)
+    assert (window.samples_in_window, window.samples_since_reset) == (60, 60)
     check(window, values[:60])
     assert np.isnan(window.avar()[-2:]).sum() == 6  # m = 50 needs a hundred
     window.update(values[60:])
-    assert (window.n, window.total) == (100, 260)
+    assert (window.samples_in_window, window.samples_since_reset) == (100, 260)
     window.reset()
-    assert (window.n, window.total) == (0, 0)
+    assert (window.samples_in_window, window.samples_since_reset) == (0, 0)
     assert np.isnan(window.avar()).all()
     window.update(values)
     fresh = AllanWindow(LENGTH, FACTORS)
@@ -147,7 +147,7 @@ def test_growing_full_and_reset():
 def test_an_empty_block_changes_nothing():
     window = AllanWindow(LENGTH, FACTORS)
     window.update(np.empty((0, 6)))
-    assert window.total == 0
+    assert window.samples_since_reset == 0
 
 
 @pytest.mark.parametrize("n", [0, 1, 37, 64, 99, 100])
@@ -264,7 +264,7 @@ def test_slope_and_length_are_those_of_the_whole_window():
     for window in (plain, spanned):
         window.update(values)
     assert spanned.n == 300
-    assert np.array_equal(plain.slopes()[0], spanned.slopes()[0])
+    assert np.array_equal(plain.slopes_of_axes_and_taus()[0], spanned.slopes_of_axes_and_taus()[0])
 
 
 def test_a_transient_leaves_each_row_after_its_own_span():
@@ -322,7 +322,7 @@ def test_ten_thousand_turns_of_phase_and_ring():
     for turn in range(40):
         window.update(values)
         check(window, values[-(1000 + turn) :])
-    assert window.total == 2_000_000
+    assert window.samples_since_reset == 2_000_000
 
 
 def test_full_scale_square_wave_at_the_longest_tau_does_not_overflow():
@@ -492,7 +492,7 @@ class Calls(RuleBasedStateMachine):
 
     @rule(axis=st.integers(0, 5), n=st.integers(0, LENGTH + 33))
     def forget(self, axis, n):
-        self.window.discard(axis, n)
+        self.window.keep_newest(axis, n)
         self.held[: max(len(self.held) - n, 0), axis] = np.nan
 
     @rule()
@@ -502,11 +502,13 @@ class Calls(RuleBasedStateMachine):
 
     @invariant()
     def is_the_batch(self):
-        assert self.window.n == len(self.held)
+        assert self.window.samples_in_window == len(self.held)
         check(self.window, self.held)
         if len(self.held) >= 3:
-            np.testing.assert_allclose(self.window.slopes()[0], slope_of_recording(self.held), rtol=1e-6, atol=1e-12)
-            seen, true = self.window.slopes()[1], slope_per_tau(self.held, self.window.factors)
+            np.testing.assert_allclose(
+                self.window.slopes_of_axes_and_taus()[0], slope_of_recording(self.held), rtol=1e-6, atol=1e-12
+            )
+            seen, true = self.window.slopes_of_axes_and_taus()[1], rate_slope_per_tau(self.held, self.window.factors)
             assert np.array_equal(np.isnan(seen), np.isnan(true))
             whole = np.isfinite(self.held).all(axis=0)  # with a gap, each puts another mean in its place
             np.testing.assert_allclose(seen[:, whole], true[:, whole], rtol=1e-5, atol=1e-12)
@@ -526,7 +528,7 @@ def test_forgetting_one_axis_makes_its_older_samples_missing(kept):
     values[LENGTH : LENGTH + 7, 2] = np.nan
     window, expected = AllanWindow(LENGTH, FACTORS), values[: 2 * LENGTH].copy()
     window.update(expected)
-    window.discard(1, kept)
+    window.keep_newest(1, kept)
     expected[: len(expected) - kept, 1] = np.nan
     for n in (0, 3, 40, LENGTH):
         window.update(values[len(expected) : len(expected) + n])
@@ -540,15 +542,17 @@ def test_the_slope_of_an_axis_that_began_anew_is_that_of_its_own_samples():
     values = made(LENGTH) + 1e-3 * np.arange(LENGTH)[:, None]
     window = AllanWindow(LENGTH, FACTORS)
     window.update(values)
-    window.discard(4, 60)
+    window.keep_newest(4, 60)
     lengths = np.full(6, LENGTH)
     lengths[4] = 60
-    assert np.isnan(window.slopes()[0][4])
-    assert window.slopes(lengths)[0][4] == pytest.approx(slope_of_recording(values[-60:])[4], rel=1e-6)
-    assert window.slopes(lengths)[0][[0, 5]] == pytest.approx(slope_of_recording(values)[[0, 5]], rel=1e-6)
-    expected = slope_per_tau(values[-60:], FACTORS)[:, 4]
+    assert np.isnan(window.slopes_of_axes_and_taus()[0][4])
+    assert window.slopes_of_axes_and_taus(lengths)[0][4] == pytest.approx(slope_of_recording(values[-60:])[4], rel=1e-6)
+    assert window.slopes_of_axes_and_taus(lengths)[0][[0, 5]] == pytest.approx(
+        slope_of_recording(values)[[0, 5]], rel=1e-6
+    )
+    expected = rate_slope_per_tau(values[-60:], FACTORS)[:, 4]
     there = np.isfinite(expected)
-    assert window.slopes(lengths)[1][there, 4] == pytest.approx(expected[there], rel=1e-6)
+    assert window.slopes_of_axes_and_taus(lengths)[1][there, 4] == pytest.approx(expected[there], rel=1e-6)
 
 
 # --- for ever
@@ -569,14 +573,18 @@ def test_a_small_gap_leaves_the_slope(gap):
     whole.update(values)
     values[at : at + missing] = np.nan
     window.update(values)
-    np.testing.assert_allclose(window.slopes()[0], slope_of_recording(values), rtol=1e-9)
-    np.testing.assert_allclose(window.slopes()[0], whole.slopes()[0], rtol=0.01)
+    np.testing.assert_allclose(window.slopes_of_axes_and_taus()[0], slope_of_recording(values), rtol=1e-9)
+    np.testing.assert_allclose(window.slopes_of_axes_and_taus()[0], whole.slopes_of_axes_and_taus()[0], rtol=0.01)
     # a missing sample stands for the level, here up to the whole ramp away
-    np.testing.assert_allclose(window.slopes()[1][3:], whole.slopes()[1][3:], rtol=0.05)
-    np.testing.assert_allclose(slope_per_tau(values, factors)[3:], whole.slopes()[1][3:], rtol=0.05)
+    np.testing.assert_allclose(
+        window.slopes_of_axes_and_taus()[1][3:], whole.slopes_of_axes_and_taus()[1][3:], rtol=0.05
+    )
+    np.testing.assert_allclose(
+        rate_slope_per_tau(values, factors)[3:], whole.slopes_of_axes_and_taus()[1][3:], rtol=0.05
+    )
     values[:100] = np.nan
     window.update(values)
-    assert np.isnan(window.slopes()[0]).all()
+    assert np.isnan(window.slopes_of_axes_and_taus()[0]).all()
     assert np.isnan(slope_of_recording(values)).all()
-    assert np.isnan(window.slopes()[1]).all()
-    assert np.isnan(slope_per_tau(values, factors)).all()
+    assert np.isnan(window.slopes_of_axes_and_taus()[1]).all()
+    assert np.isnan(rate_slope_per_tau(values, factors)).all()

@@ -8,7 +8,7 @@ from drivers.errors import ConfigError
 from drivers.sample import AXES
 from monitor.estimation.detection.change_detection import LEARN_S, ChangeDetector
 from monitor.estimation.detection.change_kernel import TICK_SAMPLES, F, N, S
-from monitor.estimation.detection.change_size import Octaves, identify_noise_change
+from monitor.estimation.detection.changed_coefficients import HaarVariancesBeforeAfter, identify_noise_change
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
 from monitor.noise.effects.ieee952.quantization_noise import QuantizationNoise
@@ -282,7 +282,7 @@ def octaves(before, after, terms=10_000.0):
         return sum(sources[c](**{c: value}).avar(tau, 0.01) for c, value in letters.items())
 
     n = terms / 2.0 ** np.arange(12)
-    return Octaves(variance(before), 10 * n, variance(after), n)
+    return HaarVariancesBeforeAfter(variance(before), 10 * n, variance(after), n)
 
 
 MIX = {"Q": 2e-6, "N": 1.5e-4, "B": 4e-5, "K": 1.5e-6}
@@ -302,7 +302,7 @@ def test_two_letters():
 
 def test_nothing_known_names_nothing():
     none = np.zeros(12)
-    assert identify_noise_change(Octaves(none, none, none, none), 100.0) == {}
+    assert identify_noise_change(HaarVariancesBeforeAfter(none, none, none, none), 100.0) == {}
 
 
 # --- learning and refusing
@@ -311,14 +311,14 @@ def test_nothing_known_names_nothing():
 def test_learned_after_its_time():
     detector = ChangeDetector(100.0)
     detector.update(white(int(LEARN_S * 100) - TICK_SAMPLES))
-    assert not detector.learned.any()
+    assert not detector.learned_axes.any()
     detector.update(white(4 * TICK_SAMPLES))
-    assert detector.learned.all()
-    assert detector.watched[:, 0].sum() >= 6
+    assert detector.learned_axes.all()
+    assert detector.watched_octaves[:, 0].sum() >= 6
     detector.restart(GZ)
-    assert detector.learned.tolist() == [True, True, False, True, True, True]
+    assert detector.learned_axes.tolist() == [True, True, False, True, True, True]
     detector.restart()
-    assert not detector.learned.any()
+    assert not detector.learned_axes.any()
 
 
 @pytest.mark.parametrize(("rate", "alarms"), [(0.0, 1.0), (float("nan"), 1.0), (100.0, 0.0), (100.0, -1.0)])

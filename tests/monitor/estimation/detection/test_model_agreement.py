@@ -48,7 +48,7 @@ def test_a_gap_that_stays_is_told_once_with_where_and_how_much() -> None:
         "model": {"agrees": False, "gap": 6.0, "threshold": 4.0, "ratio": 1.5, "tau_lo": 0.08, "tau_hi": 0.32}
     }
     assert event.t_ns - (event.since_ns or 0) == HOLD * 10_000_000
-    assert looks.agreement.verdicts == {"gz": False, "gx": True}
+    assert looks.agreement.decisions == {"gz": False, "gx": True}
     assert looks.see(5 * HOLD, gz=6.0, gx=2.0) == []
 
 
@@ -58,7 +58,7 @@ def test_a_gap_that_comes_and_goes_is_no_event() -> None:
         assert looks.see(HOLD, gz=6.0) == []
         assert looks.see(STEP, gz=2.0) == []
     assert looks.see(20 * HOLD, gz=4.3) == []  # above the threshold, below the alarm of many looks
-    assert looks.agreement.verdicts == {"gz": True}
+    assert looks.agreement.decisions == {"gz": True}
 
 
 def test_what_is_beyond_all_chance_is_told_sooner() -> None:
@@ -72,20 +72,20 @@ def test_what_is_beyond_all_chance_is_told_sooner() -> None:
 def test_it_agrees_again_only_below_the_lower_limit() -> None:
     looks = Looks()
     looks.see(MIN_SAMPLES + STEP, gz=20.0)
-    assert looks.agreement.verdicts == {"gz": False}
+    assert looks.agreement.decisions == {"gz": False}
     assert looks.see(10 * HOLD, gz=3.5) == []
     assert looks.see(HOLD, gz=1.5) == []
     (event,) = looks.see(STEP, gz=1.5)
     assert (event.kind, event.values["model"]["agrees"]) == (KIND, True)
     assert event.text == "gz agrees with its model again: 1.5 σ apart at most"
-    assert looks.agreement.verdicts == {"gz": True}
+    assert looks.agreement.decisions == {"gz": True}
     assert len(looks.see(2 * HOLD, gz=6.0)) == 1
 
 
 def test_there_is_no_verdict_before_one_is_sure() -> None:
     looks = Looks()
     looks.see(MIN_SAMPLES, gz=20.0)
-    assert looks.agreement.verdicts == {}
+    assert looks.agreement.decisions == {}
     assert len(looks.see(STEP, gz=20.0)) == 1
 
 
@@ -93,7 +93,7 @@ def test_an_axis_that_cannot_be_judged_for_a_while_keeps_its_verdict() -> None:
     looks = Looks()
     looks.see(MIN_SAMPLES + STEP, gz=20.0)
     assert looks.see(HOLD) == []
-    assert looks.agreement.verdicts == {"gz": False}
+    assert looks.agreement.decisions == {"gz": False}
     assert looks.see(HOLD, gz=20.0) == []
 
 

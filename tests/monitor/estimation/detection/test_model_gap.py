@@ -11,10 +11,10 @@ from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.model_gap import (
     MIN_EDF,
     MIN_SAMPLES,
-    ModelComparison,
+    PreparedModel,
     max_z_limit,
     normal_score,
-    samples_of,
+    samples_of_axis,
 )
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.estimator import Estimator
@@ -70,7 +70,7 @@ def simulated(model: NoiseModel, n: int, seed: int) -> Estimate:
 def test_scores_of_a_true_model_are_those_of_chance(effects: tuple[Effect, ...]) -> None:
     """At every τ: a wrong number of degrees of freedom would show in the spread."""
     model = model_of(*effects)
-    in_force = ModelComparison(model, 12_000)
+    in_force = PreparedModel(model, 12_000)
     looks = [in_force.compare(simulated(model, 12_000, seed)) for seed in range(40)]
     assert all(list(look.axes) == list(AXES) for look in looks)
     z = np.array([one.z for look in looks for one in look.axes.values()])
@@ -82,15 +82,15 @@ def test_scores_of_a_true_model_are_those_of_chance(effects: tuple[Effect, ...])
     spread = z[:, judged].std(axis=0)
     assert spread.max() < 1.0 + 4.5 / np.sqrt(2 * n)
     assert spread.min() > narrow
-    assert sum(one.passes for look in looks for one in look.axes.values()) <= 3  # 0.4 are to be expected
+    assert sum(one.exceeds_threshold for look in looks for one in look.axes.values()) <= 3  # 0.4 are to be expected
 
 
 def test_what_is_wrong_is_found_where_it_is_and_as_large_as_it_is() -> None:
     true = model_of(*CLASSIC)
     measured = true + NoiseModel({"gz": (Sinusoidal(amplitude=6e-4, frequency=5.0),)})
-    look = ModelComparison(true, 30_000).compare(simulated(measured, 30_000, 5))
+    look = PreparedModel(true, 30_000).compare(simulated(measured, 30_000, 5))
     gz = look.axes["gz"]
-    assert gz.passes
+    assert gz.exceeds_threshold
     lo, hi = gz.tau_s
     assert lo <= 0.08 <= hi  # a line is largest at half its period
     assert look.tau_s[gz.row] in (0.04, 0.08)
@@ -98,19 +98,19 @@ def test_what_is_wrong_is_found_where_it_is_and_as_large_as_it_is() -> None:
     tau = look.tau_s[gz.row : gz.row + 1]
     expected = np.sqrt(measured.avar("gz", tau, 1 / RATE) / true.avar("gz", tau, 1 / RATE))[0]
     assert gz.ratio == pytest.approx(expected, rel=0.03)
-    assert not any(look.axes[axis].passes for axis in AXES if axis != "gz")
+    assert not any(look.axes[axis].exceeds_threshold for axis in AXES if axis != "gz")
 
 
 def test_a_sensor_that_is_too_quiet_is_found_too() -> None:
-    look = ModelComparison(model_of(WHITE), 10_000).compare(simulated(model_of(AngleRandomWalk(N=1.2e-4)), 10_000, 1))
-    assert all(one.passes and one.z[one.row] < 0.0 and one.ratio == pytest.approx(0.8, rel=0.06)
+    look = PreparedModel(model_of(WHITE), 10_000).compare(simulated(model_of(AngleRandomWalk(N=1.2e-4)), 10_000, 1))
+    assert all(one.exceeds_threshold and one.z[one.row] < 0.0 and one.ratio == pytest.approx(0.8, rel=0.06)
                for one in look.axes.values())  # fmt: skip
 
 
 def test_a_part_of_a_percent_is_told_where_the_window_allows_it() -> None:
     """z is in the window's own standard deviations: at one sample, 1/√edf of the deviation."""
     n = 100_000
-    look = ModelComparison(model_of(WHITE), n).compare(simulated(model_of(AngleRandomWalk(N=1.5e-4 * 1.02)), n, 3))
+    look = PreparedModel(model_of(WHITE), n).compare(simulated(model_of(AngleRandomWalk(N=1.5e-4 * 1.02)), n, 3))
     shortest = [one.z[0] for one in look.axes.values()]
     assert np.mean(shortest) == pytest.approx(0.04 / np.sqrt(2 / (2 * n / 3)), rel=0.25)  # edf = 2/3 n
 
@@ -119,14 +119,14 @@ def test_axes_without_a_model_or_without_samples_are_not_judged() -> None:
     model = model_of(WHITE, axes=("gx", "gz")) + NoiseModel({"ay": (Bias(value=1.0),)})
     heated = model + NoiseModel({"gx": (TemperatureBias(coefficient=1e-3, reference=20.0),)})
     values = model_of(WHITE).simulate(5000, RATE, 1)
-    assert list(ModelComparison(model, 5000).compare(estimate(values)).axes) == ["gx", "gz"]
-    assert list(ModelComparison(heated, 5000).compare(estimate(values)).axes) == ["gz"]  # its temperature is not known
+    assert list(PreparedModel(model, 5000).compare(estimate(values)).axes) == ["gx", "gz"]
+    assert list(PreparedModel(heated, 5000).compare(estimate(values)).axes) == ["gz"]  # its temperature is not known
     values[:, 2] = np.nan
-    assert list(ModelComparison(model, 5000).compare(estimate(values)).axes) == ["gx"]
+    assert list(PreparedModel(model, 5000).compare(estimate(values)).axes) == ["gx"]
 
 
 def test_too_few_samples_are_no_look() -> None:
-    in_force = ModelComparison(model_of(WHITE), 5000)
+    in_force = PreparedModel(model_of(WHITE), 5000)
     values = model_of(WHITE).simulate(MIN_SAMPLES, RATE, 1)
     assert in_force.compare(estimate(values[:-1], 5000)).axes == {}
     assert list(in_force.compare(estimate(values, 5000)).axes) == list(AXES)
@@ -138,13 +138,13 @@ def test_an_axis_that_began_anew_is_judged_by_its_own_samples() -> None:
     values = model.simulate(20_000, RATE, 1)
     values[:17_000, 2] *= 3.0
     estimator.update(make_block(np.arange(20_000) * 10_000_000, values.copy()))
-    in_force = ModelComparison(model, estimator.length)
-    assert in_force.compare(estimator.get(fitted=False)).axes["gz"].passes
+    in_force = PreparedModel(model, estimator.window_samples)
+    assert in_force.compare(estimator.get(fitted=False)).axes["gz"].exceeds_threshold
     estimator.restart(2, 3000)
     look = in_force.compare(estimator.get(fitted=False))
-    assert not look.axes["gz"].passes
+    assert not look.axes["gz"].exceeds_threshold
     assert (look.axes["gz"].samples, look.axes["gx"].samples) == (3000, 20_000)
-    assert samples_of(estimator.get(fitted=False).curve, 2) == 3000
+    assert samples_of_axis(estimator.get(fitted=False).curve, 2) == 3000
     # fewer samples, fewer τ that say something
     assert np.isfinite(look.axes["gz"].z).sum() < np.isfinite(look.axes["gx"].z).sum()
 
@@ -153,14 +153,14 @@ def test_gaps_in_the_samples_cost_certainty_and_nothing_else() -> None:
     model = model_of(*CLASSIC)
     values = model.simulate(30_000, RATE, 2)
     values[np.random.default_rng(1).random(30_000) < 0.01] = np.nan
-    look = ModelComparison(model, 30_000).compare(estimate(values))
+    look = PreparedModel(model, 30_000).compare(estimate(values))
     assert list(look.axes) == list(AXES)
-    assert not any(one.passes for one in look.axes.values())
+    assert not any(one.exceeds_threshold for one in look.axes.values())
 
 
 def test_a_rate_known_better_is_another_label() -> None:
     model = model_of(WHITE)
-    in_force = ModelComparison(model, 10_000)
+    in_force = PreparedModel(model, 10_000)
     found = simulated(model, 10_000, 4)
     before = in_force.compare(found).axes["gz"]
     curve: AllanCurve = replace(found.curve, tau_s=found.curve.factors / 104.0)

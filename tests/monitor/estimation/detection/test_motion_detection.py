@@ -37,7 +37,7 @@ def stream(values, edges, lost_before=None, rate=RATE):
     given = taken = 0
     for a, b in pairwise(edges):
         lost = lost_before if lost_before and a == lost_before else 0
-        came = rest.update(make_block(np.arange(a, b), values[a:b].copy(), lost=lost))
+        came = rest.advance_and_take_decided(make_block(np.arange(a, b), values[a:b].copy(), lost=lost))
         out += came
         given, taken = given + b - a, taken + sum(len(one) for one in came)
         most = max(most, given - taken)
@@ -95,7 +95,7 @@ def test_missing_samples_keep_their_places():
     edges = [*range(0, 1000, 100), *range(1000, len(kept), 100), len(kept)]
     rest = MotionDetector(RATE)
     for a, b in pairwise(edges):
-        rest.update(make_block(np.arange(a, b), kept[a:b].copy(), lost=260 if a == 1000 else 0))
+        rest.advance_and_take_decided(make_block(np.arange(a, b), kept[a:b].copy(), lost=260 if a == 1000 else 0))
     rest.flush()
     (found,) = rest.take()
     assert (found.kind, found.since, found.until) == (motion.kind, motion.since, motion.until)
@@ -103,8 +103,8 @@ def test_missing_samples_keep_their_places():
 
 def test_a_very_long_pause_is_no_work():
     rest = MotionDetector(RATE)
-    rest.update(make_block(np.arange(2000), still(20)))
-    rest.update(make_block(np.arange(2000), still(20, seed=1), lost=10**12))
+    rest.advance_and_take_decided(make_block(np.arange(2000), still(20)))
+    rest.advance_and_take_decided(make_block(np.arange(2000), still(20, seed=1), lost=10**12))
     rest.flush()
     assert rest.take() == []
 
@@ -114,7 +114,7 @@ def test_moving_is_shown_while_it_lasts():
     rest = MotionDetector(RATE)
     shown = []
     for a in range(0, 3000, 10):
-        rest.update(make_block(np.arange(a, a + 10), values[a : a + 10].copy()))
+        rest.advance_and_take_decided(make_block(np.arange(a, a + 10), values[a : a + 10].copy()))
         shown.append(rest.moving)
     seconds = np.flatnonzero(shown) / 10.0
     assert 20.0 < seconds[0] < 20.6

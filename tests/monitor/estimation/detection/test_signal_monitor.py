@@ -47,32 +47,32 @@ def test_louder_noise_is_an_event_with_its_time_and_a_restart_with_its_samples(l
     assert not watch.take_restarts()
 
 
-@pytest.mark.parametrize("leave_out", [False, True])
-def test_motion_is_told_and_left_out_only_where_that_is_wanted(leave_out):
+@pytest.mark.parametrize("remove_motion", [False, True])
+def test_motion_is_told_and_left_out_only_where_that_is_wanted(remove_motion):
     values = noise(12_000)
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    watch = SignalMonitor(RATE_HZ, leave_out)
+    watch = SignalMonitor(RATE_HZ, remove_motion)
     passed = feed(watch, values)
     assert not watch.moving
     passed += watch.flush()
     out = np.concatenate([one.values for one in passed])
     assert len(out) == len(values)
     struck = np.isnan(out[:, 0])
-    assert struck[8_000:8_300].all() if leave_out else not struck.any()
+    assert struck[8_000:8_300].all() if remove_motion else not struck.any()
     assert struck.sum() < 500
     assert np.array_equal(out[~struck], values[~struck])
-    assert watch.moved_samples == (struck.sum() if leave_out else watch.moved_samples) > 300
+    assert watch.moved_samples == (struck.sum() if remove_motion else watch.moved_samples) > 300
     (event,) = watch.take_events()
     assert (event.kind, event.axis) == ("moved", "gx")
     assert seconds(event.since_ns) == pytest.approx(80.0, abs=0.6)
     assert event.values["moved"]["peak"] == pytest.approx(0.5, rel=0.1)
 
 
-@pytest.mark.parametrize("leave_out", [False, True])
-def test_what_is_at_rest_can_be_had_whatever_is_handed_on(leave_out):
+@pytest.mark.parametrize("remove_motion", [False, True])
+def test_what_is_at_rest_can_be_had_whatever_is_handed_on(remove_motion):
     values = noise(12_000)
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    watch = SignalMonitor(RATE_HZ, leave_out, keep_still=True)
+    watch = SignalMonitor(RATE_HZ, remove_motion, keep_samples_at_rest=True)
     feed(watch, values)
     still = np.concatenate([one.values for one in watch.take_samples_at_rest()])
     assert len(still) < len(values)  # the last are not judged yet
@@ -82,7 +82,7 @@ def test_what_is_at_rest_can_be_had_whatever_is_handed_on(leave_out):
     assert struck.sum() == watch.moved_samples > 300
     assert np.array_equal(still[~struck], values[~struck])
     assert watch.take_samples_at_rest() == []
-    assert watch.handled == 0
+    assert watch.orientation_changes == 0
 
 
 def test_still_samples_are_kept_only_for_who_wants_them():
@@ -99,7 +99,7 @@ def test_being_left_in_another_orientation_is_counted():
     watch = SignalMonitor(RATE_HZ)
     feed(watch, values)
     watch.flush()
-    assert watch.handled == 1
+    assert watch.orientation_changes == 1
 
 
 def test_motion_is_no_change_of_noise():
@@ -138,7 +138,7 @@ def test_at_another_rate_nothing_that_was_held_back_is_lost(at):
     """Also in the middle of a motion, which is told."""
     values = noise(12_000)
     values[7_700:8_000, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
-    watch, passed = SignalMonitor(RATE_HZ, leave_out=True), []
+    watch, passed = SignalMonitor(RATE_HZ, remove_motion=True), []
     for first in range(0, len(values), 130):
         part = values[first : first + 130]
         passed += watch.update(make_block(STEP_NS * np.arange(first, first + len(part)), part))
@@ -150,12 +150,12 @@ def test_at_another_rate_nothing_that_was_held_back_is_lost(at):
     assert watch.moved_samples == np.isnan(np.concatenate([one.values for one in passed])[:, 0]).sum() > 150
 
 
-@pytest.mark.parametrize("leave_out", [False, True])
-def test_after_an_outage_of_years_changes_are_learned_anew_with_their_times(leave_out):
+@pytest.mark.parametrize("remove_motion", [False, True])
+def test_after_an_outage_of_years_changes_are_learned_anew_with_their_times(remove_motion):
     lost = 10**10
     values = noise(30_000)
     values[20_000:, 3] *= 2.0
-    watch = SignalMonitor(RATE_HZ, leave_out)
+    watch = SignalMonitor(RATE_HZ, remove_motion)
     feed(watch, noise(5_000, 9))
     t_ns = FIRST_NS + STEP_NS * (5_000 + lost + np.arange(len(values)))
     handed_on = watch.update(make_block(t_ns[:250], values[:250], lost=lost))

@@ -9,8 +9,8 @@ from scipy.stats import binom
 
 from drivers.sample import AXES
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
-from monitor.estimation.allan.uncertainty import covariance_table, intervals
-from monitor.estimation.fit.coefficient_fit import Fit, design, fit
+from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
+from monitor.estimation.fit.coefficient_fit import Fit, fit, make_design
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.noise.effect import Source
@@ -34,7 +34,7 @@ def fit_values(values: np.ndarray, with_slope: bool = True, **more) -> Fit:
     factors = cluster_sizes(len(values), RATE_HZ)
     avar, terms = overlapping_avar(values, factors)
     given = {"slope": slope_of_recording(values) * RATE_HZ} if with_slope else {}
-    return fit(design(factors, RATE_HZ), covariance_table(len(values), factors), avar, terms, **given, **more)
+    return fit(make_design(factors, RATE_HZ), covariance_table(len(values), factors), avar, terms, **given, **more)
 
 
 @cache
@@ -59,7 +59,7 @@ def exact_curve(theta: np.ndarray, n: int = N) -> Fit:
     avar = sum(t * s.avar(factors / RATE_HZ, 1.0 / RATE_HZ) for t, s in zip(theta, UNIT_SOURCES, strict=True))
     t = covariance_table(n, factors)
     columns = np.repeat(avar[:, None], 6, axis=1)
-    return fit(design(factors, RATE_HZ), t, columns, np.repeat(t.terms[:, None], 6, axis=1))
+    return fit(make_design(factors, RATE_HZ), t, columns, np.repeat(t.terms[:, None], 6, axis=1))
 
 
 def test_an_exact_curve_gives_its_coefficients_back():
@@ -103,7 +103,7 @@ def test_intervals_of_deviations_hold_the_truth():
     truth = sum(source.avar(factors / RATE_HZ, 1.0 / RATE_HZ) for source in MIX)[:, None]
     held = []
     for one, avar in zip(looked, measured, strict=True):
-        lo, hi = intervals(avar, one.edf)
+        lo, hi = deviation_intervals(avar, one.edf)
         held.append((lo**2 <= truth) & (truth <= hi**2))
     short = np.array(held)[:, factors <= N // 8]
     for share in short.mean(axis=(0, 2)):
@@ -175,7 +175,12 @@ def test_hysteresis_enters_late_and_leaves_late():
     for b in np.linspace(1e-5, 1e-4, 60):
         theta[2] = b**2
         avar = sum(x * s.avar(factors / RATE_HZ, 1.0 / RATE_HZ) for x, s in zip(theta, UNIT_SOURCES, strict=True))
-        arguments = (design(factors, RATE_HZ), t, np.repeat(avar[:, None], 6, 1), np.repeat(t.terms[:, None], 6, 1))
+        arguments = (
+            make_design(factors, RATE_HZ),
+            t,
+            np.repeat(avar[:, None], 6, 1),
+            np.repeat(t.terms[:, None], 6, 1),
+        )
         entered.append([fit(*arguments, before=before).entered[2, 0] for before in (never, always)])
     entered = np.array(entered)
     assert (entered[:, 1] >= entered[:, 0]).all()
@@ -190,7 +195,7 @@ def test_too_few_tau_is_unestimated_but_has_degrees_of_freedom():
     factors = 2 ** np.arange(MIN_ROWS - 1)
     values = np.random.default_rng(0).standard_normal((64, 6))
     avar, terms = overlapping_avar(values, factors)
-    result = fit(design(factors, RATE_HZ), covariance_table(64, factors), avar, terms)
+    result = fit(make_design(factors, RATE_HZ), covariance_table(64, factors), avar, terms)
     assert (result.coefficients.status == Status.UNESTIMATED).all()
     assert np.isnan(result.coefficients.hi).all()
     assert np.isnan(result.fitted).all()
@@ -243,7 +248,7 @@ def test_where_the_terms_are_no_description_none_is_more_than_the_curve():
     values = 1e-3 * np.random.default_rng(5).standard_normal((t.size, 6)) + 0.05 * np.sin(np.pi * t)[:, None]
     factors = cluster_sizes(t.size, 100.0)
     avar, terms = overlapping_avar(values, factors)
-    columns = design(factors, 100.0)
+    columns = make_design(factors, 100.0)
     found = fit(columns, covariance_table(t.size, factors), avar, terms)
     assert (found.misfit > 1.0).all()
     c = found.coefficients

@@ -8,7 +8,7 @@ from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import AxisCovarianceTables, CovarianceTables
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.fit.coefficient_fit import design, fit
+from monitor.estimation.fit.coefficient_fit import fit, make_design
 from monitor.estimation.fit.continuous_refit import ContinuousRefit
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
@@ -16,7 +16,7 @@ from monitor.noise.model import NoiseModel
 RATE_HZ = 100.0
 LENGTH = 20_000
 FACTORS = cluster_sizes(LENGTH, RATE_HZ)
-DESIGN = design(FACTORS, RATE_HZ)
+DESIGN = make_design(FACTORS, RATE_HZ)
 MIX = (QuantizationNoise(Q=5e-6), AngleRandomWalk(N=1.5e-4), BiasInstability(B=1e-4), RateRandomWalk(K=3e-5))
 
 
@@ -30,7 +30,7 @@ def follow(values, blocks=(1000,)):
     refit = ContinuousRefit(window, FACTORS.size, AxisCovarianceTables(FACTORS, LENGTH))
     courses, at, k, lengths = [], 0, 0, np.zeros(6, np.int64)
     while at < len(values):
-        courses.append(refit.update(DESIGN, values[at : at + blocks[k % len(blocks)]], lengths))
+        courses.append(refit.advance_and_refit(DESIGN, values[at : at + blocks[k % len(blocks)]], lengths))
         at += blocks[k % len(blocks)]
         k += 1
     return np.concatenate(courses), window, refit
@@ -39,9 +39,11 @@ def follow(values, blocks=(1000,)):
 def fresh(window, before):
     """A fit from nothing to the curve of a window; diagonal weights, as at every sample."""
     tables = CovarianceTables(FACTORS, LENGTH)
-    slope, slopes = window.slopes()
+    slope, slopes = window.slopes_of_axes_and_taus()
     avar, terms = window.avar(), window.terms()
-    return fit(DESIGN, tables.at(window.n), avar, terms, before, slope * RATE_HZ, slopes * RATE_HZ, full=False)
+    return fit(
+        DESIGN, tables.at(window.samples_in_window), avar, terms, before, slope * RATE_HZ, slopes * RATE_HZ, full=False
+    )
 
 
 @pytest.mark.long
@@ -114,7 +116,7 @@ def test_a_ramp_comes_and_goes_as_a_slope():
     values = simulated(n, RateRamp(R=1e-4))
     course, window, _ = follow(values)
     assert course[-1, 4] == pytest.approx(np.full(6, 1e-4), rel=0.2)
-    np.testing.assert_allclose(course[-1, 4], np.abs(window.slopes()[0]) * RATE_HZ, rtol=1e-6)
+    np.testing.assert_allclose(course[-1, 4], np.abs(window.slopes_of_axes_and_taus()[0]) * RATE_HZ, rtol=1e-6)
 
 
 def test_samples_that_are_missing_keep_their_place():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from drivers.errors import ConfigError
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.hadamard import hadamard_curve
-from monitor.estimation.allan.live_total_hadamard import MIN_SAMPLES, LiveTotalHadamard
+from monitor.estimation.allan.live_total_and_hadamard import MIN_SAMPLES, LiveTotalAndHadamard
 from monitor.estimation.allan.total import total_curve
 from monitor.estimation.allan.window import AllanWindow
 
@@ -50,7 +50,7 @@ def test_equals_the_batch_on_the_window(samples, factors):
     values = made(samples)
     window = AllanWindow(300, factors)
     window.update(values)
-    check(LiveTotalHadamard(window), window, values)
+    check(LiveTotalAndHadamard(window), window, values)
 
 
 @pytest.mark.long
@@ -68,7 +68,7 @@ def test_equals_the_batch_with_gaps_anywhere(samples, holes, skipped, seed):
     window = AllanWindow(200, cluster_sizes(200, 1.0))
     window.update(values)
     window.skip(skipped)
-    check(LiveTotalHadamard(window), window, np.concatenate([values, np.full((skipped, 6), np.nan)]))
+    check(LiveTotalAndHadamard(window), window, np.concatenate([values, np.full((skipped, 6), np.nan)]))
 
 
 @pytest.mark.long
@@ -76,12 +76,12 @@ def test_a_window_with_a_span_for_each_tau_gives_the_same():
     values = made(900)
     window = AllanWindow(500, np.array([1, 4, 4, 16]), np.array([64, 100, 500, 200]))
     window.update(values)
-    check(LiveTotalHadamard(window), window, values)
+    check(LiveTotalAndHadamard(window), window, values)
 
 
 def test_chosen_clusters_wait_until_the_window_holds_them():
     window = AllanWindow(500, cluster_sizes(500, 1.0))
-    slow = LiveTotalHadamard(window, np.array([100, 300, 499]), np.array([150]))
+    slow = LiveTotalAndHadamard(window, np.array([100, 300, 499]), np.array([150]))
     window.update(made(300))
     for _ in range(50):
         slow.step()
@@ -96,7 +96,7 @@ def test_each_step_sees_the_window_of_its_moment_and_a_round_is_handed_over_whol
     values = made(1200)
     window = AllanWindow(400, cluster_sizes(400, 1.0))
     window.update(values[:600])
-    slow = LiveTotalHadamard(window, np.array([2, 300]), np.array([4]))
+    slow = LiveTotalAndHadamard(window, np.array([2, 300]), np.array([4]))
     slow.step()
     window.update(values[600:900])
     slow.step()
@@ -114,7 +114,7 @@ def test_each_step_sees_the_window_of_its_moment_and_a_round_is_handed_over_whol
 
 def test_an_emptied_window_takes_its_results_along():
     window = AllanWindow(400, cluster_sizes(400, 1.0))
-    slow = LiveTotalHadamard(window)
+    slow = LiveTotalAndHadamard(window)
     slow.step()
     window.update(made(400))
     one_round(slow)
@@ -130,7 +130,7 @@ def test_an_emptied_window_takes_its_results_along():
 def test_a_growing_window_is_followed():
     values = made(400)
     window = AllanWindow(400, cluster_sizes(400, 1.0))
-    slow = LiveTotalHadamard(window)
+    slow = LiveTotalAndHadamard(window)
     longest = []
     for start in range(0, 400, 4):
         window.update(values[start : start + 4])
@@ -146,7 +146,7 @@ def test_a_constant_axis_has_no_variance():
     values[:, 5], values[:, 4] = 9.80665, 1.0 / 3.0
     window = AllanWindow(300, cluster_sizes(300, 1.0))
     window.update(values)
-    slow = LiveTotalHadamard(window)
+    slow = LiveTotalAndHadamard(window)
     totals, hadamards = one_round(slow)
     assert (hadamards.hvar == 0.0).all()
     assert (totals.tvar == 0.0).all()
@@ -156,14 +156,14 @@ def test_a_constant_axis_has_no_variance():
 def test_clusters_beyond_what_phase_can_hold_are_left_out():
     length = 200_000
     short = AllanWindow(length, np.array([1]))
-    slow = LiveTotalHadamard(short)
+    slow = LiveTotalAndHadamard(short)
     swing = np.where(np.arange(length) < length // 2, 30.0, -30.0)[:, None] * np.ones(6)
     short.update(swing)
     totals, _ = one_round(slow)
     expected = total_curve(swing, 100.0, THETA, totals.factors)
     assert totals.factors[-1] < length // 100
     np.testing.assert_allclose(totals.tvar, expected.tvar, rtol=1e-9)
-    assert LiveTotalHadamard(AllanWindow(length, cluster_sizes(length, 1.0)))._factors[0][-1] == 131_072
+    assert LiveTotalAndHadamard(AllanWindow(length, cluster_sizes(length, 1.0)))._factors[0][-1] == 131_072
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_clusters_beyond_what_phase_can_hold_are_left_out():
 def test_impossible_clusters_are_refused(totals, hadamards):
     window = AllanWindow(400, np.array([1, 100]))
     with pytest.raises(ConfigError, match="must lie within"):
-        LiveTotalHadamard(window, np.array(totals, np.int64), np.array(hadamards, np.int64))
+        LiveTotalAndHadamard(window, np.array(totals, np.int64), np.array(hadamards, np.int64))
 
 
 def test_the_window_is_only_looked_at():
@@ -184,7 +184,7 @@ def test_the_window_is_only_looked_at():
     assert not phase.flags.writeable
     assert not missing.flags.writeable
     assert unit.shape == (6,)
-    one_round(LiveTotalHadamard(window))
+    one_round(LiveTotalAndHadamard(window))
     assert np.array_equal(window.avar(), before)
     window.update(made(5))  # it still advances
-    assert window.total == 305
+    assert window.samples_since_reset == 305

@@ -2,19 +2,21 @@
 
 Computing both variances for every refit would take too long. Each call of ``step`` computes one τ of one of the two
 variances. A round covers all τ of both variances, by default octaves of the window. The results of a round are returned
-together when the last τ is complete. The samples are not copied, because the sums use the ring of phase of the window
-between two updates by the same thread.
+together when the last τ is complete. The thread that updates the window also calls ``step``, so the sums can read the
+phase of the window without a copy.
 
 The results lag behind the window. A window of 3.6 million samples has 22 averaging times for the total variance and 21
 for the Hadamard variance. With ten steps per second, a round takes 4.3 s, and the oldest value returned by ``get`` is
-between 4.3 and 8.6 s old. This is 0.24 % of the length of the window, which is an hour at 1 kHz. Each value is exact
-for the window at the time of the step that computed the value.
+between 4.3 and 8.6 s old. The largest delay is 0.24 % of the window length, which is an hour at 1 kHz. Each value is
+exact for the window at the time of computation.
 
-Inside the record, the terms of the total variance are terms of the Allan variance. If the window already computes this
-τ over its full length, the sum of the window is used, and only the reflected ends are added.
+Except at the reflected ends, the terms of the total variance are also terms of the Allan variance. If the window
+computes the Allan variance of the same τ over the full length, only the reflected terms are added to the sum of the
+window.
 
-Integer phase can represent the difference of two means over τ up to half of full scale. τ that could exceed 2⁶³ are
-left out. Rounding moves the phase of a constant axis by one or two units; such sums are set to zero.
+Integer phase can represent the difference of two means over τ up to half of full scale. Averaging times at which a
+difference could exceed 2⁶³ are left out. Rounding changes the phase of a constant axis by one or two units, and sums of
+this size are set to zero.
 """
 
 from collections.abc import Iterator
@@ -37,31 +39,31 @@ TOTAL, HADAMARD = 0, 1
 MIN_SAMPLES: Final = 8
 """Minimum number of samples for a round."""
 MOMENTS_RENEWAL_RATIO: Final = 1.02
-"""Ratio of window lengths at which bias and degrees of freedom are recomputed while the window grows."""
+"""Growth of the window after which bias and degrees of freedom are recomputed."""
 MAX_ROUNDING_SQUARE: Final = (9.0, 16.0)
-"""Largest squared difference that rounding alone can make, in squared units of phase, for each statistic.
+"""Largest squared difference that rounding alone can cause, in squared units of phase, for each statistic.
 
-It is the square of half a unit times the sum of the absolute weights, for the second difference of reflected phase and
-for the third difference.
+The limit is the square of half the sum of the absolute weights of a difference. The differences are the second
+difference of reflected phase and the third difference.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class _Result:
-    """One τ of one statistic, for the window at the time of its step."""
+    """Result of one step: one statistic of six axes at one τ."""
 
     variance: Floats  # [6] squared unit of the axis, not corrected for bias
     terms: Ints  # [6] number of terms
     moments: Moments
 
 
-class LiveTotalHadamard:
+class LiveTotalAndHadamard:
     """Total and Hadamard variance of a window, computed in rounds.
 
     Parameters
     ----------
     window : AllanWindow
-        Window to read. It is not changed.
+        Window, which is only read.
     totals : ndarray of int64 or None
         Cluster sizes of the total variance in samples, below the window length. None means octaves.
     hadamards : ndarray of int64 or None
@@ -109,8 +111,8 @@ class LiveTotalHadamard:
         rate_hz : float
             Sample rate in Hz.
         theta : ndarray of float64, shape (5, 6)
-            Fitted Q² N² B² K² R² in SI, see ``coefficient_fit.Fit.theta``. They determine the bias correction and the
-            degrees of freedom.
+            Fitted Q² N² B² K² R² in SI, see ``coefficient_fit.Fit.theta``. The coefficients determine the bias
+            correction and the degrees of freedom.
         """
         if self._last is None:
             return None
@@ -121,9 +123,12 @@ class LiveTotalHadamard:
         )
 
     def _steps(self) -> Iterator[None]:
-        """Run rounds without end, and yield after each step. The window length at its start sets the τ of a round."""
+        """Run rounds in an endless loop, and yield after each step.
+
+        The number of samples at the start of a round determines the τ of the round.
+        """
         while True:
-            n = self._window.n
+            n = self._window.samples_in_window
             totals = [m for m in self._factors[TOTAL] if m < n]
             hadamards = [m for m in self._factors[HADAMARD] if 3 * m <= n]
             if n < MIN_SAMPLES or not totals or not hadamards:
@@ -164,9 +169,9 @@ class LiveTotalHadamard:
         return self._result(HADAMARD, ring.n, m, sums, terms)
 
     def _ring(self) -> tuple[PhaseRing, Floats]:
-        """Return the phase of the window, and the size of one unit of phase [6]."""
+        """Return the phase of the window, and the size of one unit of phase of each axis in SI."""
         phase, missing, first, unit = self._window.view_ring()
-        return PhaseRing(phase, missing, first, self._window.n), unit
+        return PhaseRing(phase, missing, first, self._window.samples_in_window), unit
 
     def _result(self, statistic: int, n: int, m: int, sums: Floats, terms: Ints) -> _Result:
         """Convert the sums of one statistic at one cluster size to variances."""

@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from monitor.estimation.missing_samples import count_missing_samples
+from monitor.estimation.missing_sample_count import count_missing_samples
 
 NONE = np.array([], np.int64)
 

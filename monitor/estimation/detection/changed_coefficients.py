@@ -43,7 +43,7 @@ PEAK_F_TAU: Final = 0.371
 
 
 @dataclass(frozen=True, slots=True)
-class Octaves:
+class HaarVariancesBeforeAfter:
     """Haar variances of one axis before and after a change, arrays [J]; octave j has clusters of 2^j samples."""
 
     before: Floats  # variance, squared unit of the axis
@@ -52,25 +52,25 @@ class Octaves:
     n_after: Floats  # number of terms, divided by their spread F
 
     @property
-    def usable(self) -> np.ndarray:
+    def usable_octaves(self) -> np.ndarray:
         """True for octaves with enough terms before and after the change."""
         return (self.n_after >= MIN_TERMS) & (self.n_before >= MIN_TERMS) & (self.before > 0.0)
 
     def evidence(self) -> float:
         """Return the log likelihood ratio of "each octave changed" over "none changed", minus its mean by chance."""
-        ok = self.usable & (self.after > 0.0)
+        ok = self.usable_octaves & (self.after > 0.0)
         n0, n1, v0, v1 = self.n_before[ok], self.n_after[ok], self.before[ok], self.after[ok]
         pooled = (n0 * v0 + n1 * v1) / (n0 + n1)
         gained = 0.5 * ((n0 + n1) * np.log(pooled) - n0 * np.log(v0) - n1 * np.log(v1))
         return float(max(gained.sum() - 0.5 * ok.sum(), 0.0))
 
 
-def identify_noise_change(octaves: Octaves, rate_hz: float) -> dict[str, tuple[float, float]]:
+def identify_noise_change(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> dict[str, tuple[float, float]]:
     """Return the coefficients that changed, or the frequency band if no coefficient explains the change.
 
     Parameters
     ----------
-    octaves : Octaves
+    octaves : HaarVariancesBeforeAfter
         Variances before and after the change.
     rate_hz : float
         Sample rate in Hz.
@@ -82,7 +82,7 @@ def identify_noise_change(octaves: Octaves, rate_hz: float) -> dict[str, tuple[f
         in Hz, and ``rms`` the Haar deviation before and after at the octave that changed most. Empty if no octave has
         enough terms.
     """
-    ok = octaves.usable
+    ok = octaves.usable_octaves
     if not ok.any():
         return {}
     tau0 = 1.0 / rate_hz

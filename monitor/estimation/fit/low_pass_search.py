@@ -136,7 +136,7 @@ def power_spectrum(rates: Floats) -> Floats:
     return np.asarray((turned.real**2 + turned.imag**2).mean(axis=0))
 
 
-def is_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
+def is_seen_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
     """Return True if a spectrum falls beyond the cutoff as expected behind the filter.
 
     Medians are compared, so that spectral lines do not matter.
@@ -160,7 +160,7 @@ def is_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
     )
 
 
-def with_bandwidth(
+def apply_low_passes(
     design: Design, table: CovarianceTable, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
 ) -> tuple[Fit, list[LowPass | None]]:
     """Replace the fit of each contradicted axis by a fit with its low-pass, if the low-pass explains the curve.
@@ -277,16 +277,18 @@ def search_low_pass(
             column = LowPass(kind, order, float(np.exp(log_cutoff))).avar(design.factors)
             return float(fit_columns(_with_noise_column(design, column), table, measured).scatter[0])
 
-        least, log_cutoff = yield from yield_in_pieces(
+        least, log_cutoff = yield from _yield_after_several_steps(
             golden_section(of, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE)
         )
         found.append((least, LowPass(kind, order, float(np.exp(log_cutoff)))))
         yield
     least, low_pass = min(found, key=lambda one: one[0])
-    return low_pass if least < MAX_SCATTER and is_in_spectrum(low_pass, power) else None
+    return low_pass if least < MAX_SCATTER and is_seen_in_spectrum(low_pass, power) else None
 
 
-def yield_in_pieces(search: Generator[None, None, tuple[float, float]]) -> Generator[None, None, tuple[float, float]]:
+def _yield_after_several_steps(
+    search: Generator[None, None, tuple[float, float]],
+) -> Generator[None, None, tuple[float, float]]:
     """Run a search and yield after every ``REFINED_CUTOFFS_PER_STEP`` of its steps."""
     steps = 0
     while True:
