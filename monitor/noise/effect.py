@@ -47,7 +47,7 @@ class SampleBlockContext:
 class RunningEffect:
     """Effect that is being simulated on one axis."""
 
-    def truth(self) -> dict[str, Any]:
+    def drawn_values(self) -> dict[str, Any]:
         """Return the random values drawn so far that the parameters do not contain."""
         return {}
 
@@ -83,7 +83,7 @@ class NoiseSeries(RunningEffect, ABC):
         return values
 
 
-class FunctionSeries(NoiseSeries):
+class StatelessSeries(NoiseSeries):
     """Series without a state: a function adds the samples of a block."""
 
     def __init__(self, function: Callable[[Floats, SampleBlockContext], object]) -> None:
@@ -301,12 +301,12 @@ def parameter(
     return field(default=None, metadata=metadata) if optional else field(metadata=metadata)
 
 
-def source_axis() -> Any:
+def source_axis_field() -> Any:
     """Return a dataclass field that names another axis."""
     return field(metadata={"units": ("axis", "axis"), "axis": True})
 
 
-def parameter_units(table: type[ParameterTable]) -> Mapping[str, tuple[str, str]]:
+def gyro_and_accel_units(table: type[ParameterTable]) -> Mapping[str, tuple[str, str]]:
     """Return the unit of every parameter of an effect, on a gyroscope and on an accelerometer."""
     return {f.name: f.metadata["units"] for f in fields(table)}  # type: ignore[arg-type]
 
@@ -316,7 +316,7 @@ def required_parameters(table: type[ParameterTable]) -> tuple[str, ...]:
     return tuple(f.name for f in fields(table) if f.default is MISSING)  # type: ignore[arg-type]
 
 
-def first_sample(time_s: float, rate_hz: float) -> int:
+def first_sample_index(time_s: float, rate_hz: float) -> int:
     """Return the index of the first sample at or after a time. A millionth of a sample is allowed for rounding.
 
     Parameters

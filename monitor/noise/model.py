@@ -21,7 +21,7 @@ from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
-from monitor.noise.model_file import error_location, format_model, format_table, parse_model
+from monitor.noise.model_file import error_location, format_display_table, format_model, parse_model
 from monitor.noise.simulation import ModelStream, check_effects
 from monitor.noise.spectrum import Spectrum, undefined_spectrum, zero_spectrum
 from monitor.noise.temperature import Temperature
@@ -92,10 +92,10 @@ class NoiseModel:
         return NoiseModel(added, self.sample_rate_hz or other.sample_rate_hz, self.temperature or other.temperature)
 
     def __str__(self) -> str:
-        return format_table(self.effects, self.sample_rate_hz, self.temperature)
+        return format_display_table(self.effects, self.sample_rate_hz, self.temperature)
 
     @property
-    def rate_ratio(self) -> float:
+    def true_to_stated_rate(self) -> float:
         """Return the true sample rate divided by the stated one."""
         return self._clock.ratio
 
@@ -144,7 +144,7 @@ class NoiseModel:
         tau0_s : float
             Stated sample interval, s.
         """
-        true_s = tau0_s / self.rate_ratio
+        true_s = tau0_s / self.true_to_stated_rate
         leaking: dict[str, float] = {}
         for effect in self.effects.get(axis, ()):
             if isinstance(effect, Leak):
@@ -152,7 +152,7 @@ class NoiseModel:
         total = self._own(axis, true_s)
         for source, coefficient in leaking.items():
             total += self._measured(source, self._own(source, true_s)).scaled(coefficient)
-        return self._clock.restated(self._measured(axis, total))
+        return self._clock.restate_spectrum(self._measured(axis, total))
 
     def _own(self, axis: str, tau0_s: float) -> Spectrum:
         """Return the spectrum of the axis' own sources."""
@@ -193,7 +193,7 @@ class NoiseModel:
         ConfigError
             If ``check_effects`` finds a mistake.
         """
-        check_effects(self.effects, rate_hz * self.rate_ratio, temperature)
+        check_effects(self.effects, rate_hz * self.true_to_stated_rate, temperature)
 
     def stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> ModelStream:
         """Return an endless series of six axes. The same rate and seed give the same series.
@@ -212,7 +212,7 @@ class NoiseModel:
         ConfigError
             If ``check_effects`` finds a mistake.
         """
-        return ModelStream(self.effects, self.temperature, rate_hz, self.rate_ratio, seed, temperature_c)
+        return ModelStream(self.effects, self.temperature, rate_hz, self.true_to_stated_rate, seed, temperature_c)
 
     def simulate(self, n: int, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> Floats:
         """Return the first ``n`` samples [n, 6] of ``stream``, in rad/s and m/s².

@@ -14,7 +14,7 @@ from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.quantities import RATE_HZ
 from drivers.sample import AXES
-from monitor.noise.effect import GYROS, Effect, ParameterTable, parameter_units, required_parameters
+from monitor.noise.effect import GYROS, Effect, ParameterTable, gyro_and_accel_units, required_parameters
 from monitor.noise.effects import EFFECTS
 from monitor.noise.temperature import Temperature
 from monitor.settings import toml_text
@@ -89,7 +89,7 @@ def format_model(
     return "\n".join(lines).lstrip() + "\n"
 
 
-def format_table(
+def format_display_table(
     axis_effects: Mapping[str, tuple[Effect, ...]], sample_rate_hz: float | None, temperature: Temperature | None
 ) -> str:
     """Return a table for display, with one line per effect: axis, name, and parameters with units.
@@ -129,7 +129,7 @@ def _format_parameters(table: ParameterTable, axis: str = GYROS[0]) -> str:
     """Return the parameters of a table with their units on an axis."""
     texts = []
     for name, value in _set_fields(table):
-        unit = parameter_units(type(table))[name][axis not in GYROS]
+        unit = gyro_and_accel_units(type(table))[name][axis not in GYROS]
         number = value if isinstance(value, str) else format(value, "g")
         texts.append(f"{name} = {number}" + ("" if unit in ("1", "axis") else f" {unit}"))
     return ", ".join(texts)
@@ -170,7 +170,7 @@ def _parse_axis(axis: str, effects: Any, mistakes: list[str]) -> Iterator[Effect
 
 def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
     """Return the effect or the temperature of one table."""
-    known = tuple(parameter_units(kind))
+    known = tuple(gyro_and_accel_units(kind))
     if not isinstance(parameters, dict):
         raise ConfigError(f"{place} must be a table with {', '.join(known)}")
     mistakes = [

@@ -82,7 +82,7 @@ class RandomEvents:
             self._listed.append(((self._first_index + float(when[one])) / self._rate_hz, float(size[one])))
         return np.ceil(when - (first - self._first_index)).astype(np.int64), size
 
-    def truth(self, size: str | None = None) -> dict[str, Any]:
+    def drawn_values(self, size: str | None = None) -> dict[str, Any]:
         """Return the number of events, and the times of the listed events in seconds since the start of the stream.
 
         If ``size`` is given, the sizes of the listed events are returned under this key.

@@ -32,7 +32,7 @@ from monitor.noise.effect import (
     SampleBlockContext,
     Source,
     Transform,
-    first_sample,
+    first_sample_index,
 )
 from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
@@ -95,7 +95,7 @@ class ModelStream:
         Simulated temperature.
     rate_hz : float
         Stated sample rate, Hz.
-    rate_ratio : float
+    true_to_stated_rate : float
         True sample rate divided by the stated one.
     seed : int
         Seed of the random generators.
@@ -113,13 +113,13 @@ class ModelStream:
         axis_effects: Mapping[str, tuple[Effect, ...]],
         temperature: Temperature | None,
         rate_hz: float,
-        rate_ratio: float,
+        true_to_stated_rate: float,
         seed: int,
         temperature_c: Floats | None = None,
     ) -> None:
-        check_effects(axis_effects, rate_hz * rate_ratio, temperature_c is not None or temperature is not None)
+        check_effects(axis_effects, rate_hz * true_to_stated_rate, temperature_c is not None or temperature is not None)
         self._effects = {axis: axis_effects.get(axis, ()) for axis in AXES}
-        self._true_hz = rate_hz * rate_ratio
+        self._true_hz = rate_hz * true_to_stated_rate
         self._seed = seed
         self._count = 0  # number of samples drawn so far
         self._occurrences: Counter[tuple[str, str]] = Counter()
@@ -175,7 +175,7 @@ class ModelStream:
         self._effects = effects
         self._begin(axis, effect)
 
-    def truth(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
+    def drawn_values(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
         """Return the randomly drawn values so far: axis -> effect -> one dictionary for each effect of that name.
 
         The values are phases, counts, and times in s from the start, ready for JSON. Effects that their parameters
@@ -183,7 +183,7 @@ class ModelStream:
         """
         truths: dict[str, dict[str, list[dict[str, Any]]]] = {}
         for axis, effect, running in self._truths:
-            if truth := running.truth():
+            if truth := running.drawn_values():
                 truths.setdefault(axis, {}).setdefault(effect.name, []).append(truth)
         return truths
 
@@ -197,7 +197,7 @@ class ModelStream:
             (line.white if isinstance(effect, AngleRandomWalk) else line.others).append(series)
             self._truths.append((axis, effect, series))
         elif isinstance(effect, NoiseStep):
-            line.steps.append((first_sample(effect.time, self._true_hz), effect.ratio))
+            line.steps.append((first_sample_index(effect.time, self._true_hz), effect.ratio))
         elif isinstance(effect, Leak):
             line.leak(effect)
             self._axes[effect.source].leaks_out = True
@@ -222,7 +222,11 @@ class ModelStream:
             temperature_c[:] = 0.0
             self._temperature.add(temperature_c, block)
         sums = {axis: line.sum(block, n) for axis, line in self._axes.items()}
-        alone = {axis: line.measure_alone(sums[axis]) for axis, line in self._axes.items() if line.alone}
+        alone = {
+            axis: line.measure_without_leaks(sums[axis])
+            for axis, line in self._axes.items()
+            if line.needs_leak_free_measurement
+        }
         for column, (axis, line) in enumerate(self._axes.items()):
             values[:, column] = line.measure(sums[axis], alone)
         self._count += n
@@ -243,7 +247,7 @@ class _AxisSimulator:
         self._alone: list[tuple[int, RunningTransform]] = []
 
     @property
-    def alone(self) -> bool:
+    def needs_leak_free_measurement(self) -> bool:
         """True if the measurement without leaks is needed now, or may be needed later by transforms with a state."""
         return self.leaks_out or bool(self.leaks)
 
@@ -272,7 +276,7 @@ class _AxisSimulator:
             series.add(values, block)
         return values
 
-    def measure_alone(self, own: Floats) -> Floats:
+    def measure_without_leaks(self, own: Floats) -> Floats:
         """Return the measurement without leaks. It is computed in place if nothing leaks into the
         axis, else on a copy."""
         if not self.leaks:
@@ -285,7 +289,7 @@ class _AxisSimulator:
             for leak in self.leaks:
                 own += leak.coefficient * alone[leak.source]
         elif self.leaks_out:
-            return own  # already transformed by ``measure_alone``
+            return own  # already transformed by ``measure_without_leaks``
         return _apply_transforms(self._chain, own)
 
 

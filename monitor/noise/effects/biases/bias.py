@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from monitor.noise.effect import FunctionSeries, Source, parameter
+from monitor.noise.effect import Source, StatelessSeries, parameter
 from monitor.noise.spectrum import Spectrum, zero_spectrum
 
 
@@ -25,6 +25,6 @@ class Bias(Source):
         """Return a spectrum that has only a constant level."""
         return replace(zero_spectrum(tau0_s), level=self.value)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> FunctionSeries:
+    def start(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
         """Return a constant series."""
-        return FunctionSeries(lambda values, block: np.add(values, self.value, out=values))
+        return StatelessSeries(lambda values, block: np.add(values, self.value, out=values))

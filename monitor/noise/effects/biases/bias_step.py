@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import FunctionSeries, SampleBlockContext, Source, first_sample, parameter
+from monitor.noise.effect import SampleBlockContext, Source, StatelessSeries, first_sample_index, parameter
 from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
 
@@ -27,11 +27,11 @@ class BiasStep(Source):
         """Return NaN, because the effect of a single step depends on the length of the recording."""
         return undefined_spectrum(tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> FunctionSeries:
+    def start(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
         """Return a series in which ``time`` counts from the first sample of the stream."""
-        first = first_sample(self.time, rate_hz)
+        first = first_sample_index(self.time, rate_hz)
 
         def add(values: Floats, block: SampleBlockContext) -> None:
             values[max(0, first - block.first) :] += self.height
 
-        return FunctionSeries(add)
+        return StatelessSeries(add)

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import FunctionSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import SampleBlockContext, Source, StatelessSeries, parameter
 from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
 
@@ -29,11 +29,11 @@ class TemperatureBias(Source):
         """Return NaN, because the spectrum depends on the temperature."""
         return undefined_spectrum(tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> FunctionSeries:
+    def start(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
         """Return a series that is a function of the temperature of each sample."""
 
         def add(values: Floats, block: SampleBlockContext) -> None:
             warmer = block.temperature_c - self.reference
             values += (self.coefficient + (self.quadratic or 0.0) * warmer) * warmer
 
-        return FunctionSeries(add)
+        return StatelessSeries(add)

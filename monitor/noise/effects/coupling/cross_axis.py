@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from drivers.errors import ConfigError
-from monitor.noise.effect import GYROS, Leak, parameter, source_axis
+from monitor.noise.effect import GYROS, Leak, parameter, source_axis_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class CrossAxis(Leak):
     drivers.errors.ConfigError: cross_axis: source must be another axis than gx itself
     """
 
-    source: str = source_axis()
+    source: str = source_axis_field()
     coefficient: float = parameter("1", signed=True)
 
     description: ClassVar[str] = "The axis is not square to its neighbour and reads a little of it."

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from drivers.errors import ConfigError
-from monitor.noise.effect import ACCELEROMETERS, GYROS, Leak, parameter, source_axis
+from monitor.noise.effect import ACCELEROMETERS, GYROS, Leak, parameter, source_axis_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -18,7 +18,7 @@ class GSensitivity(Leak):
     drivers.errors.ConfigError: g_sensitivity: belongs on a gyroscope, not on ax
     """
 
-    source: str = source_axis()
+    source: str = source_axis_field()
     coefficient: float = parameter("rad/s per m/s²", "1", signed=True)
 
     description: ClassVar[str] = "The gyroscope feels acceleration: gravity and vibration shift its reading."

@@ -49,5 +49,5 @@ class _IsolatedErrors(NoiseSeries):
         when, errors = self._events.take(block.first, values.size)
         values[when] += errors
 
-    def truth(self) -> dict[str, Any]:
-        return self._events.truth("errors")
+    def drawn_values(self) -> dict[str, Any]:
+        return self._events.drawn_values("errors")

@@ -58,5 +58,5 @@ class _RandomSteps(NoiseSeries):
             self._level += jump
             values[begin:end] += self._level
 
-    def truth(self) -> dict[str, Any]:
-        return self._events.truth("heights")
+    def drawn_values(self) -> dict[str, Any]:
+        return self._events.drawn_values("heights")

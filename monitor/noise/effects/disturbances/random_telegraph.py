@@ -61,5 +61,5 @@ class _TwoLevels(NoiseSeries):
             self._level = -self._level
         self._level = -self._level  # The loop also switches at the end of a block, which is no event.
 
-    def truth(self) -> dict[str, Any]:
-        return {"first_level": self._first_level, **self._flips.truth()}
+    def drawn_values(self) -> dict[str, Any]:
+        return {"first_level": self._first_level, **self._flips.drawn_values()}

@@ -56,7 +56,7 @@ class _Sinusoid(NoiseSeries):
     def add(self, values: Floats, block: SampleBlockContext) -> None:
         _add_sinusoid(values, block.first, self._amplitude, self._step, self._phase)
 
-    def truth(self) -> dict[str, Any]:
+    def drawn_values(self) -> dict[str, Any]:
         return {"phase": self._phase} if self._drawn else {}
 
 

@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
-class SampleHold(Transform):
+class RandomSampleHold(Transform):
     """Random repetition of samples: each sample repeats, with probability h, the sample before.
 
     The age of the value that is read has a geometric distribution. On average, the output is the input through G = (1 −
@@ -21,7 +21,7 @@ class SampleHold(Transform):
     variance is an integral over this spectrum.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
-    >>> held = SampleHold(fraction=0.5).transform_spectrum(white_noise_spectrum(1.0, 0.01))
+    >>> held = RandomSampleHold(fraction=0.5).transform_spectrum(white_noise_spectrum(1.0, 0.01))
     >>> print(f"{held.avar(np.array([0.01]))[0]:.3f}")  # r(0) − r(1) of white_noise_spectrum noise held: 1 − h
     0.500
     """
@@ -66,7 +66,7 @@ class _RepeatedSamples(RunningTransform):
         self._last, held = _repeat_samples(values, tosses, self._fraction, self._last)
         self._repeat_count += held
 
-    def truth(self) -> dict[str, Any]:
+    def drawn_values(self) -> dict[str, Any]:
         return {"count": self._repeat_count}
 
 

@@ -20,7 +20,7 @@ class SampleRateError(Transform):
     be equal.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
-    >>> stated = SampleRateError(ratio=2.0).restated(white_noise_spectrum(1.0, 0.005))
+    >>> stated = SampleRateError(ratio=2.0).restate_spectrum(white_noise_spectrum(1.0, 0.005))
     >>> stated.tau0_s, float(stated.avar(np.array([0.01]))[0])
     (0.01, 1.0)
     """
@@ -30,10 +30,10 @@ class SampleRateError(Transform):
     description: ClassVar[str] = "The clock is off: what happens at one frequency is seen at another."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum unchanged; ``restated`` converts its time scale after all transforms."""
+        """Return the spectrum unchanged; ``restate_spectrum`` converts its time scale after all transforms."""
         return spectrum
 
-    def restated(self, spectrum: Spectrum) -> Spectrum:
+    def restate_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum of samples at the true rate, converted to the time scale that the recording states."""
         r, closed = self.ratio, spectrum.closed_form_avar
         return Spectrum(

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from drivers import file_access
 from drivers.errors import ConfigError
-from monitor.common.config_files import model_path
+from monitor.common.shipped_file_paths import model_path
 from monitor.noise.model import NoiseModel
 
 
