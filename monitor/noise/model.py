@@ -1,9 +1,10 @@
 """Noise model of an IMU: the effects of each axis in one object, for fit, simulation and comparison.
 
 Sources and leaks of an axis add up. Its transforms act on the sum in the order of ``TRANSFORM_ORDER``. ``avar`` and
-``psd`` describe the whole axis, including linear transforms and leaks. They use closed forms where these exist, and one
-integral after a filter. They are NaN if they depend on something that a model does not contain, such as temperature,
-the length of a recording, or the position of a rate between two quantisation steps.
+``psd`` describe the whole axis, including linear transforms and leaks. Closed forms are used where they exist. After a
+filter, the Allan variance is an integral over the spectrum. The result is NaN if it depends on a quantity that a model
+does not contain. Examples are the temperature, the length of a recording, and the position of a rate between two
+quantisation steps.
 
 ``model_file`` converts a model to text and back. ``simulation`` generates time series.
 """
@@ -80,8 +81,8 @@ class NoiseModel:
                 yield axis, effect
 
     def __add__(self, other: "NoiseModel") -> "NoiseModel":
-        """Return a model with the effects of both. Sample rate and temperature come from the first
-        model that has them."""
+        """Return a model with the effects of both models. Sample rate and temperature are those of the first model that
+        has them."""
         if not isinstance(other, NoiseModel):
             return NotImplemented
         added = {
@@ -96,7 +97,7 @@ class NoiseModel:
 
     @property
     def true_to_stated_rate(self) -> float:
-        """Return the true sample rate divided by the stated one."""
+        """Return the true sample rate divided by the stated sample rate."""
         return self._clock.ratio
 
     @property
@@ -135,7 +136,7 @@ class NoiseModel:
         return self.spectrum(axis, tau0_s).density(np.asarray(f_hz, np.float64))
 
     def spectrum(self, axis: str, tau0_s: float) -> Spectrum:
-        """Return density, lines and slope of one axis as measured.
+        """Return the spectrum of one axis after leaks and transforms.
 
         Parameters
         ----------

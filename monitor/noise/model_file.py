@@ -1,8 +1,8 @@
 """Model files: conversion of TOML text to effects and back, and a table for display.
 
 A model file has ``sample_rate`` (Hz), optionally ``[temperature]``, and one table per axis. Each axis has one table per
-effect, or an array of tables if an effect occurs twice. ``g*`` and ``a*`` stand for all axes of a kind. Every mistake
-gives one line of a ConfigError, which names the place in the file and the nearest known word.
+effect, or an array of tables if an effect occurs several times. ``g*`` and ``a*`` stand for all axes of a kind. A
+ConfigError has one line for each mistake. The line names the table and suggests the nearest known word.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ TOP_LEVEL_KEYS: Final = ("sample_rate", "temperature")
 """Other keys of a model file."""
 
 AxisEffects = tuple[tuple[str, ...], tuple[Effect, ...]]
-"""Names of axes, and the effects that each of them has."""
+"""Names of axes, and the effects of each of these axes."""
 
 
 def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature | None]:
@@ -94,7 +94,7 @@ def format_display_table(
 ) -> str:
     """Return a table for display, with one line per effect: axis, name, and parameters with units.
 
-    Sample rate and temperature stand above the table. The arguments are those of ``format_model``.
+    Sample rate and temperature are printed above the table. The arguments are those of ``format_model``.
     """
     head = [] if sample_rate_hz is None else [f"sample rate {sample_rate_hz:g} Hz"]
     if temperature is not None:
@@ -169,7 +169,7 @@ def _parse_axis(axis: str, effects: Any, mistakes: list[str]) -> Iterator[Effect
 
 
 def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
-    """Return the effect or the temperature of one table."""
+    """Return the effect or the temperature model that one table describes."""
     known = tuple(gyro_and_accel_units(kind))
     if not isinstance(parameters, dict):
         raise ConfigError(f"{place} must be a table with {', '.join(known)}")
@@ -178,7 +178,7 @@ def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
         for name in parameters
         if name not in known
     ]
-    # A misspelt parameter is also missing, but one line is enough.
+    # A misspelt parameter would otherwise be reported twice: as unknown and as missing.
     mistakes = mistakes or [
         f"{place}: {name} is missing" for name in required_parameters(kind) if name not in parameters
     ]

@@ -1,7 +1,7 @@
-"""Events at random samples: gaps and sizes that are drawn in batches, and returned by sample index.
+"""Events at random samples. Gaps and sizes of the events are drawn in batches.
 
-All batches have one length, so the events do not depend on the division into blocks. The first events are listed with
-their times for the truth of a simulation. All events are counted.
+All batches have the same length, so the events do not depend on the division into blocks. All events are counted. The
+times of the first events are stored for the truth file of a simulation.
 """
 
 from collections.abc import Callable
@@ -29,8 +29,8 @@ class RandomEvents:
     rate_hz : float
         Sample rate in Hz, for the times in ``truth``.
     before : float
-        Sample index at which the first gap begins. It is -1 if gaps are whole numbers and the first sample may be an
-        event.
+        Sample index at which the first gap begins. The value -1 allows an event at sample 0 if gaps are whole numbers
+        of at least 1.
     """
 
     def __init__(

@@ -17,7 +17,7 @@ from monitor.noise.effects.ieee952.exponentially_correlated import Exponentially
 from monitor.noise.effects.ieee952.sinusoidal import Sinusoidal
 
 PAIRS: Final = (("swing", "period"), ("wander", "wander_time"))
-"""Parameters that need each other."""
+"""Pairs of parameters that must be given together."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,5 @@
-"""Effects of a noise model, one per file, in a folder per family. In model files an effect has the name of its file."""
+"""Effects of a noise model, one per file, in a folder per family. The name of the file is the name of the effect in
+model files."""
 
 from typing import Final
 
@@ -37,8 +38,8 @@ TRANSFORM_ORDER: Final[tuple[type[Transform], ...]] = (
     Resolution,
     RandomSampleHold,
 )
-"""Order in which transforms act, whatever their order in the model. Two transforms of one kind act in the order of the
-model."""
+"""Order in which transforms act, independent of their order in the model. Two transforms of the same kind act in the
+order of the model."""
 
 _ALL: Final[tuple[type[Effect], ...]] = (
     Bias,

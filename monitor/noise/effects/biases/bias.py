@@ -11,7 +11,8 @@ from monitor.noise.spectrum import Spectrum, zero_spectrum
 
 @dataclass(frozen=True, slots=True)
 class Bias(Source):
-    """Constant bias, without Allan variance or spectrum. The share of gravity on an accelerometer is also a bias.
+    """Constant bias. Its Allan variance and its spectrum are zero. Gravity on an accelerometer axis is simulated as a
+    bias.
 
     >>> Bias(value=9.8).spectrum(0.01).level
     9.8

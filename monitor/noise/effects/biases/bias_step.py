@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
 @dataclass(frozen=True, slots=True)
 class BiasStep(Source):
-    """Step of the bias: zero before ``time``, ``height`` from the first sample at or after ``time``.
+    """Step of the bias by ``height``, from the first sample at or after ``time``.
 
     >>> bool(np.isnan(BiasStep(time=60.0, height=1e-3).avar(np.array([1.0]), 0.01)[0]))
     True

@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
 @dataclass(frozen=True, slots=True)
 class TemperatureBias(Source):
-    """Polynomial of second order in temperature, as in the error model of IEEE Std 952: b = c (T − T_r) + q (T − T_r)².
+    """Bias that is a polynomial of second order in temperature: b = c (T − T_r) + q (T − T_r)² (IEEE Std 952).
 
     >>> bool(np.isnan(TemperatureBias(coefficient=1e-4, reference=25.0).psd(np.array([1.0]), 0.01)[0]))
     True

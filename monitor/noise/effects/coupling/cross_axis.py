@@ -9,8 +9,8 @@ from monitor.noise.effect import GYROS, Leak, parameter, source_axis_field
 
 @dataclass(frozen=True, slots=True)
 class CrossAxis(Leak):
-    """Leak y += c·x, where x is the measurement of the axis ``source`` without leaks (IEEE Std 1293: cross-axis
-    sensitivity).
+    """Cross-axis sensitivity (IEEE Std 1293): the measurement changes by c·x. x is the measurement of the axis
+    ``source`` without leaks.
 
     >>> CrossAxis(source="gx", coefficient=0.02).check_axis("gx")
     Traceback (most recent call last):

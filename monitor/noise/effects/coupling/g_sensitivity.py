@@ -9,9 +9,9 @@ from monitor.noise.effect import ACCELEROMETERS, GYROS, Leak, parameter, source_
 
 @dataclass(frozen=True, slots=True)
 class GSensitivity(Leak):
-    """Leak of acceleration ω += c·a (IEEE Std 952: g-sensitive drift).
+    """g-sensitive drift (IEEE Std 952): the rate changes by c·a.
 
-    a is the measurement of the accelerometer ``source`` without leaks.
+    a is the measurement of the accelerometer axis ``source`` without leaks.
 
     >>> GSensitivity(source="az", coefficient=1e-5).check_axis("ax")
     Traceback (most recent call last):
