@@ -19,7 +19,7 @@ import typer
 
 from monitor.cli import (
     analyze,
-    check,
+    check_config,
     compensate,
     demo,
     doctor,
@@ -27,13 +27,13 @@ from monitor.cli import (
     history,
     reconcile,
     run,
-    simulate,
+    simulate_recording,
     thermal,
     view,
     warm_up,
     watch,
 )
-from monitor.cli.shared.errors import DEBUG, INTERRUPTED, explain
+from monitor.cli.shared.errors import DEBUG, INTERRUPTED, message_and_status
 
 # This must precede the import of NumPy. The matrices are small, and the program has its own threads for the work.
 # Additional threads of the linear algebra libraries would only wait actively.
@@ -77,13 +77,13 @@ def options_of_all_commands(
 for _command in (
     demo.demo,
     run.run,
-    check.check,
+    check_config.check,
     doctor.doctor,
     warm_up.warm_up,
     watch.watch,
     view.view,
     analyze.analyze,
-    simulate.simulate,
+    simulate_recording.simulate,
     reconcile.reconcile,
     compensate.compensate,
     history.history,
@@ -115,7 +115,7 @@ def main() -> None:
     except Exception as error:  # noqa: BLE001 - any other error is printed in one line, with a request to report it
         if debug:
             traceback.print_exc()
-        line, status = explain(error)
+        line, status = message_and_status(error)
         if isinstance(error, OSError):
             _discard_output()
         if not isinstance(error, BrokenPipeError):  # the reader of the output has gone, so a message is useless
@@ -142,7 +142,7 @@ def report_failed_thread(debug: bool, failed: threading.ExceptHookArgs) -> None:
         if debug:
             traceback.print_exception(error)
         thread = "a thread" if failed.thread is None else f'thread "{failed.thread.name}"'
-        print(f"imu-monitor: {thread} ended: {explain(error)[0]}", file=sys.stderr, flush=True)  # noqa: T201
+        print(f"imu-monitor: {thread} ended: {message_and_status(error)[0]}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 def _ignore_impossible_width(environment: MutableMapping[str, str]) -> None:

@@ -94,7 +94,7 @@ def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) 
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
     for option, place in (("--json", json), ("--out", out), ("--plot", plot)):
-        output.check_place(option, place)
+        output.check_output_folder(option, place)
     if out is not None:
         find_format(out)
 
@@ -107,7 +107,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
     if json is not None:
         newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
         message = HistoryMessage.reply(past, asked, newest_s, int(past.counts[:, 0].sum()))
-        output.write("--json", json, message.encode() + b"\n")
+        output.write_bytes("--json", json, message.encode() + b"\n")
     if out is not None:
         history_file.save_history(past, out)
     if plot is not None:

@@ -25,7 +25,7 @@ def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True
         )
     cold = [group for group in kernel_parts.GROUPS if not kernel_compilation.is_warm(group)]
     begun_s = time.monotonic()
-    with output.progress() as show:
+    with output.show_progress() as show:
 
         def tell(progress: kernel_compilation.Progress) -> None:
             show(str(progress), progress.share)

@@ -18,7 +18,7 @@ import numpy as np
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
 from drivers.sample import AXES, Ints, SampleBlock
-from monitor.drift.thermal.temperature_share import TemperatureShare, remove_temperature, temperature_varied
+from monitor.drift.thermal.temperature_removal import TemperatureRemoval, remove_temperature, temperature_varied
 from monitor.estimation.allan.batch import TauGrid
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
@@ -71,7 +71,7 @@ class Results:
     hadamard: HadamardCurve | None = None
     dynamic: DynamicAllan | None = None
     lacking: str = ""  # reason why requested dynamic curves are missing
-    without_temperature: TemperatureShare | None = (
+    without_temperature: TemperatureRemoval | None = (
         None  # coefficients without the effect of temperature, if it explains any axis
     )
 
@@ -165,7 +165,7 @@ def draw_plots(results: Results, path: Path, title: str) -> None:
 
 def _without_temperature(
     result: Analysis, blocks: Sequence[SampleBlock], rate_hz: float | None
-) -> TemperatureShare | None:
+) -> TemperatureRemoval | None:
     """Return the coefficients without the effect of temperature; None if the temperature is missing or constant."""
     if not temperature_varied(np.concatenate([samples.temperature_c for samples in blocks])):
         return None

@@ -122,7 +122,7 @@ def _run(live: Compensator, values: Floats, tell: ProgressCallback) -> Floats:
     size = live.interval_samples
     for start in range(0, len(values), size):
         out[start : start + size] = live.compensate(values[start : start + size])
-        live.identify()
+        live.identify_due_models()
         if start % (256 * size) == 0:
             tell("compensating", start / len(values))
     return out
@@ -170,7 +170,9 @@ def _evaluate_axis(
     model = live.models[at]
     became = np.array([one.outcome[at] for one in intervals])
     return AxisCompensation(
-        model=None if model is None else fit_arma(*live.identification_data(at), [model.order], intervals=True),
+        model=None
+        if model is None
+        else fit_arma(*live.identification_means_and_variance(at), [model.order], intervals=True),
         uncompensated=score_at_rest(np.where(judged[:, at], before, np.nan)[first:], live.rate_hz),
         compensated=score_at_rest(np.where(judged[:, at], out[:, at], np.nan)[first:], live.rate_hz),
         rejected_intervals=int((became == REJECTED).sum()),

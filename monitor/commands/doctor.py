@@ -33,7 +33,7 @@ from drivers.extras import find_missing_packages
 from drivers.links.can_link import describe_missing_package
 from drivers.links.replay_link import ReplayLink
 from drivers.number_ranges import DAY_S
-from monitor.commands.check import check
+from monitor.commands.check_config import check_configuration
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, lock_holder
 from monitor.settings.file_permissions import contains_secret
 from monitor.settings.loading import Config, Storage
@@ -81,10 +81,16 @@ class Finding:
 
 def examine(path: Path | None = None) -> list[Finding]:
     """Check the machine, and the configuration if a path is given."""
-    found = [*check_libraries(), *check_packages(sys.path), *_check_kernels(), *check_clock(), *_check_systemd_unit()]
+    found = [
+        *check_library_versions(),
+        *check_shadowed_packages(sys.path),
+        *_check_kernels(),
+        *check_clock(),
+        *_check_systemd_unit(),
+    ]
     if path is None:
         return found
-    config, wrong = read(path)
+    config, wrong = read_configuration(path)
     found = [*wrong, *found]
     if path.is_file():
         found += _check_permissions(path)
@@ -108,9 +114,9 @@ def examine(path: Path | None = None) -> list[Finding]:
 # --- the configuration
 
 
-def read(path: Path) -> tuple[Config | None, list[Finding]]:
+def read_configuration(path: Path) -> tuple[Config | None, list[Finding]]:
     """Read and check the configuration; return it, or None if it has a mistake, and the findings."""
-    config, wrong = check(path, pipe=True)
+    config, wrong = check_configuration(path, pipe=True)
     if config is None:
         return None, [Finding("wrong", "configuration", line) for line in wrong]
     count = len(config.devices)
@@ -246,7 +252,7 @@ def _check_zenoh(config: Config) -> list[Finding]:
     own = config.zenoh
     if own.mode == "none":
         return []
-    found = [one for endpoint in own.listen or () if own.mode != "client" for one in port_is_free("zenoh", endpoint)]
+    found = [one for endpoint in own.listen or () if own.mode != "client" for one in check_port_free("zenoh", endpoint)]
     found += [one for endpoint in own.connect for one in _reachable("zenoh", endpoint)]
     for endpoint in own.listen or ():
         host = _host(endpoint)
@@ -258,7 +264,7 @@ def _check_zenoh(config: Config) -> list[Finding]:
     return found
 
 
-def port_is_free(about: str, endpoint: str) -> list[Finding]:
+def check_port_free(about: str, endpoint: str) -> list[Finding]:
     """Check that a port can be listened on, by binding it for a moment.
 
     Parameters
@@ -327,7 +333,7 @@ def _check_metrics(config: Config) -> list[Finding]:
         text = "metrics.listen is set, but prometheus-client is not installed"
         return [Finding("wrong", "metrics", text, 'pip install "imu-monitor[metrics]"')]
     host = f"[{own.host}]" if ":" in own.host else own.host
-    found = port_is_free("metrics", f"tcp/{host}:{own.port}")
+    found = check_port_free("metrics", f"tcp/{host}:{own.port}")
     if not own.host.startswith(LOOPBACK):
         text = f"{own.host}: everyone who reaches this machine can read the metrics"
         found.append(Finding("doubt", "metrics", text, "listen on 127.0.0.1, and let a local collector forward them"))
@@ -368,7 +374,7 @@ def _check_storage(config: Config) -> list[Finding]:
         text = f"{own.folder}: cannot be written: {error.strerror or error}"
         return [*found, Finding("wrong", "storage", text, f"create it, owned by {_user(os.geteuid())}")]
     found += _check_in_use(own)
-    return [*found, *disk_space(own, bytes_a_day(config), usage.total, usage.free)]
+    return [*found, *check_disk_space(own, recorded_bytes_per_day(config), usage.total, usage.free)]
 
 
 def _check_in_use(own: Storage) -> list[Finding]:
@@ -379,17 +385,17 @@ def _check_in_use(own: Storage) -> list[Finding]:
     return [Finding("doubt", "storage", f"{own.folder}: in use by {one}", do) for one in holders]
 
 
-def bytes_a_day(config: Config) -> float | None:
+def recorded_bytes_per_day(config: Config) -> float | None:
     """Return the disk use of all devices per day in bytes; None if the rate of a device is not configured.
 
     Examples
     --------
     >>> import dataclasses
-    >>> from monitor.common.config_files import CONFIG_FOLDER
+    >>> from monitor.common.shipped_file_paths import CONFIG_FOLDER
     >>> from monitor.settings.loading import load
     >>> one = load(CONFIG_FOLDER / "demo.toml")
     >>> kept = Storage(folder=Path("kept"))
-    >>> bytes_a_day(dataclasses.replace(one, storage=kept)) == one.devices[0].rate_hz * DAY_S * SAMPLE_BYTES
+    >>> recorded_bytes_per_day(dataclasses.replace(one, storage=kept)) == one.devices[0].rate_hz * DAY_S * SAMPLE_BYTES
     True
     """
     own = config.storage
@@ -401,7 +407,7 @@ def bytes_a_day(config: Config) -> float | None:
     return None if len(known) < len(rates) else sum(known) * DAY_S * each
 
 
-def disk_space(own: Storage, a_day: float | None, total: int, available: int) -> list[Finding]:
+def check_disk_space(own: Storage, a_day: float | None, total: int, available: int) -> list[Finding]:
     """Check that the data to be kept fit on the disk.
 
     Parameters
@@ -433,9 +439,9 @@ def disk_space(own: Storage, a_day: float | None, total: int, available: int) ->
 # --- the machine
 
 
-def check_libraries() -> list[Finding]:
+def check_library_versions() -> list[Finding]:
     """Check the version of each library against the requirements of this program."""
-    wanted = list(requirements())
+    wanted = list(required_libraries())
     if not wanted:
         return [
             Finding(
@@ -453,7 +459,7 @@ def check_libraries() -> list[Finding]:
                 wrong.append(Finding("wrong", "libraries", f"{name} is missing", f'pip install "{name}{versions}"'))
             continue
         count += 1
-        if not satisfies(there, versions):
+        if not version_satisfies(there, versions):
             text = f"{name} {there} is installed, {versions} is required"
             wrong.append(Finding("wrong", "libraries", text, f'pip install "{name}{versions}"'))
     return wrong or [
@@ -461,7 +467,7 @@ def check_libraries() -> list[Finding]:
     ]
 
 
-def requirements() -> Iterator[tuple[str, str, bool]]:
+def required_libraries() -> Iterator[tuple[str, str, bool]]:
     """Yield name, versions and whether it is optional, for every library except those for tests."""
     try:
         lines = metadata.requires(PACKAGE) or []
@@ -476,7 +482,7 @@ def requirements() -> Iterator[tuple[str, str, bool]]:
             yield match[1], match[2].replace(" ", ""), extra is not None
 
 
-def satisfies(version: str, wanted: str) -> bool:
+def version_satisfies(version: str, wanted: str) -> bool:
     """Return True if a version is within bounds like ``>=0.41,<0.42``. Bounds of another kind are ignored.
 
     Parameters
@@ -488,15 +494,15 @@ def satisfies(version: str, wanted: str) -> bool:
 
     Examples
     --------
-    >>> satisfies("0.41.2", ">=0.41,<0.42"), satisfies("0.42.0", ">=0.41,<0.42"), satisfies("2.0rc1", ">=1.9")
-    (True, False, True)
+    >>> version_satisfies("0.41.2", ">=0.41,<0.42"), version_satisfies("0.42.0", ">=0.41,<0.42")
+    (True, False)
     """
     compare = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt, "==": operator.eq}
     bounds = re.findall(r"(>=|<=|==|>|<)\s*([\d.]+)", wanted)
     return all(compare[sign](_numbers(version), _numbers(bound)) for sign, bound in bounds)
 
 
-def check_packages(module_path: Sequence[str]) -> list[Finding]:
+def check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
     """Report foreign packages and modules that have the name of one of the program's packages and are found first.
 
     Parameters
@@ -559,15 +565,15 @@ def _check_systemd_unit() -> list[Finding]:
         said = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False).stdout
     except (OSError, subprocess.TimeoutExpired) as error:
         return [Finding("doubt", "systemd", f"the state is unknown: {error}")]
-    return unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
+    return check_unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
 
 
-def unit_state(seen: Mapping[str, str]) -> list[Finding]:
+def check_unit_state(seen: Mapping[str, str]) -> list[Finding]:
     """Return the findings for the output of ``systemctl show``; none if there is no such unit.
 
     Examples
     --------
-    >>> unit_state({"LoadState": "not-found"})
+    >>> check_unit_state({"LoadState": "not-found"})
     []
     """
     if seen.get("LoadState") != "loaded":

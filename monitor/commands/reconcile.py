@@ -83,13 +83,13 @@ def run_reconciliation(request: Request, tell: ProgressCallback = lambda _what, 
     """
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
-    check_folder(request.out)
+    create_report_folder(request.out)
     try:
         recording, notes = _to_regular_grid(found)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             result = reconcile(recording, request.model, request.seed, pool.map, lambda what: tell(what, None))
     except NotReady as error:
-        _write(request.out / REPORT, write_failure(str(error), len(found)))
+        _write(request.out / REPORT, encode_failure(str(error), len(found)))
         raise
     result = replace(result, notes=(*request.notes, *found.notes, *notes, *result.notes))
     tell("writing", None)
@@ -114,9 +114,9 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
     NotReady
         Fewer than two recordings support an answer, or the first does not and the model was to be fitted to it.
     """
-    named = unique_names(request.recordings)
+    named = unique_recording_names(request.recordings)
     _check_recordings(named, request.out)
-    check_folder(request.out)
+    create_report_folder(request.out)
     model, runs, silent = request.model, list[NamedResult](), dict[str, str]()
     fitted_to = next(iter(named)) if model is None else None
     for at, (name, path) in enumerate(named.items(), start=1):
@@ -134,7 +134,7 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
     if len(runs) < 2:
         why = "; ".join(f"{name}: {said}" for name, said in silent.items())
         why = f"two recordings at least are compared with each other, and {len(runs)} can be: {why}"
-        _write(request.out / REPORT, write_failure(why, 0, comparison_report.SCHEMA))
+        _write(request.out / REPORT, encode_failure(why, 0, comparison_report.SCHEMA))
         raise NotReady(why)
     tell("writing", None)
     comparison = compare(runs, fitted_to, silent)
@@ -159,7 +159,7 @@ def write_comparison(result: Comparison, folder: Path) -> None:
     _write(folder / "report.html", render_page(result).encode())
 
 
-def unique_names(recordings: Sequence[Path]) -> dict[str, Path]:
+def unique_recording_names(recordings: Sequence[Path]) -> dict[str, Path]:
     """Return a unique name for each recording: the file name without its suffix, and a number if names are equal.
 
     Raises
@@ -169,7 +169,7 @@ def unique_names(recordings: Sequence[Path]) -> dict[str, Path]:
 
     Examples
     --------
-    >>> list(unique_names([Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/warm.npz")]))
+    >>> list(unique_recording_names([Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/warm.npz")]))
     ['run', 'run-2', 'warm']
     """
     found: dict[str, Path] = {}
@@ -223,7 +223,7 @@ def write_report(result: Reconciliation, folder: Path, title: str) -> None:
         write_rrd(result, place)
 
 
-def write_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
+def encode_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
     """Return the content of ``report.json`` if there is no verdict.
 
     Parameters
@@ -238,7 +238,7 @@ def write_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
     return msgspec.json.encode({"schema": schema, "verdict": None, "why": why, "samples": samples})
 
 
-def check_folder(folder: Path) -> None:
+def create_report_folder(folder: Path) -> None:
     """Create the folder of the report.
 
     Raises

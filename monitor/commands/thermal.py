@@ -24,8 +24,8 @@ from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_study import (
     ThermalFitReport,
     ThermalPredictionReport,
+    choose_interval_s,
     compare_with_means,
-    round_interval_s,
 )
 from monitor.estimation.regular_grid import resample_with_temperature
 
@@ -33,7 +33,7 @@ SCHEMA: Final = "imu-monitor/thermal-model/1"
 """Schema of the model file."""
 
 
-class AxisRow(msgspec.Struct):
+class AxisModelRecord(msgspec.Struct):
     """Thermal model of one axis in a model file."""
 
     powers: int
@@ -54,7 +54,7 @@ class ModelFile(msgspec.Struct):
 
     schema: str
     interval: float
-    axes: dict[str, AxisRow]
+    axes: dict[str, AxisModelRecord]
 
 
 def fit_recording(
@@ -79,7 +79,7 @@ def fit_recording(
         The recording cannot be read, or it has no temperature.
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
-    means = _means(values, temperature_c, rate, interval_s or round_interval_s(temperature_c.size / rate, rate))
+    means = _means(values, temperature_c, rate, interval_s or choose_interval_s(temperature_c.size / rate, rate))
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
@@ -125,7 +125,7 @@ def predict_recording(
     return ThermalPredictionReport(recording.name, interval, means, judged, refused, notes)
 
 
-def write_model_file(study: ThermalFitReport) -> bytes:
+def encode_model_file(study: ThermalFitReport) -> bytes:
     """Return the content of the model file with all axes that were fitted."""
     rows = {axis: _row(one.model) for axis, one in study.fits.items()}
     return msgspec.json.format(msgspec.json.encode(ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
@@ -156,9 +156,9 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
     return {axis: _model(path, axis, row, found.interval) for axis, row in found.axes.items()}
 
 
-def _row(model: ThermalModel) -> AxisRow:
+def _row(model: ThermalModel) -> AxisModelRecord:
     """Return a model in the form of the model file."""
-    return AxisRow(
+    return AxisModelRecord(
         powers=model.shape.powers,
         time_constants=list(model.shape.constants_s),
         reference=model.reference_c,
@@ -172,7 +172,7 @@ def _row(model: ThermalModel) -> AxisRow:
     )
 
 
-def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalModel:
+def _model(path: Path, axis: str, row: AxisModelRecord, interval_s: float) -> ThermalModel:
     """Check the model of one axis in a model file, and return it."""
     k = len(row.time_constants)
     terms = 1 + row.powers + k

@@ -82,7 +82,7 @@ def _without_machine_code(library: Any, description: Any, environment: Any) -> A
     return _dynfunc.make_function(description.lookup_module(), description.qualname, "", 0, environment, (library,))
 
 
-class Intermediate(CPUDispatcher):  # type: ignore[misc]
+class IntermediateDispatcher(CPUDispatcher):  # type: ignore[misc]
     """Dispatcher that compiles a function for calls from other kernels."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, bool | str]) -> None:
@@ -112,7 +112,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             "nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "forceinline": inline,
         }  # fmt: skip
         super().__init__(function, targetoptions=options)
-        self.intermediate = Intermediate(function, options | {"no_cpython_wrapper": True})
+        self.intermediate = IntermediateDispatcher(function, options | {"no_cpython_wrapper": True})
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Compile for a call from another kernel. Numba calls this method when it infers the types of that kernel.

@@ -36,7 +36,8 @@ class Output:
         """Receive a result of one of the kinds in ``monitor.publishing.result_kinds``.
 
         Estimates arrive at the configured rate. A device without a model in force has no ``ModelGap``, and a device
-        without a thermal model has no ``ThermalUpdate``. A ``DriftUpdate`` arrives every second of drift compensation.
+        without a thermal model has no ``ThermalIntervalResult``. A ``DriftUpdate`` arrives every second of drift
+        compensation.
         ``SlowStatistics`` arrive when their step by step computation is complete.
 
         Parameters

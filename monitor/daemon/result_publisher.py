@@ -152,7 +152,7 @@ class ResultPublisher:
             offsets_ns = self.timeline.offsets_ns(compensated)
             for output in self.outputs:
                 output.compensated(self.device.name, self.published - len(samples) + at, compensated, offsets_ns)
-        for drift in live.take():
+        for drift in live.take_updates():
             self._result(drift.t_ns, drift)
 
     def _refit(self) -> None:

@@ -13,7 +13,7 @@ from typing import Any, Final
 from drivers.sample import Event, Floats
 from monitor.common.health import Health
 from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate, concatenate_coefficients
 from monitor.publishing.messages.message import Message
@@ -134,7 +134,7 @@ RESULT_KINDS: Final = (
         drawings=(Drawing("CompensatedPanel"),),
         size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes,
     ),
-    ResultKind(ThermalUpdate, (ThermalMessage,), (Drawing("ThermalPanel"),)),
+    ResultKind(ThermalIntervalResult, (ThermalMessage,), (Drawing("ThermalPanel"),)),
     ResultKind(DriftUpdate, drawings=(Drawing("DriftPanel"),)),
     ResultKind(SlowStatistics, (TotalMessage,)),
     ResultKind(

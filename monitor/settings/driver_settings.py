@@ -30,7 +30,7 @@ from drivers.settings_model import (
     check_table,
     fields_by_key,
 )
-from monitor.common.config_files import model_path
+from monitor.common.shipped_file_paths import model_path
 from monitor.settings.field_types import Duration
 
 VIRTUAL: Final = "virtual"

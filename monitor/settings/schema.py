@@ -20,7 +20,7 @@ from drivers.links.base import Link
 from drivers.number_ranges import DAY_S, NumberRange
 from drivers.sample import AXES, EVENT_KINDS
 from drivers.settings_model import Conflict, ListOf, ReadAs, SettingsModel, WordOr, checked_by, one_of
-from monitor.common.config_files import model_path
+from monitor.common.shipped_file_paths import model_path
 from monitor.common.topics import ENDPOINT
 from monitor.settings.driver_settings import Driver, VirtualTable, read_driver
 from monitor.settings.field_types import (

@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Final, ParamSpec, TypeVar
 
 from drivers.errors import ConfigError
-from monitor.common import config_files
-from monitor.common.config_files import CONFIG_FOLDER
-from monitor.noise.catalogue import read_model
+from monitor.common import shipped_file_paths
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.noise.model_catalogue import read_model
 from monitor.settings import loading
 from monitor.settings.loading import Config, VirtualTable
 from monitor.simulator import DEFAULT_RATE_HZ, parse_effects
@@ -44,7 +44,9 @@ def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_a
     table = device.link
     assert isinstance(table, VirtualTable)
     given = {
-        "model": None if sensor is None else str(_for_option("--sensor", config_files.model_path, sensor, Path.cwd())),
+        "model": None
+        if sensor is None
+        else str(_for_option("--sensor", shipped_file_paths.model_path, sensor, Path.cwd())),
         "effect": tuple(effects) or None,
         "effect_at": effect_at_s,
     }

@@ -15,7 +15,7 @@ import structlog
 from drivers.decoders.base import Decoder
 from drivers.errors import ConfigError
 from drivers.sample import NO_TICK, Chunk, CounterTimedFormat, Floats, Ints, make_block
-from monitor.noise.catalogue import read_model
+from monitor.noise.model_catalogue import read_model
 from monitor.noise.simulation import ModelStream
 from monitor.settings.loading import VirtualTable
 from monitor.simulator.scheduled_effects import parse_effects

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.recordings import save_samples
 from drivers.sample import Event, SampleBlock
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.common.units import format_utc
 from monitor.daemon.output import Output
 from monitor.daemon.service import Service
@@ -22,7 +22,7 @@ from monitor.history.reading import HistoryTable
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
-from monitor.noise.catalogue import read_model
+from monitor.noise.model_catalogue import read_model
 from monitor.publishing.messages.history import decode_history
 from monitor.settings import loading
 from tests.support.ports import free_endpoint

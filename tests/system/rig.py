@@ -17,7 +17,7 @@ from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.output import Output
 from monitor.daemon.service import Service
 from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.results import SlowStatistics
@@ -33,7 +33,7 @@ class Caught(Output):
         self.estimates: dict[str, Estimate] = {}
         self.totals: dict[str, SlowStatistics] = {}
         self.gaps: dict[str, ModelGap] = {}
-        self.thermals: dict[str, list[ThermalUpdate]] = {}
+        self.thermals: dict[str, list[ThermalIntervalResult]] = {}
         self.rates: dict[str, list[SampleBlock]] = {}
         self.drifts: dict[str, list[DriftUpdate]] = {}
         self.events: list[tuple[str, Event]] = []
@@ -48,7 +48,7 @@ class Caught(Output):
                 self.estimates[device] = result
             case ModelGap():
                 self.gaps[device] = result
-            case ThermalUpdate():
+            case ThermalIntervalResult():
                 self.thermals.setdefault(device, []).append(result)
             case DriftUpdate():
                 self.drifts.setdefault(device, []).append(result)

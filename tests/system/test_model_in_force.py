@@ -14,7 +14,7 @@ import zenoh
 from drivers.recordings import load_samples
 from drivers.sample import AXES, Event
 from monitor.common import topics
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.daemon.operations.live_reconcile import Reconciler
 from monitor.daemon.service import Service
 from monitor.estimation.detection.model_gap import ModelGap

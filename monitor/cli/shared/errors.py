@@ -25,7 +25,7 @@ MAX_CAUSE_CHARACTERS: Final = 300
 """Maximum length of the text of an unexpected error. Libraries may write pages."""
 
 
-def explain(error: Exception) -> tuple[str, int]:
+def message_and_status(error: Exception) -> tuple[str, int]:
     """Return the line for standard error and the exit status of an error that ended a command."""
     match error:
         case TyperException():

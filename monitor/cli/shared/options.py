@@ -28,7 +28,7 @@ MAX_AVERAGING_TIMES: Final = 1000
 """Largest number of averaging times in a list."""
 
 
-def within(quantity: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
+def range_callback(quantity: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
     """Return a typer callback that checks the number of an option against a quantity.
 
     Raises
@@ -60,31 +60,45 @@ ZenohFile = Annotated[
 Rate = Annotated[
     float | None,
     typer.Option(
-        metavar="HZ", help="Sample rate for a recording that has neither times nor a rate.", callback=within(RATE_HZ)
+        metavar="HZ",
+        help="Sample rate for a recording that has neither times nor a rate.",
+        callback=range_callback(RATE_HZ),
     ),
 ]
 ModelRate = Annotated[
     float | None,
-    typer.Option(metavar="HZ", help="Sample rate; by default that of the model.", callback=within(RATE_HZ)),
+    typer.Option(metavar="HZ", help="Sample rate; by default that of the model.", callback=range_callback(RATE_HZ)),
 ]
-Seconds = Annotated[float | None, typer.Option(metavar="S", help="Stop after S seconds.", callback=within(RUN_TIME_S))]
+Seconds = Annotated[
+    float | None, typer.Option(metavar="S", help="Stop after S seconds.", callback=range_callback(RUN_TIME_S))
+]
 SimulationSeed = Annotated[
-    int, typer.Option(metavar="N", help="Seed of the random numbers: same seed, same recording.", callback=within(SEED))
+    int,
+    typer.Option(
+        metavar="N", help="Seed of the random numbers: same seed, same recording.", callback=range_callback(SEED)
+    ),
 ]
 ReportSeed = Annotated[
-    int, typer.Option(metavar="N", help="Seed of the random numbers: same seed, same report.", callback=within(SEED))
+    int,
+    typer.Option(
+        metavar="N", help="Seed of the random numbers: same seed, same report.", callback=range_callback(SEED)
+    ),
 ]
 Inflation = Annotated[
-    float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=within(INFLATION))
+    float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=range_callback(INFLATION))
 ]
 TimeStep = Annotated[
     float | None,
-    typer.Option(metavar="S", help="kalman: time step; by default the sample period.", callback=within(DURATION_S)),
+    typer.Option(
+        metavar="S", help="kalman: time step; by default the sample period.", callback=range_callback(DURATION_S)
+    ),
 ]
 CorrelationTime = Annotated[
     float | None,
     typer.Option(
-        metavar="S", help="kalman: correlation time of the process that represents B.", callback=within(DURATION_S)
+        metavar="S",
+        help="kalman: correlation time of the process that represents B.",
+        callback=range_callback(DURATION_S),
     ),
 ]
 Last = Annotated[
@@ -92,7 +106,7 @@ Last = Annotated[
 ]
 
 
-def tau(text: str) -> "TauGrid":
+def parse_averaging_times(text: str) -> "TauGrid":
     """Parse averaging times: the name of a grid, or a list of seconds.
 
     Raises
@@ -117,12 +131,12 @@ def tau(text: str) -> "TauGrid":
 
 
 @overload
-def duration(option: str, text: str) -> float: ...
+def parse_duration(option: str, text: str) -> float: ...
 @overload
-def duration(option: str, text: None) -> None: ...
+def parse_duration(option: str, text: None) -> None: ...
 @overload
-def duration(option: str, text: str | None) -> float | None: ...
-def duration(option: str, text: str | None) -> float | None:
+def parse_duration(option: str, text: str | None) -> float | None: ...
+def parse_duration(option: str, text: str | None) -> float | None:
     """Parse a duration such as "90", "30min" or "1h", and return seconds.
 
     Parameters
@@ -145,7 +159,7 @@ def duration(option: str, text: str | None) -> float | None:
         raise ConfigError(f"{option}: {error}") from None
 
 
-def order(text: str | None) -> "Order | None":
+def parse_arma_order(text: str | None) -> "Order | None":
     """Parse the orders p and q of an ARMA model.
 
     Raises
@@ -163,7 +177,7 @@ def order(text: str | None) -> "Order | None":
     raise ConfigError(f'--order: "{text}"; possible are {" ".join(f"{p},{q}" for p, q in ORDERS)}')
 
 
-def noise(source: Path) -> "NoiseCoefficients":
+def read_noise_coefficients(source: Path) -> "NoiseCoefficients":
     """Read noise parameters from a model or from the JSON of ``analyze``. JSON begins with a brace, and a model does
     not.
 

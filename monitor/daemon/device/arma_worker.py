@@ -52,7 +52,7 @@ class _Identification:
     def __init__(self, of: Compensator, axis: int, name: str) -> None:
         self.of, self.axis = of, axis
         self.found: ArmaModel | None = None
-        self._window: tuple[Floats, float] = of.identification_data(axis)
+        self._window: tuple[Floats, float] = of.identification_means_and_variance(axis)
         self.thread = threading.Thread(target=self.run, name=name, daemon=True)
 
     def run(self) -> None:

@@ -20,7 +20,7 @@ from monitor.common.compiled import interpreted
 from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import LiveCompensation
-from monitor.drift.thermal.live_thermal import LiveThermal, ThermalUpdate
+from monitor.drift.thermal.live_thermal import LiveThermal, ThermalIntervalResult
 from monitor.estimation.detection.model_gap import PreparedModel
 from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import Estimator
@@ -82,7 +82,7 @@ class DevicePipeline:
         self._live = live
         self._interprets = False
         self._temperatures: TemperatureRing | None = None  # of the samples in the window
-        self._thermal_intervals: list[ThermalUpdate] = []  # thermal intervals that were not taken yet
+        self._thermal_intervals: list[ThermalIntervalResult] = []  # thermal intervals that were not taken yet
         self._handled = 0  # last seen value of ``signal_monitor.orientation_changes``
         self._pieces: deque[SampleBlock] = deque()  # samples of a recording that wait for the thermal model
         self._replaying = False
@@ -189,7 +189,7 @@ class DevicePipeline:
             for at in range(0, len(samples), MAX_PIECE_SAMPLES):
                 live.update(samples[at : at + MAX_PIECE_SAMPLES])
             self.arma_worker.update(live)
-            live.take()
+            live.take_updates()
         self.take_events()
         self.take_thermal_intervals()
 
@@ -223,7 +223,7 @@ class DevicePipeline:
         ]
         return [event for events in found for event in events]
 
-    def take_thermal_intervals(self) -> list[ThermalUpdate]:
+    def take_thermal_intervals(self) -> list[ThermalIntervalResult]:
         """Return the thermal intervals that were completed since the last call."""
         intervals, self._thermal_intervals = self._thermal_intervals, []
         return intervals

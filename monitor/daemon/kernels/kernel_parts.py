@@ -62,9 +62,9 @@ def _call_change_detection() -> None:
 def _call_compensation() -> None:
     compensator = Compensator(100.0)
     compensator.compensate(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))
-    compensator.set_model(0, fit_arma(*compensator.identification_data(0), [(2, 1)]))
+    compensator.set_model(0, fit_arma(*compensator.identification_means_and_variance(0), [(2, 1)]))
     compensator.compensate(np.zeros((1, 6)), lost=1)
-    _ = compensator.error
+    _ = compensator.bias_standard_error
 
 
 def _call_slow_statistics() -> None:

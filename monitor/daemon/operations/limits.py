@@ -23,8 +23,8 @@ from monitor.common.distributions import Z95
 from monitor.common.units import COEFFICIENT_NAMES, sensor_kind, unit_of
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
-from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
+from monitor.noise.model_catalogue import read_model
 from monitor.publishing.exporters.noise import from_model
 from monitor.settings.loading import Device, Limit
 

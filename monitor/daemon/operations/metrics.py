@@ -23,7 +23,7 @@ from monitor.common.health import Health
 from monitor.daemon.output import Output
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS
-from monitor.noise.effect import parameter_units
+from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.standard_terms import STANDARD_TERMS
 from monitor.settings.loading import Metrics
 
@@ -46,7 +46,7 @@ MISSING_LIBRARY_TEXT: Final = 'prometheus-client is not installed: pip install "
 STATES: Final = ("running", "waiting", "lost", "ended")
 """States of a device."""
 _GYRO_UNITS: Final = ", ".join(
-    f"{symbol} {parameter_units(term)[symbol][0]}" for symbol, term in STANDARD_TERMS.items()
+    f"{symbol} {gyro_and_accel_units(term)[symbol][0]}" for symbol, term in STANDARD_TERMS.items()
 )
 UNITS: Final = f"gyroscopes {_GYRO_UNITS}; accelerometers with m/s for rad"
 """Text about the units of the coefficients."""

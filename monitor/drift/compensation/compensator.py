@@ -2,9 +2,9 @@
 
 The measured rate is z = ω + drift + noise. At rest the true rate ω is zero, so the drift is learned only there, from
 means over intervals (``sage_husa``, with the model of ``arma``). In motion the drift is predicted, and the remaining
-rate is smoothed by filters that follow motion (``motion_filter_bank``). A single filter for both would have to divide
-every slow change between drift and motion. The knowledge that the carrier is at rest is more reliable than any such
-division.
+rate is smoothed by filters that follow motion (``carrier_rate_filter_bank``). A single filter for both would have to
+divide every slow change between drift and motion. The knowledge that the carrier is at rest is more reliable than such
+a division.
 
 The decision whether a sample was taken at rest follows some blocks later (``motion_kernel``). The result of an interval
 therefore applies from the second block after it, which is 0.5 s at most rates. The compensated rate has no such delay:
@@ -23,7 +23,7 @@ from drivers.sample import AXES, Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import ORDERS, ArmaModel, Order, fit_arma
-from monitor.drift.compensation.motion_filter_bank import (
+from monitor.drift.compensation.carrier_rate_filter_bank import (
     MIN_REST_INTERVALS,
     filter_memories,
     filter_sample,
@@ -79,8 +79,8 @@ class CompensatorState(NamedTuple):
     learned: Ints  # [3] intervals at rest from which the filters learned their noise
     drift: np.ndarray  # [3] of sage_husa.DRIFT_FILTER
     bias: Floats  # [3] rad/s, bias that is subtracted now; NaN = not known yet
-    bank: Floats  # [3, filters + 1, 5] columns as in ``motion_filter_bank``
-    ages: Ints  # [3, filters, 2] columns as in ``motion_filter_bank``
+    bank: Floats  # [3, filters + 1, 5] columns as in ``carrier_rate_filter_bank``
+    ages: Ints  # [3, filters, 2] columns as in ``carrier_rate_filter_bank``
     feedback: Floats  # [3, 1] difference of input and output that is still to be fed back
     waiting: Floats  # [MAX_PENDING_BLOCKS, 6, 5] sums of the blocks that wait for a rest decision
     sums: Floats  # [MAX_PENDING_BLOCKS, 3, filters + 1, 2] sums of ``filter_sample`` for each of these blocks
@@ -161,7 +161,7 @@ class Compensator:
         return self._state.bias.copy()
 
     @property
-    def error(self) -> Floats:
+    def bias_standard_error(self) -> Floats:
         """Return the standard error [3] of the bias in rad/s; NaN means that the bias is not known yet."""
         known = [sage_husa.expected_bias(drift)[1] ** 0.5 for drift in self._state.drift]
         return np.where(np.isnan(self._state.bias), np.nan, known)
@@ -219,7 +219,7 @@ class Compensator:
         """Return the indices of the axes that have enough new intervals to identify a model."""
         return tuple(np.flatnonzero(self._at_rest >= self._next_identification).tolist())
 
-    def identification_data(self, axis: int) -> tuple[Floats, float]:
+    def identification_means_and_variance(self, axis: int) -> tuple[Floats, float]:
         """Return the interval means from which the model of an axis is to be identified.
 
         Parameters
@@ -261,11 +261,11 @@ class Compensator:
         drift["rest_count"] = count  # The repeated intervals are not counted a second time.
         _update_bias(axis, self._state.drift, self._state.bias, self._state.bank)
 
-    def identify(self) -> None:
+    def identify_due_models(self) -> None:
         """Identify the models of all axes that are due."""
         for axis in self.axes_due:
             try:
-                self.set_model(axis, fit_arma(*self.identification_data(axis), self._orders))
+                self.set_model(axis, fit_arma(*self.identification_means_and_variance(axis), self._orders))
             except NotReady:  # The means are all equal or too few. The identification is repeated later.
                 self.set_model(axis, None)
 
@@ -494,7 +494,7 @@ def _min_variance(blocks: Floats, axis: int) -> float:
 def _predict_next_interval(axis: int, s: CompensatorState) -> None:
     """Predict the drift of the next interval, if a level is confirmed."""
     if s.drift[axis]["rest_count"] >= sage_husa.MIN_CONFIRMED_INTERVALS:
-        sage_husa.predict(s.drift[axis])
+        sage_husa.predict_next_interval(s.drift[axis])
         _update_bias(axis, s.drift, s.bias, s.bank)
 
 

@@ -42,7 +42,7 @@ class InnovationTest:
         self._exceeded = True
         return True
 
-    def reset(self) -> None:
+    def forget_innovations(self) -> None:
         """Discard all innovations, after a change of the model or of the level."""
         self._squares.clear()
         self._exceeded = False

@@ -59,7 +59,7 @@ class LiveCompensation:
             self._publish(interval, t_ns)
         return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
-    def take(self) -> list[DriftUpdate]:
+    def take_updates(self) -> list[DriftUpdate]:
         """Return the results of the intervals that have ended since the last call."""
         updates, self._updates = self._updates, []
         return updates
@@ -81,7 +81,7 @@ class LiveCompensation:
         """
         self.compensator.set_model(axis, model)
         if model is not None:
-            self._innovations[axis].reset()
+            self._innovations[axis].forget_innovations()
 
     def set_rate(self, rate_hz: float) -> None:
         """Set a better estimate of the sample rate in Hz.
@@ -114,7 +114,7 @@ class LiveCompensation:
         )
         for at in range(GYROS):
             if interval.outcome[at] == STEPPED:
-                self._innovations[at].reset()
+                self._innovations[at].forget_innovations()
                 self._events.append(_step_event(AXES[at], float(interval.mean[at] - interval.expected[at]), t_ns))
                 continue
             known = used[at] and np.isfinite(interval.expected[at])

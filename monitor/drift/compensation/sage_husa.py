@@ -102,7 +102,7 @@ def set_model(drift: np.void, arma: ArmaModel) -> None:
 
 
 @compiled
-def predict(drift: np.void) -> None:
+def predict_next_interval(drift: np.void) -> None:
     """Predict the state of the next interval."""
     phi1, phi2, g1, s = drift["phi1"], drift["phi2"], drift["g1"], drift["variance"]
     x, p = drift["state"], drift["covariance"]
@@ -263,4 +263,4 @@ def refilter_history(drift: np.void, z: Floats, scatter: Floats, least: float) -
     for k in range(z.size):
         if z[k] == z[k]:
             update_with_interval(drift, z[k], scatter[k], least)
-        predict(drift)
+        predict_next_interval(drift)

@@ -27,7 +27,7 @@ class IntervalMeans:
         """True [n] where bias and temperature are both known."""
         return np.isfinite(self.bias) & np.isfinite(self.temperature_c)
 
-    def first(self, n: int) -> "IntervalMeans":
+    def first_intervals(self, n: int) -> "IntervalMeans":
         """Return the first n intervals."""
         return IntervalMeans(self.interval_s, self.bias[:n], self.error[:n], self.temperature_c[:n])
 

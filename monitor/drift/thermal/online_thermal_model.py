@@ -44,7 +44,7 @@ NEW_OFFSET: Final = "it was handled, or started anew: its new offset is being le
 
 
 @dataclass(frozen=True, slots=True)
-class AxisThermalUpdate:
+class PredictedAxisInterval:
     """One interval of one axis, with its prediction."""
 
     bias: float  # rad/s or m/s²; NaN if too few samples are known
@@ -65,7 +65,7 @@ class _Row:
     temperature_c: float
 
     @property
-    def known(self) -> bool:
+    def has_bias_and_temperature(self) -> bool:
         """True if bias and temperature are both known."""
         return bool(np.isfinite(self.bias) and np.isfinite(self.temperature_c))
 
@@ -93,7 +93,7 @@ class OnlineThermalModel:
         self._settled: list[UnexplainedChange] = []
         self._missing_reason = ""  # reason why there is no model
 
-    def update(self, bias: float, error: float, temperature_c: float) -> AxisThermalUpdate:
+    def update(self, bias: float, error: float, temperature_c: float) -> PredictedAxisInterval:
         """Add an interval, and return it with its prediction.
 
         Parameters
@@ -107,26 +107,28 @@ class OnlineThermalModel:
         """
         row = _Row(bias, error, temperature_c)
         self._interval_count += 1
-        self._known_count += row.known
+        self._known_count += row.has_bias_and_temperature
         self._rows.append(row)
         if self._recursion is None:
             if self._work is None:
-                self._begin(self._choose())
-            return AxisThermalUpdate(bias, error, None, None, "", np.nan, self._missing_reason)
-        multi_step, one_step = self._recursion.predict(temperature_c)
+                self._start_work(self._choose_model())
+            return PredictedAxisInterval(bias, error, None, None, "", np.nan, self._missing_reason)
+        multi_step, one_step = self._recursion.predict_multi_and_one_step(temperature_c)
         model = self._recursion.model
         if self._offset_differences is not None:
             self._recursion.update(temperature_c, np.nan)
-            if row.known:
+            if row.has_bias_and_temperature:
                 self._add_offset_difference(self._offset_differences, bias - multi_step.bias)
-            return AxisThermalUpdate(bias, error, None, None, model.shape.name, model.slope, NEW_OFFSET)
-        found = self._suspicion.update(bias if row.known else np.nan, multi_step, one_step)
-        self._recursion.update(temperature_c, np.nan if row.known and self._suspicion.far else bias)
+            return PredictedAxisInterval(bias, error, None, None, model.shape.name, model.mean_slope, NEW_OFFSET)
+        found = self._suspicion.update(bias if row.has_bias_and_temperature else np.nan, multi_step, one_step)
+        self._recursion.update(
+            temperature_c, np.nan if row.has_bias_and_temperature and self._suspicion.is_unfit_for_update else bias
+        )
         if found is not None:
-            self._begin(self._test_for_step(found))
-        elif self._known_count >= self._next_choice and self._work is None and self._suspicion.clear:
-            self._begin(self._choose())
-        return AxisThermalUpdate(bias, error, multi_step, one_step, model.shape.name, model.slope, "")
+            self._start_work(self._test_for_step(found))
+        elif self._known_count >= self._next_choice and self._work is None and self._suspicion.is_within_prediction:
+            self._start_work(self._choose_model())
+        return PredictedAxisInterval(bias, error, multi_step, one_step, model.shape.name, model.mean_slope, "")
 
     @property
     def choosing(self) -> bool:
@@ -143,26 +145,26 @@ class OnlineThermalModel:
             self._work = None
         return True
 
-    def take(self) -> list[UnexplainedChange]:
+    def take_unexplained_changes(self) -> list[UnexplainedChange]:
         """Return the changes that temperature does not explain, confirmed since the last call."""
         told, self._settled = self._settled, []
         return told
 
-    def offset_is_new(self) -> None:
+    def learn_new_offset(self) -> None:
         """Learn a new offset of the bias, because the old one no longer applies."""
         self._work = None
-        self._suspicion.forget()
+        self._suspicion.forget_residuals()
         if self._recursion is None:
             self._rows.clear()  # Without a model, the new offset cannot be determined.
         else:
             self._offset_differences, self._new_offset_at = [], self._interval_count
 
-    def _begin(self, work: StepwiseWork[None]) -> None:
+    def _start_work(self, work: StepwiseWork[None]) -> None:
         """Start new work. Unfinished earlier work is discarded, because it used fewer intervals."""
         self._work = work
         self.step()
 
-    def _choose(self) -> StepwiseWork[None]:
+    def _choose_model(self) -> StepwiseWork[None]:
         """Choose the model again, and keep the present one if the intervals do not suffice."""
         self._next_choice = ceil(REFIT_GROWTH * self._known_count)
         self._missing_reason = "the model is being chosen"
@@ -196,7 +198,7 @@ class OnlineThermalModel:
         """Add a residual, and determine the new offset when there are enough."""
         apart.append(by)
         if len(apart) == OFFSET_INTERVALS:
-            self._begin(self._settle_offset(float(np.mean(apart))))
+            self._start_work(self._settle_offset(float(np.mean(apart))))
 
     def _settle_offset(self, size: float) -> StepwiseWork[None]:
         """Determine the new offset, by a fit to all intervals if possible, else by the mean residual."""

@@ -21,8 +21,8 @@ from monitor.drift.thermal.thermal_fit import whiten
 from monitor.drift.thermal.thermal_model import (
     LOG_TIME_CONSTANT_STEP,
     ThermalModel,
+    bias_derivatives_by_time_constant,
     coefficient_covariance,
-    combine_derivatives,
     interpolate_gaps,
     predict_with_variance,
     regressor_derivatives,
@@ -38,7 +38,7 @@ class PredictionInterval:
     lo: float
     hi: float
 
-    def side(self, bias: float) -> int:
+    def side_of(self, bias: float) -> int:
         """Return 1 if the bias lies above the interval, −1 if below, and 0 if inside or not measured."""
         return int(bias > self.hi) - int(bias < self.lo)
 
@@ -57,7 +57,7 @@ class RecursiveThermalFit:
     def __init__(self, model: ThermalModel, means: IntervalMeans) -> None:
         self._model = model
         shape = model.shape
-        k = self._k = shape.memory
+        k = self._k = shape.difference_equation_order
         self._terms = 1 + shape.powers + k
         excess = interpolate_gaps(means.temperature_c) - model.reference_c
         columns = regressors(shape, excess, model.interval_s, began=True)
@@ -87,7 +87,7 @@ class RecursiveThermalFit:
         taken = self._terms + 2 * self._k + (self._model.phi > 0.0)
         return max(self._count - taken, 1)
 
-    def predict(self, temperature_c: float) -> tuple[PredictionInterval, PredictionInterval]:
+    def predict_multi_and_one_step(self, temperature_c: float) -> tuple[PredictionInterval, PredictionInterval]:
         """Return the multi-step and the one-step prediction of the next interval from its temperature in °C.
 
         The prediction intervals use Student's t distribution, because few intervals determine the scatter at first.
@@ -95,11 +95,11 @@ class RecursiveThermalFit:
         model = self.model
         excess = np.array([self._excess, temperature_c - model.reference_c if np.isfinite(temperature_c) else np.nan])
         excess[1] = excess[0] if np.isnan(excess[1]) else excess[1]
-        row, _, _ = self._next_row(float(excess[1]), model.temperature_range_c)
+        row, _, _ = self._next_row(float(excess[1]), model.temperature_range_from_reference_c)
         rows = np.stack([self._row, row])
         sizes = np.concatenate([model.coefficients, model.initial_state])
         own = sizes.size
-        bends = combine_derivatives(model.shape, rows[:, own:], sizes)
+        bends = bias_derivatives_by_time_constant(model.shape, rows[:, own:], sizes)
         wide = student_quantile(self.degrees_of_freedom, 0.975)
         both = []
         for measured in (None, np.array([self._bias, np.nan])):
@@ -152,7 +152,7 @@ class RecursiveThermalFit:
         sizes = np.linalg.lstsq(x / scale, z, rcond=1e-10)[0] / scale
         square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
         sigma = (square / self.degrees_of_freedom) ** 0.5
-        bends = combine_derivatives(self._model.shape, self._triangle[:, own:-1], sizes)
+        bends = bias_derivatives_by_time_constant(self._model.shape, self._triangle[:, own:-1], sizes)
         return replace(
             self._model,
             coefficients=sizes[: self._terms],

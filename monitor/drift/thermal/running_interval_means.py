@@ -85,7 +85,7 @@ class RunningIntervalMeans:
             finished += self._advance(count)
         return finished
 
-    def forget(self) -> None:
+    def forget_sensor_values(self) -> None:
         """Discard the sensor values of the current interval, and keep the temperatures of the interval."""
         self._rows[: self._buffered, :TEMPERATURE_COLUMN] = np.nan
         self._sum[:, :TEMPERATURE_COLUMN], self._count[:, :TEMPERATURE_COLUMN] = 0.0, 0

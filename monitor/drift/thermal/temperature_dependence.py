@@ -91,7 +91,7 @@ class Hysteresis:
     p_value: float  # p-value of the hypothesis of no difference
 
     @property
-    def significant(self) -> bool:
+    def hysteresis_is_significant(self) -> bool:
         """True if noise alone does not explain the difference."""
         return self.p_value < SIGNIFICANCE
 

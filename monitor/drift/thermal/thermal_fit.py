@@ -95,7 +95,7 @@ class ThermalFit:
 
     model: ThermalModel
     candidates: tuple[Candidate, ...]  # the chosen form first, then the others by AICc
-    both_ways: bool  # True if temperature rose and fell
+    temperature_rose_and_fell: bool  # True if temperature rose and fell
     explained: float  # explained share of the variance of the means
     aicc: float  # only differences between fits of the same means are meaningful
     step: float = 0.0  # step of the offset (after minus before), if one was fitted; rad/s or m/s²
@@ -118,10 +118,10 @@ def fit_thermal_model(means: IntervalMeans) -> ThermalFit:
         If there are too few intervals, or if temperature hardly moved.
     """
     found = run_all_steps(fit_in_steps(means))
-    loop = find_hysteresis(means) if found.both_ways else None
+    loop = find_hysteresis(means) if found.temperature_rose_and_fell else None
     if loop is None:
         return found
-    return replace(found, hysteresis=loop.size if loop.significant else 0.0, hysteresis_p=loop.p_value)
+    return replace(found, hysteresis=loop.size if loop.hysteresis_is_significant else 0.0, hysteresis_p=loop.p_value)
 
 
 def run_all_steps(pieces: StepwiseWork[T]) -> T:
@@ -151,11 +151,11 @@ def fit_in_steps(means: IntervalMeans, since: int | None = None, lags: bool = Fa
     NotReady
         If there are too few intervals, or if temperature hardly moved. The first piece raises it.
     """
-    check_means(means)
+    check_means_suffice(means)
     excess, reference_c = _temperature_difference(means)
-    both_ways = _both_ways(means.temperature_c)
+    temperature_rose_and_fell = _both_ways(means.temperature_c)
     tried = []
-    for shape in _shapes(means, both_ways or lags):
+    for shape in _shapes(means, temperature_rose_and_fell or lags):
         tried.append((yield from _fit_shape(means, excess, shape, since)))
     tried.sort(key=lambda one: one.aicc + _aicc_margin(one.shape))
     errors = []
@@ -173,7 +173,7 @@ def fit_in_steps(means: IntervalMeans, since: int | None = None, lags: bool = Fa
     known = means.known
     left = means.bias[known] - (best.columns @ best.sizes)[known]
     explained = 1.0 - float(np.var(left) / np.var(means.bias[known]))
-    return ThermalFit(model, candidates, both_ways, explained, best.aicc, best.step)
+    return ThermalFit(model, candidates, temperature_rose_and_fell, explained, best.aicc, best.step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,7 +190,7 @@ class _ShapeFit:
     step: float
 
 
-def check_means(means: IntervalMeans) -> None:
+def check_means_suffice(means: IntervalMeans) -> None:
     """Check that the means suffice for a fit.
 
     Raises
@@ -223,7 +223,7 @@ def check_means(means: IntervalMeans) -> None:
 
 def _aicc_margin(shape: ThermalModelForm) -> float:
     """Return the margin in AICc that a form must gain."""
-    if shape.memory:
+    if shape.difference_equation_order:
         return LAG_AICC_MARGIN
     return CURVE_AICC_MARGIN if shape.powers > CUBIC else 0.0
 
@@ -283,7 +283,7 @@ class _TimeConstantSearch:
 
     def run(self) -> StepwiseWork[_ShapeFit]:
         """Fit the form with its best time constants."""
-        k = self._shape.memory
+        k = self._shape.difference_equation_order
         for _ in range(k):
             yield from self._add_from_grid()
         for _ in range(2 if k > 1 else min(k, 1)):
@@ -344,7 +344,7 @@ def _fit_sizes(
     sizes = least_squares(x, z)
     count = x.shape[0]
     square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
-    free = sizes.size + shape.memory + (phi > 0.0) + 1
+    free = sizes.size + shape.difference_equation_order + (phi > 0.0) + 1
     likelihood = count * log(square / count) - fresh * log(1.0 - phi**2)
     aicc = likelihood + 2.0 * free * count / max(count - free - 1.0, 0.5)
     rms = float(np.sqrt(np.mean((y - columns @ sizes)[known] ** 2)))
@@ -416,7 +416,7 @@ def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit)
 
 def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _ShapeFit) -> ThermalModel:
     """Return the model of a fitted form, with the covariance of its coefficients."""
-    k = one.shape.memory
+    k = one.shape.difference_equation_order
     terms = one.sizes.size - k
     model = ThermalModel(
         shape=one.shape,

@@ -45,10 +45,10 @@ class ThermalModel:
         return float(self.sigma / (1.0 - self.phi**2) ** 0.5)
 
     @property
-    def slope(self) -> float:
+    def mean_slope(self) -> float:
         """Return the mean slope of the bias in rad/s or m/s² per °C over the temperatures of the fit, with settled
         lags."""
-        (lo, hi), powers = self.temperature_range_c, np.arange(1, self.shape.powers + 1)
+        (lo, hi), powers = self.temperature_range_from_reference_c, np.arange(1, self.shape.powers + 1)
         chords = (hi**powers - lo**powers) / (hi - lo)
         return float(
             self.coefficients[1 : 1 + self.shape.powers] @ chords + self.coefficients[1 + self.shape.powers :].sum()
@@ -64,7 +64,7 @@ class ThermalModel:
         return {"a": a.tolist(), "b": b.tolist(), "c": c}
 
     @property
-    def temperature_range_c(self) -> tuple[float, float]:
+    def temperature_range_from_reference_c(self) -> tuple[float, float]:
         """Return the lowest and the highest temperature of the fit minus the reference, °C."""
         return self.lowest_c - self.reference_c, self.highest_c - self.reference_c
 
@@ -100,8 +100,10 @@ def predict(
         assumed to have been constant before, and the prediction intervals include the uncertainty of this assumption.
     """
     excess = interpolate_gaps(temperature_c) - model.reference_c
-    columns = regressors(model.shape, excess, model.interval_s, began=True, ends=model.temperature_range_c)
-    k = model.shape.memory
+    columns = regressors(
+        model.shape, excess, model.interval_s, began=True, ends=model.temperature_range_from_reference_c
+    )
+    k = model.shape.difference_equation_order
     if not began:
         columns[:, columns.shape[1] - k :] = 0.0
     sizes = np.concatenate([model.coefficients, model.initial_state if began else np.zeros(k)])
@@ -154,7 +156,7 @@ def predict_with_variance(
         bias[1:] += model.phi * last
         sigma[1:][known] = model.sigma
     variance = np.einsum("ij,jk,ik->i", rows, model.covariance, rows) + sigma**2
-    variance += (model.slope * excess_beyond_range(excess, model.temperature_range_c)) ** 2
+    variance += (model.mean_slope * excess_beyond_range(excess, model.temperature_range_from_reference_c)) ** 2
     return bias, variance
 
 
@@ -191,7 +193,9 @@ def time_constant_derivatives(model: ThermalModel, excess: Floats, sizes: Floats
     sizes : ndarray, shape (terms + k,)
         Coefficients of the columns.
     """
-    return combine_derivatives(model.shape, regressor_derivatives(model.shape, excess, model.interval_s), sizes)
+    return bias_derivatives_by_time_constant(
+        model.shape, regressor_derivatives(model.shape, excess, model.interval_s), sizes
+    )
 
 
 def regressor_derivatives(shape: ThermalModelForm, excess: Floats, interval_s: float) -> Floats:
@@ -216,17 +220,19 @@ def regressor_derivatives(shape: ThermalModelForm, excess: Floats, interval_s: f
     return np.asarray((more - less)[:, 1:] / (2.0 * LOG_TIME_CONSTANT_STEP))
 
 
-def combine_derivatives(shape: ThermalModelForm, of_each: Floats, sizes: Floats) -> Floats:
+def bias_derivatives_by_time_constant(shape: ThermalModelForm, column_derivatives: Floats, sizes: Floats) -> Floats:
     """Return the derivatives [n, k] of the bias by the logarithms of the time constants, from those of the columns.
 
     Parameters
     ----------
     shape : ThermalModelForm
         Form of the model.
-    of_each : ndarray, shape (n, 2 k)
+    column_derivatives : ndarray, shape (n, 2 k)
         Derivatives of the columns, from ``regressor_derivatives``.
     sizes : ndarray, shape (terms + k,)
         Coefficients of the columns.
     """
-    k, first = shape.memory, 1 + shape.powers
-    return np.asarray(of_each[:, :k] * sizes[first : first + k] + of_each[:, k:] * sizes[first + k :])
+    k, first = shape.difference_equation_order, 1 + shape.powers
+    return np.asarray(
+        column_derivatives[:, :k] * sizes[first : first + k] + column_derivatives[:, k:] * sizes[first + k :]
+    )

@@ -29,7 +29,7 @@ class ThermalModelForm:
     constants_s: tuple[float, ...]  # time constants of the lags, s
 
     @property
-    def memory(self) -> int:
+    def difference_equation_order(self) -> int:
         """Return the order k of the difference equation; 0 for a polynomial."""
         return len(self.constants_s)
 
@@ -42,12 +42,12 @@ class ThermalModelForm:
         >>> ThermalModelForm(0, (3600.0,)).name, ThermalModelForm(1, (60.0, 600.0)).name
         ('difference 1, 0', 'difference 2, 2')
         """
-        if self.memory:
-            return f"difference {self.memory}, {self.memory - 1 + min(self.powers, 1)}"
+        if order := self.difference_equation_order:
+            return f"difference {order}, {order - 1 + min(self.powers, 1)}"
         return f"polynomial {self.powers}" if self.powers else "constant"
 
 
-def lag_roots(shape: ThermalModelForm, interval_s: float) -> Floats:
+def compute_lag_roots(shape: ThermalModelForm, interval_s: float) -> Floats:
     """Return the root p of each lag.
 
     Parameters
@@ -91,7 +91,7 @@ def regressors(
     n = excess_c.size
     columns = [np.ones(n)]
     columns += [_power(excess_c, power, ends) for power in range(1, shape.powers + 1)]
-    p = lag_roots(shape, interval_s)
+    p = compute_lag_roots(shape, interval_s)
     columns += [first_order_lag(excess_c, one) for one in p]
     if began:
         columns += [one ** np.arange(n, dtype=np.float64) for one in p]
@@ -173,7 +173,7 @@ def difference_equation(shape: ThermalModelForm, sizes: Floats, interval_s: floa
     >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12)
     ([-0.5], [5.0], 1.5)
     """
-    p = lag_roots(shape, interval_s)
+    p = compute_lag_roots(shape, interval_s)
     whole = np.poly(p) if p.size else np.ones(1)  # [k + 1] 1, followed by a
     b = np.zeros(whole.size)
     if shape.powers:

@@ -17,7 +17,7 @@ from drivers.errors import ConfigError, ImuError, NotReady
 from drivers.number_ranges import RATE_HZ
 from drivers.sample import AXES
 from monitor.common.units import KINDS, Kind, axes_of
-from monitor.noise.effect import Source, parameter_units
+from monitor.noise.effect import Source, gyro_and_accel_units
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
 
@@ -44,7 +44,7 @@ def ascii_unit(letter: str, kind: Kind) -> str:
     kind
         Kind of sensor.
     """
-    unit = parameter_units(COEFFICIENT_EFFECTS[letter])[letter][KINDS.index(kind)]
+    unit = gyro_and_accel_units(COEFFICIENT_EFFECTS[letter])[letter][KINDS.index(kind)]
     return unit.replace("√s", "sqrt(s)").replace("²", "^2").replace("³", "^3")
 
 

@@ -8,7 +8,7 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from drivers.sample import AXES, Floats
-from monitor.drift.thermal.temperature_share import SLOW_LETTERS, TemperatureShare
+from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemoval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.allan.hadamard import HadamardCurve
@@ -60,7 +60,7 @@ class WithoutTemperature(msgspec.Struct, frozen=True):
     share: dict[str, float | None]
 
     @classmethod
-    def of(cls, found: TemperatureShare, axis: str) -> Self:
+    def of(cls, found: TemperatureRemoval, axis: str) -> Self:
         """Return the values of one axis."""
         i = AXES.index(axis)
         values = coefficient_values(found.coefficients, i, found.k_or_r[i])
@@ -176,7 +176,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
         total: TotalCurve | None = None,
         hadamard: HadamardCurve | None = None,
         dynamic: DynamicAllan | None = None,
-        temperature: TemperatureShare | None = None,
+        temperature: TemperatureRemoval | None = None,
     ) -> Self:
         """Build the output of an analysis.
 
@@ -245,7 +245,7 @@ class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag
 
 
 def _temperature_values(
-    result: Analysis, temperature: TemperatureShare | None, axis: str
+    result: Analysis, temperature: TemperatureRemoval | None, axis: str
 ) -> TemperatureValues | UnsetType:
     """Return the dependence of an axis on temperature, if temperature explains most of its slow variance."""
     if temperature is None or axis not in result.axes_of_temperature:

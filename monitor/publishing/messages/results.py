@@ -12,7 +12,7 @@ from drivers.credential_masking import mask_secrets
 from drivers.sample import AXES, Event, Floats
 from monitor.common import topics
 from monitor.common.health import Health
-from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.recursive_least_squares import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
@@ -259,7 +259,7 @@ class ThermalMessage(
     axes: dict[str, AxisThermalValues]
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: ThermalUpdate) -> Self:
+    def of(cls, device: str, t: float | None, samples: int, result: ThermalIntervalResult) -> Self:
         """Build the message from the result of the thermal model for an interval."""
         axes = {
             axis: AxisThermalValues(

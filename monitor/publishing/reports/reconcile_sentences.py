@@ -24,7 +24,7 @@ from monitor.common.units import (
     format_number,
     sensor_kind,
 )
-from monitor.noise.effect import parameter_units
+from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
 from monitor.publishing.exporters.noise import COEFFICIENT_EFFECTS
@@ -46,7 +46,7 @@ _DEGREES_PER_HOUR: Final = DEVIATION_UNITS["gyro"].factor  # °/h per rad/s
 _SI_OF_COEFFICIENTS: Final = {
     si: COEFFICIENT_UNITS[kind][letter]
     for letter, effect in COEFFICIENT_EFFECTS.items()
-    for kind, si in zip(KINDS, parameter_units(effect)[letter], strict=True)
+    for kind, si in zip(KINDS, gyro_and_accel_units(effect)[letter], strict=True)
 }
 FIELD_UNITS: Final = {
     **_SI_OF_COEFFICIENTS,
@@ -290,7 +290,7 @@ def parameter_unit(effect: str, name: str, axis: str, size: float) -> Unit:
     size
         Size of the value in the SI unit.
     """
-    si = parameter_units(EFFECTS[effect])[name][KINDS.index(sensor_kind(axis))]
+    si = gyro_and_accel_units(EFFECTS[effect])[name][KINDS.index(sensor_kind(axis))]
     return UNITS_BY_NAME.get(name) or field_unit(si, size)
 
 

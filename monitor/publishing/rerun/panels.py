@@ -23,8 +23,8 @@ from monitor.common.units import (
     sensor_kind,
 )
 from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
-from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
+from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
@@ -220,7 +220,7 @@ class ThermalPanel(Panel):
                 f"thermal/{axis}", [*lines, (f"{axis} 95 % low", dim, 0.75), (f"{axis} 95 % high", dim, 0.75)]
             )
 
-    def draw(self, unix_s: Floats, results: Sequence[ThermalUpdate]) -> None:
+    def draw(self, unix_s: Floats, results: Sequence[ThermalIntervalResult]) -> None:
         """Draw the results."""
         for axis in AXES:
             rows = np.array([self._row(one.axes.get(axis)) for one in results])
@@ -229,7 +229,7 @@ class ThermalPanel(Panel):
                 self.scene.log_scalars(self.path(f"thermal/{axis}"), unix_s, rows * factor)
 
     @staticmethod
-    def _row(one: AxisThermalUpdate | None) -> tuple[float, float, float, float]:
+    def _row(one: PredictedAxisInterval | None) -> tuple[float, float, float, float]:
         """Return measured bias, predicted bias, and the ends of its interval."""
         if one is None or one.one_step is None:
             return (np.nan if one is None else one.bias), np.nan, np.nan, np.nan

@@ -19,10 +19,10 @@ from scipy.fft import irfft, next_fast_len, rfft
 from drivers.sample import Floats
 from monitor.noise.effects import (
     PoissonSteps,
+    RandomSampleHold,
     RandomTelegraph,
     RateRamp,
     Resolution,
-    SampleHold,
     Saturation,
     TemperatureBias,
     TemperatureLag,
@@ -282,7 +282,7 @@ def diagnose_values(seen: WhitenedAxis) -> Finding:
     have = {type(effect) for effect in seen.effects}
     shown = seen.axis.shown
     best = NO_FINDING
-    for kind, found in ((Resolution, shown.levels), (Saturation, shown.clipped), (SampleHold, shown.repeats)):
+    for kind, found in ((Resolution, shown.levels), (Saturation, shown.clipped), (RandomSampleHold, shown.repeats)):
         if found is not None and kind not in have and found.gain > best.gain:
             best = Finding(found.gain, Location())
     if best.gain and shown.clipped is not None and best.gain == shown.clipped.gain:

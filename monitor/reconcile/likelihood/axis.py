@@ -21,8 +21,8 @@ from monitor.noise.effects import (
     BandwidthLimit,
     Bias,
     NoiseStep,
+    RandomSampleHold,
     Resolution,
-    SampleHold,
     Saturation,
 )
 from monitor.noise.spectrum import Spectrum, white_noise_spectrum
@@ -342,7 +342,7 @@ def _spectral_transforms(effects: Sequence[Effect], shown: ValueStatistics) -> l
     found = [
         effect
         for effect in effects
-        if isinstance(effect, Transform) and not (replaced and isinstance(effect, SampleHold))
+        if isinstance(effect, Transform) and not (replaced and isinstance(effect, RandomSampleHold))
     ]
     return sorted(found, key=lambda effect: TRANSFORM_ORDER.index(type(effect)))
 

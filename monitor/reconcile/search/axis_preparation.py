@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.noise.effect import Effect
-from monitor.noise.effects import Outliers, SampleHold, Saturation
+from monitor.noise.effects import Outliers, RandomSampleHold, Saturation
 from monitor.reconcile.likelihood.axis import Axis, Effects, RegressorCache, ValueStatistics
 from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
 from monitor.reconcile.likelihood.outlier_statistics import fit_outliers
@@ -100,7 +100,7 @@ def _repair_samples(y: Floats, shown: ValueStatistics, effects: Effects, rng: np
     Repeats and clipping are repaired only if they are among the effects.
     """
     missing = ~np.isfinite(y)
-    if _first_of_type(effects, SampleHold) and shown.repeats:
+    if _first_of_type(effects, RandomSampleHold) and shown.repeats:
         missing = missing | shown.repeats.mask
     repaired = fill_missing(y, missing, rng)
     limit = _first_of_type(effects, Saturation)

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.noise.effect import Effect
-from monitor.noise.effects import Outliers, Resolution, SampleHold, Saturation, Sinusoidal
+from monitor.noise.effects import Outliers, RandomSampleHold, Resolution, Saturation, Sinusoidal
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.likelihood.axis import Axis, AxisFit, Effects, RegressorCache
@@ -28,7 +28,7 @@ from monitor.reconcile.search.axis_preparation import measure_value_statistics, 
 
 MIN_HALF_GAIN_NATS: Final = 5.0
 """Smallest gain in nats that one half must be able to provide."""
-SAMPLE_EFFECTS: Final = (Resolution, Saturation, SampleHold, Outliers)
+SAMPLE_EFFECTS: Final = (Resolution, Saturation, RandomSampleHold, Outliers)
 """Effects that are visible in single samples and not in the spectrum."""
 TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too little evidence for the effect"
 """Reason why a weak effect is not validated."""

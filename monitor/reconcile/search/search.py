@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from monitor.noise.effect import Effect, Leak
-from monitor.noise.effects import BiasStep, Outliers, SampleHold, Saturation
+from monitor.noise.effects import BiasStep, Outliers, RandomSampleHold, Saturation
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, run_diagnostics
 from monitor.reconcile.diagnostics.plot_data import plot_data
@@ -46,7 +46,7 @@ MAX_VALIDATION_ATTEMPTS: Final = 3
 """Number of candidates of one kind that may fail cross-validation before the next kind is tried."""
 MIN_FINER_BINS: Final = 8
 """Number of additional bins from which finer bins are worth a new fit."""
-REPAIRED_EFFECTS: Final = frozenset({Saturation, SampleHold, Outliers})
+REPAIRED_EFFECTS: Final = frozenset({Saturation, RandomSampleHold, Outliers})
 """Effects after which the samples are repaired again."""
 DISTRIBUTION_DIAGNOSTICS: Final = ("tails", "variance")
 """Diagnostics that test whether samples are Gaussian and stationary."""

@@ -24,10 +24,10 @@ from monitor.noise.effects import (
     ExponentiallyCorrelated,
     NoiseStep,
     Outliers,
+    RandomSampleHold,
     RateRamp,
     RateRandomWalk,
     Resolution,
-    SampleHold,
     Saturation,
     ScaleFactor,
 )
@@ -151,9 +151,9 @@ def _value_trials(seen: WhitenedAxis) -> list[Trial]:
         ends = shown.clipped
         saturation = Saturation(limit=ends.limit.value)
         found.append(_penalised_trial(saturation, ends.gain, {"limit": _scaled_bounds(ends.limit)}, ends.count))
-    if shown.repeats and SampleHold not in seen.types:
+    if shown.repeats and RandomSampleHold not in seen.types:
         twice = shown.repeats
-        hold = SampleHold(fraction=min(twice.fraction.value, 0.999))
+        hold = RandomSampleHold(fraction=min(twice.fraction.value, 0.999))
         bounds = {"fraction": _scaled_bounds(twice.fraction)}
         found.append(_penalised_trial(hold, twice.gain, bounds, round(twice.count)))
     return _best_first(found)

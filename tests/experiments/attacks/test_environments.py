@@ -19,7 +19,7 @@ import pytest
 
 import imu_monitor
 from drivers.sample import AXES
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.daemon.operations import live_reconcile
 
 ROOT: Final = Path(imu_monitor.__file__).resolve().parent

@@ -28,7 +28,7 @@ from drivers.sample import AXES
 from drivers.settings_model import SettingsModel, WordOr, fields_by_key
 from monitor import cli
 from monitor.commands.analyze import Request, run_analysis
-from monitor.common import config_files
+from monitor.common import shipped_file_paths
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature
@@ -88,7 +88,7 @@ def leaves(kind: Any) -> Iterator[Any]:
 def arguments(tmp_path: Path) -> dict[tuple[str, ...], list[str]]:
     """Valid arguments of each command, without the options."""
     rng = np.random.default_rng(1)
-    recording, model = tmp_path / "r.npz", str(config_files.CONFIG_FOLDER / "models" / "consumer-mems.toml")
+    recording, model = tmp_path / "r.npz", str(shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml")
     warm = 25.0 + 5.0 * np.sin(np.arange(2000) / 200.0)
     np.savez(recording, t=np.arange(2000) / 100.0, temperature=warm, **{a: rng.normal(size=2000) for a in AXES})  # type: ignore[arg-type]
     config = tmp_path / "c.toml"

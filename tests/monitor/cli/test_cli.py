@@ -25,8 +25,8 @@ import pytest
 from drivers.recordings import save_samples
 from drivers.sample import AXES
 from monitor.cli import main, report_failed_thread
-from monitor.common.config_files import CONFIG_FOLDER
-from monitor.noise.catalogue import read_model
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.noise.model_catalogue import read_model
 from monitor.settings.loading import load
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 

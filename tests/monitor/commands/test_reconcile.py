@@ -12,8 +12,9 @@ import pytest
 
 from drivers.errors import ConfigError, NotReady, RecordingError
 from monitor.cli import main
-from monitor.commands import reconcile, simulate
-from monitor.commands.reconcile import ComparisonRequest, compare_recordings, unique_names
+from monitor.commands import reconcile
+from monitor.commands import simulate_recording as simulate
+from monitor.commands.reconcile import ComparisonRequest, compare_recordings, unique_recording_names
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, BiasStep, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import Reconciliation
@@ -154,8 +155,8 @@ def test_two_answers_at_least_are_needed(tmp_path: Path) -> None:
 
 def test_names_are_those_of_the_files_and_differ(tmp_path: Path) -> None:
     paths = [Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/RUN.NPZ"), Path("d/run-2.csv"), tmp_path / "segments"]
-    assert list(unique_names(paths)) == ["run", "run-2", "RUN", "run-2-2", "segments"]
-    assert list(unique_names([Path(".csv"), Path("x.parquet")])) == [".csv", "x"]
+    assert list(unique_recording_names(paths)) == ["run", "run-2", "RUN", "run-2-2", "segments"]
+    assert list(unique_recording_names([Path(".csv"), Path("x.parquet")])) == [".csv", "x"]
 
 
 def test_what_cannot_be_compared_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

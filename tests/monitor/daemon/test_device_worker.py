@@ -16,7 +16,7 @@ from monitor.daemon.device import device_worker
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import Status
@@ -43,7 +43,12 @@ class Caught:
         self.counts.append(received)
 
     def result(self, device, unix_s, received, result):
-        kept = {Estimate: self.estimates, ModelGap: self.gaps, ThermalUpdate: self.thermals, DriftUpdate: self.drifts}
+        kept = {
+            Estimate: self.estimates,
+            ModelGap: self.gaps,
+            ThermalIntervalResult: self.thermals,
+            DriftUpdate: self.drifts,
+        }
         if isinstance(result, SlowStatistics):
             self.totals.append((received, *result))
             self.total_times.append(unix_s)

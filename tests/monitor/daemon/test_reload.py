@@ -21,7 +21,7 @@ from monitor.daemon import reload
 from monitor.daemon.output import Output
 from monitor.daemon.outputs import TableOutput
 from monitor.daemon.service import Service
-from monitor.noise.catalogue import read_model
+from monitor.noise.model_catalogue import read_model
 from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.terminal import live_table
 from monitor.settings import loading

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monitor.noise.effect import Transform, parameter_units
+from monitor.noise.effect import Transform, gyro_and_accel_units
 from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER
 from monitor.noise.temperature import Temperature
 from tests.contracts.effect_examples import AXIS, model
@@ -46,4 +46,4 @@ def test_page_says_nan_where_the_code_does(name):
 
 def test_temperature_is_there():
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", SECTIONS["temperature"], flags=re.MULTILINE))
-    assert rows == {name: unit for name, (unit, _) in parameter_units(Temperature).items()}
+    assert rows == {name: unit for name, (unit, _) in gyro_and_accel_units(Temperature).items()}

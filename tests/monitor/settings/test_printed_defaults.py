@@ -12,7 +12,7 @@ from drivers.decoders.dbc.settings import SignalSettings
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
 from drivers.settings_model import SettingsModel, fields_by_key, find_model, read_settings
-from monitor.commands.check import check
+from monitor.commands.check_config import check_configuration
 from monitor.settings import printed_defaults
 from monitor.settings.driver_settings import FaultsTable, link_names, link_settings
 from monitor.settings.schema import (
@@ -58,7 +58,7 @@ def folder(tmp_path: Path) -> Path:
 
 def check_text(folder: Path, text: str) -> None:
     (folder / "my.toml").write_text(f'[[device]]\nname = "a"\nmodel = "consumer-mems"\n{text}\n', "utf-8")
-    config, wrong = check(folder / "my.toml")
+    config, wrong = check_configuration(folder / "my.toml")
     assert wrong == []
     assert config is not None
 
@@ -90,7 +90,7 @@ def test_an_example_of_a_default_has_its_value(model: type[SettingsModel]) -> No
 
 def test_the_file_is_a_valid_configuration(tmp_path: Path) -> None:
     (tmp_path / "my.toml").write_text(printed_defaults.format_defaults(), "utf-8")
-    config, wrong = check(tmp_path / "my.toml")
+    config, wrong = check_configuration(tmp_path / "my.toml")
     assert wrong == []
     assert config is not None
     assert config.devices[0].axes == AxisMap()

@@ -11,7 +11,7 @@ import pytest
 from drivers.driver import Driver
 from drivers.sample import SampleBlock
 from drivers.timing.sample_clock import SampleClock
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.settings.loading import FaultsTable, VirtualTable
 from monitor.simulator import VirtualImu
 from monitor.simulator.can_port import CanPort

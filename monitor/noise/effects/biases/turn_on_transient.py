@@ -14,7 +14,7 @@ from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
 @dataclass(frozen=True, slots=True)
 class TurnOnTransient(Source):
-    """Exponential transient A exp(−t/τ) from the first sample on: the warm-up term of the drift model of IEEE Std 952.
+    """Exponential transient A exp(−t/τ), which begins at the first sample (warm-up term of IEEE Std 952).
 
     >>> bool(np.isnan(TurnOnTransient(amplitude=1e-3, time_constant=60.0).avar(np.array([1.0]), 0.01)[0]))
     True
@@ -30,7 +30,7 @@ class TurnOnTransient(Source):
         return undefined_spectrum(tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Decay":
-        """Return a transient that begins at its first sample, even if it is added to a running stream."""
+        """Return a transient that begins at the first sample after the call, also in a running stream."""
         return _Decay(self.amplitude, 1.0 / (self.time_constant * rate_hz))
 
 

@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class RateRamp(Source):
-    """Constant slope, IEEE Std 952 eq. C.32: σ²(τ) = R²τ²/2. It is deterministic and has no noise spectrum.
+    """Constant slope of the rate: σ²(τ) = R²τ²/2 (IEEE Std 952 eq. C.32). A ramp is deterministic and has no spectrum.
 
     >>> float(RateRamp(R=2e-6).avar(np.array([1000.0]), 0.01)[0])
     2e-06

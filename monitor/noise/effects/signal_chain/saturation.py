@@ -17,10 +17,11 @@ NOISE_SIGMAS: Final = 6.0
 
 @dataclass(frozen=True, slots=True)
 class Saturation(Transform):
-    """Clipping at the range: y = x clipped at ± limit.
+    """Clipping of the measurement at ± limit.
 
-    If level, lines and six standard deviations of the noise of an hour stay within the range, nothing is clipped.
-    Spectrum and Allan variance are then unchanged. Otherwise there is no closed form, and they are NaN.
+    The range must contain the bias, all sinusoids, the slope, and six standard deviations of the noise during one hour.
+    In this case, nothing is clipped, and spectrum and Allan variance do not change. Otherwise, no closed form is known,
+    and spectrum and Allan variance are NaN.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> clipped = [Saturation(limit=x).transform_spectrum(white_noise_spectrum(1.0, 0.01)) for x in (10.0, 1.0)]

@@ -11,7 +11,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class ScaleFactor(Transform):
-    """Factor on the measurement of the axis, y = f·x: σ²(τ) and S(f) times f² (IEEE Std 952, scale factor).
+    """Scale factor f of the axis (IEEE Std 952). The factor multiplies Allan variance and spectrum by f².
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> float(ScaleFactor(factor=2.0).transform_spectrum(white_noise_spectrum(1.0, 0.01)).avar(np.array([0.01]))[0])

@@ -232,7 +232,7 @@ def command_line(data: bytes) -> None:
         options.tau,
         options.order,
         loading.check_viewer_mode,
-        lambda word: options.duration("--window", word),
+        lambda word: options.parse_duration("--window", word),
     ):
         try:
             possible(read(text))

@@ -13,7 +13,7 @@ import pytest
 from drivers.errors import LinkLost
 from drivers.links.base import Carrier
 from drivers.sample import Chunk
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.service import Service
 from monitor.settings import loading

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from drivers.sample import AXES
-from monitor.noise.effects import AngleRandomWalk, Outliers, Resolution, SampleHold, Saturation
+from monitor.noise.effects import AngleRandomWalk, Outliers, RandomSampleHold, Resolution, Saturation
 from monitor.reconcile.search.axis_preparation import (
     _may_leak,
     _repair_samples,
@@ -54,7 +54,7 @@ def test_repeats_are_mended_where_the_model_has_them():
     assert shown.repeats.fraction.value == pytest.approx(0.2, abs=0.03)
     as_it_is = _repair_samples(y, shown, (WHITE,), np.random.default_rng(RNG))
     np.testing.assert_array_equal(as_it_is, y)
-    put_right = _repair_samples(y, shown, (WHITE, SampleHold(fraction=0.2)), np.random.default_rng(RNG))
+    put_right = _repair_samples(y, shown, (WHITE, RandomSampleHold(fraction=0.2)), np.random.default_rng(RNG))
     assert np.count_nonzero(np.diff(put_right) == 0.0) == 0
     np.testing.assert_array_equal(put_right[~held], y[~held])
     assert np.std(put_right) == pytest.approx(SIGMA, rel=0.03)

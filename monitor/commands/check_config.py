@@ -13,7 +13,7 @@ from drivers.errors import ConfigError
 from monitor.settings.loading import Config, ModelUse, examine
 
 
-def check(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
+def check_configuration(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
     """Read a configuration file and find all mistakes.
 
     Parameters
@@ -41,7 +41,7 @@ def _problems(use: ModelUse) -> Iterator[str]:
     try:
         if use.model is not None:
             from monitor.daemon.operations.limits import make_bounds
-            from monitor.noise.catalogue import read_model
+            from monitor.noise.model_catalogue import read_model
 
             make_bounds(use.limits, read_model(use.model))
     except ConfigError as error:

@@ -7,7 +7,7 @@ import typer
 
 from drivers.errors import ConfigError
 from drivers.file_access import real_path
-from monitor.cli.shared import options, output, terminal_session
+from monitor.cli.shared import options, output, service_in_terminal
 
 
 def simulate(
@@ -30,20 +30,20 @@ def simulate(
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
     """Write a recording of a noise model. An incomplete file never appears."""
-    from monitor.commands import simulate as simulation
-    from monitor.noise.catalogue import load_model
+    from monitor.commands import simulate_recording as simulation
+    from monitor.noise.model_catalogue import load_model
 
-    length_s = options.duration("--seconds", seconds)
-    output.check_place("--json", json)
+    length_s = options.parse_duration("--seconds", seconds)
+    output.check_output_folder("--json", json)
     for option, path in (("--json", json), ("--temperature-from", temperature_from)):
         if path is not None and real_path(path) == real_path(out):
             raise ConfigError(f"{option}: {path} is what --out writes; another name is needed")
     noise = load_model(model, Path.cwd())
     request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
-    terminal_session.end_on_sigterm()
-    with output.progress() as tell:
+    service_in_terminal.exit_on_sigterm()
+    with output.show_progress() as tell:
         result = simulation.run_simulation(request, tell)
     if json is not None:
-        output.write("--json", json, result.to_json() + b"\n")
+        output.write_bytes("--json", json, result.to_json() + b"\n")
     if json != Path("-"):
         typer.echo(result.text())

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from monitor.drift.compensation.motion_filter_bank import (
+from monitor.drift.compensation.carrier_rate_filter_bank import (
     filter_memories,
     filter_sample,
     gain_table,

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from drivers import file_access
 from drivers.errors import ConfigError
-from monitor.common.config_files import model_path
+from monitor.common.shipped_file_paths import model_path
 from monitor.noise.model import NoiseModel
 
 
@@ -14,7 +14,7 @@ def read_model(path: Path) -> NoiseModel:
     Raises
     ------
     ConfigError
-        If the file cannot be read or is not valid. Each line names the file and the place in it.
+        If the file cannot be read or is not valid. Each line names the file and the table.
     """
     try:
         return NoiseModel.from_toml(file_access.read_small_file(path).decode("utf-8"))
@@ -34,7 +34,7 @@ def load_model(name: str, folder: Path) -> NoiseModel:
     name : str
         Name in the catalogue, or path of a file.
     folder : Path
-        Folder at which relative paths begin.
+        Folder to which relative paths refer.
 
     Raises
     ------

@@ -21,9 +21,9 @@ from drivers.errors import NotReady
 from drivers.sample import AXES, Floats
 from monitor.drift.thermal.interval_means import compute_interval_means
 from monitor.drift.thermal.temperature_dependence import TemperatureDependence, find_dependence
-from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means, fit_thermal_model
+from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means_suffice, fit_thermal_model
 from monitor.drift.thermal.thermal_model import predict
-from monitor.drift.thermal.thermal_study import round_interval_s
+from monitor.drift.thermal.thermal_study import choose_interval_s
 from monitor.estimation.allan.batch import EachAxis
 from monitor.estimation.analysis import Analysis, fit_other_samples
 from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
@@ -33,7 +33,7 @@ SLOW_LETTERS: Final = ("K", "R")
 
 
 @dataclass(frozen=True, slots=True)
-class TemperatureShare:
+class TemperatureRemoval:
     """Dependence of each axis on temperature, and the coefficients after its removal from the bias."""
 
     models: Mapping[str, str]  # axis -> form of its model, for the axes with a fitted model
@@ -71,7 +71,7 @@ class TemperatureShare:
         after = float((self.coefficients.hi if bounded else self.coefficients.value)[at])
         return max(1.0 - (after / float(self.before.value[at])) ** 2, 0.0)
 
-    def is_significant(self, letter: str, axis: str) -> bool:
+    def has_decreased_significantly(self, letter: str, axis: str) -> bool:
         """Return True if the coefficient has changed significantly: its new upper limit lies below its old interval.
 
         Parameters
@@ -93,7 +93,7 @@ def temperature_varied(temperatures_c: Floats) -> bool:
     )
 
 
-def remove_temperature(result: Analysis, temperature_c: Floats, each: EachAxis = map) -> TemperatureShare | None:
+def remove_temperature(result: Analysis, temperature_c: Floats, each: EachAxis = map) -> TemperatureRemoval | None:
     """Return the coefficients of an analysis without the temperature part of the bias.
 
     Parameters
@@ -107,16 +107,16 @@ def remove_temperature(result: Analysis, temperature_c: Floats, each: EachAxis =
 
     Returns
     -------
-    TemperatureShare or None
+    TemperatureRemoval or None
         None if no axis depends on temperature.
     """
     rate_hz = result.estimate.rate_hz
-    interval_s = round_interval_s(len(result.values) / rate_hz, rate_hz)
+    interval_s = choose_interval_s(len(result.values) / rate_hz, rate_hz)
     values, models, dependences = result.values, dict[str, str](), dict[str, TemperatureDependence]()
     for at, axis in enumerate(AXES):
         means = compute_interval_means(result.values[:, at], temperature_c, rate_hz, interval_s)
         try:
-            check_means(means)
+            check_means_suffice(means)
         except NotReady:
             continue
         dependence = find_dependence(means)
@@ -124,7 +124,7 @@ def remove_temperature(result: Analysis, temperature_c: Floats, each: EachAxis =
             continue
         dependences[axis] = dependence
         model = fit_thermal_model(means).model
-        if model.shape.memory or model.shape.powers:
+        if model.shape.difference_equation_order or model.shape.powers:
             values = values.copy() if values is result.values else values
             course = predict(model, means.temperature_c, began=True).bias
             values[:, at] -= interpolate_smoothly(course, round(means.interval_s * rate_hz), len(values))
@@ -136,7 +136,7 @@ def remove_temperature(result: Analysis, temperature_c: Floats, each: EachAxis =
     if models:
         fit = fit_other_samples(result, values, each)
         after, k_or_r = fit.coefficients, fit.k_or_r
-    return TemperatureShare(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
+    return TemperatureRemoval(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
 
 
 def interpolate_smoothly(course: Floats, length: int, n: int) -> Floats:

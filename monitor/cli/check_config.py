@@ -22,7 +22,7 @@ def check(
     ] = None,
 ) -> None:
     """Read a configuration file and report all mistakes. No device is opened."""
-    from monitor.commands.check import check as check_configuration
+    from monitor.commands.check_config import check_configuration
 
     if print_defaults:
         typer.echo(_defaults(link, decoder), nl=False)

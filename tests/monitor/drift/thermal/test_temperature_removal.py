@@ -7,7 +7,7 @@ import pytest
 from scipy.interpolate import CubicSpline
 
 from drivers.sample import make_block
-from monitor.drift.thermal.temperature_share import interpolate_smoothly, remove_temperature, temperature_varied
+from monitor.drift.thermal.temperature_removal import interpolate_smoothly, remove_temperature, temperature_varied
 from monitor.estimation.analysis import analyze
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.publishing.terminal.thermal_text import temperature_notes
@@ -40,9 +40,9 @@ def test_what_was_temperature_is_gone_and_the_rest_stays(warm):
     k = SYMBOLS.index("K")
     assert found.before.status[k, 0] == found.before.status[k, 1] == Status.ESTIMATED
     assert found.variance_share("K", "gx") > 0.9
-    assert found.is_significant("K", "gx")
+    assert found.has_decreased_significantly("K", "gx")
     assert found.coefficients.value[k, 1] == pytest.approx(3e-6, rel=0.4)
-    assert not found.is_significant("K", "gy")
+    assert not found.has_decreased_significantly("K", "gy")
     assert found.coefficients.value[1, 0] == pytest.approx(N, rel=0.03)  # N is as it was
     assert "gy" not in found.dependences
     assert found.axes_of_temperature == ("gx",)

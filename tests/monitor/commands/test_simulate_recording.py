@@ -12,7 +12,7 @@ from drivers.errors import ConfigError
 from drivers.recordings import FORMATS, load_samples, save_samples
 from drivers.sample import AXES
 from monitor.commands import analyze
-from monitor.commands.simulate import CHUNK_ROWS, Request, run_simulation
+from monitor.commands.simulate_recording import CHUNK_ROWS, Request, run_simulation
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
 

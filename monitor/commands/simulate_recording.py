@@ -206,7 +206,7 @@ def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:
             "seconds": result.seconds,
             "samples": result.samples,
             "axes": result.axes,
-            "drawn": stream.truth(),
+            "drawn": stream.drawn_values(),
         }
     )
 

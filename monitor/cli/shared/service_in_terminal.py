@@ -29,7 +29,7 @@ STDERR: Final = "standard error"
 """Name of standard error in messages."""
 
 
-def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
+def run_service(config: "Config", seconds: float | None, viewer: str | None) -> None:
     """Run the service, with a live table in a terminal, or else with log lines and the final table at the end.
 
     Parameters
@@ -84,7 +84,7 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
                 service.stop()
 
             # in a terminal, SIGHUP means that the terminal has been closed
-            on_signals(stop, stop if terminal else service.reload)
+            install_signal_handlers(stop, stop if terminal else service.reload)
             table.states = board
             service.run(seconds)
         finally:
@@ -110,7 +110,7 @@ def _table_error(screen: "QueuedWriter", unread: bool) -> Exception | None:
     return error
 
 
-def view(
+def run_fleet_viewer(
     keyexpr: str, connect: Sequence[str], file: Path | None, detail: Sequence[str], mode: str, seconds: float | None
 ) -> None:
     """Run the viewer of a fleet until a signal, and print its address and its errors on standard error.
@@ -152,7 +152,7 @@ def view(
     arriving = ZenohSubscriber(keyexpr, connect, file, keys)
     rerun = RerunView(ViewerSettings(mode=mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
     stop = threading.Event()
-    on_signals(stop.set)
+    install_signal_handlers(stop.set)
 
     def say(text: str) -> None:
         print(text, file=_ErrorStream(), flush=True)
@@ -164,7 +164,7 @@ def view(
         FleetView(arriving, rerun, keys).run(stop, say, seconds)
 
 
-def with_history(config: "Config", history_s: float | None) -> "Config":
+def with_history_span(config: "Config", history_s: float | None) -> "Config":
     """Return the configuration with another time span of history in the viewer.
 
     Parameters
@@ -276,7 +276,7 @@ def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]
     return {key: mask_secrets(value) if isinstance(value, str) else value for key, value in line.items()}
 
 
-def on_signals(stop: Callable[[], None], hung_up: Callable[[], None] | None = None) -> None:
+def install_signal_handlers(stop: Callable[[], None], hung_up: Callable[[], None] | None = None) -> None:
     """Install the signal handlers of a session.
 
     The first SIGINT or SIGTERM calls ``stop``. A second SIGINT ends the process at once. SIGHUP calls ``hung_up``.
@@ -302,7 +302,7 @@ def on_signals(stop: Callable[[], None], hung_up: Callable[[], None] | None = No
         signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=call, name="hung up", daemon=True).start())
 
 
-def end_on_sigterm() -> None:
+def exit_on_sigterm() -> None:
     """Let SIGTERM end a command as Ctrl-C does, so that incomplete files are removed."""
 
     def ended(_number: int, _frame: Any) -> NoReturn:
