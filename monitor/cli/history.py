@@ -136,7 +136,7 @@ def _from_file(source: Path | None, name: str | None) -> Get:
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
     """Return a function that answers over zenoh."""
-    from monitor.publishing.zenoh.history_query import query_histories
+    from monitor.publishing.zenoh.history_client import query_histories
 
     def get(asked: "HistoryQuery") -> "HistoryTable":
         found = {one.device: one for one in query_histories(endpoint, name or "*", asked.parameters(), prefix, file)}

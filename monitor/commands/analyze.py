@@ -150,11 +150,11 @@ def draw_plots(results: Results, path: Path, title: str) -> None:
     ConfigError
         The plotting library is not installed, or the file cannot be written.
     """
-    from monitor.publishing.plots.analysis_plot import DrawnAnalysis, save_analysis_plot
+    from monitor.publishing.plots.analysis_plot import AnalysisPlotData, save_analysis_plot
 
     result = results.analysis
     marks = [ChangeMark(change.since / result.estimate.rate_hz, AXES[change.axis]) for change in result.changes]
-    drawn = DrawnAnalysis(result, other_deviations(results.total, results.hadamard), results.dynamic, marks)
+    drawn = AnalysisPlotData(result, other_deviations(results.total, results.hadamard), results.dynamic, marks)
     if path.suffix == ".html":
         from monitor.publishing.reports.analysis_report import write_html_report
 

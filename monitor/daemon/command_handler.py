@@ -6,7 +6,7 @@ import structlog
 
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.operations.live_reconcile import Job, Reconciler
-from monitor.publishing.messages.results import ResetMessage
+from monitor.publishing.messages.results import ResetReply
 from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
 
 _log = structlog.get_logger("imu-monitor")
@@ -40,7 +40,7 @@ class CommandHandler:
             if command.device in workers:
                 self._execute(command, workers[command.device])
             else:
-                command.refuse("the device was removed from the configuration")
+                command.reply_refusal("the device was removed from the configuration")
 
     def publish_reconciled(self, workers: Mapping[str, DeviceWorker]) -> None:
         """Publish an event for each reconciliation that has finished since the last call.
@@ -64,18 +64,18 @@ class CommandHandler:
             case "reset":
                 worker.reset()
                 now_s, received = worker.timeline.now_unix_s(), worker.driver.counts.received
-                command.answer(ResetMessage.of(worker.name, now_s, received, "the window is empty").encode())
+                command.reply_result(ResetReply.of(worker.name, now_s, received, "the window is empty").encode())
                 _log.info("reset", device=worker.name)
             case "reconcile":
                 self._reconcile(command, worker)
             case other:
-                command.refuse(f'unknown command "{other}"; known commands are reset and reconcile')
+                command.reply_refusal(f'unknown command "{other}"; known commands are reset and reconcile')
 
     def _reconcile(self, command: Command, worker: DeviceWorker) -> None:
         """Start a reconciliation with a copy of the window; a thread of its own sends the answer."""
         window = worker.window_snapshot()
         if window is None:
-            command.refuse("no samples yet")
+            command.reply_refusal("no samples yet")
             return
         received, device = worker.driver.counts.received, worker.device
         newest_s = worker.timeline.unix_s(worker.pipeline.newest_ns)

@@ -286,7 +286,7 @@ class Service:
 
     def _add(self, worker: DeviceWorker, imu: "VirtualImu | None") -> None:
         """Start an added device while the other devices continue."""
-        self.zenoh.add(worker.name)
+        self.zenoh.add_device(worker.name)
         if self.recorder is not None:
             self.recorder.add(_segment_origins(self.config.storage, worker.device))
         if imu is not None:
@@ -303,7 +303,7 @@ class Service:
             _log.warning("reader did not end in time", device=worker.name)
         worker.work(time.monotonic(), drain=True)
         self.workers = [one for one in self.workers if one is not worker]
-        self.zenoh.remove(worker.name)
+        self.zenoh.remove_device(worker.name)
         if self.recorder is not None:
             self.recorder.remove(worker.name)
             self._work_until(lambda: self.recorder is None or not self.recorder.is_recording(worker.name))

@@ -57,7 +57,7 @@ class CompensatedRows:
 
 
 @dataclass(frozen=True, slots=True)
-class OverviewText:
+class DeviceTableText:
     """Table of all devices as Markdown. It belongs to no device, so the name of its device is empty."""
 
     text: str
@@ -128,7 +128,9 @@ RESULT_KINDS: Final = (
     ),
     ResultKind(Event, (EventMessage,), (Drawing("EventsPanel"),)),
     ResultKind(Health, (StatusMessage,), (Drawing("HealthPanel", keep_newest),)),
-    ResultKind(OverviewText, drawings=(Drawing("OverviewPanel", keep_newest),), size_bytes=lambda one: len(one.text)),
+    ResultKind(
+        DeviceTableText, drawings=(Drawing("DeviceTablePanel", keep_newest),), size_bytes=lambda one: len(one.text)
+    ),
     ResultKind(
         CompensatedRows,
         drawings=(Drawing("CompensatedPanel"),),

@@ -43,7 +43,7 @@ from monitor.history.sqlite_store import FILE_NAME, HistoryStore
 from monitor.history.stored_events import StoredEvent
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_catalogue import read_model
-from monitor.publishing.plots.diagnostic_figure import diagnostic_svg
+from monitor.publishing.plots.diagnostic_figure import compared_diagnostic_svg
 from monitor.publishing.rerun import sinks
 from monitor.publishing.rerun.fleet import FleetView
 from monitor.publishing.rerun.view import RerunView
@@ -445,7 +445,7 @@ def reconcile_hidden_effects(folder: Path) -> AxisResult:
 def save_diagnostic_picture(result: AxisResult, when: str, path: Path) -> Path:
     """Draw spectrum, Allan deviation and tails of one axis with one model, as in the report."""
     views = {view.lens: view for view in getattr(result, when).views}
-    drawn = [diagnostic_svg([("", views[lens])], result.axis, 5.2, 3.3) for lens in ("psd", "allan", "tails")]
+    drawn = [compared_diagnostic_svg([("", views[lens])], result.axis, 5.2, 3.3) for lens in ("psd", "allan", "tails")]
     page = path.with_suffix(".html")
     style = "body{margin:8px;display:flex;font-family:sans-serif;background:white}svg{width:520px;height:330px}"
     page.write_text(f"<meta charset=utf-8><style>{style}</style>{''.join(drawn)}")
@@ -558,7 +558,7 @@ def window() -> Iterator[tuple[int, Callable[[Path], None]]]:
         *("--bind", "127.0.0.1", "--port", str(port), "--headless", "--window-size", size, "--hide-welcome-screen")
     ])  # fmt: skip
     try:
-        wait_until(lambda: sinks.listens(port), 30.0)
+        wait_until(lambda: sinks.is_listening(port), 30.0)
         yield port, lambda path: ViewerClient(sinks.server_url(port)).save_screenshot(str(path))
     finally:
         child.end()
@@ -572,7 +572,7 @@ def page_server() -> Iterator[tuple[int, str]]:
         *("--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port))
     ])  # fmt: skip
     try:
-        wait_until(lambda: sinks.listens(port) and sinks.listens(web_port), 30.0)
+        wait_until(lambda: sinks.is_listening(port) and sinks.is_listening(web_port), 30.0)
         yield port, f"http://127.0.0.1:{web_port}/?url={quote(sinks.server_url(port), safe='')}"
     finally:
         child.end()
@@ -675,7 +675,7 @@ def browser() -> Iterator[Page]:
             env={**os.environ, "NO_PROXY": "127.0.0.1"},
         )
         try:
-            wait_until(lambda: sinks.listens(port), 30.0)
+            wait_until(lambda: sinks.is_listening(port), 30.0)
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as reply:
                 tabs = [tab for tab in json.load(reply) if tab["type"] == "page"]
             yield Page(tabs[0]["webSocketDebuggerUrl"])

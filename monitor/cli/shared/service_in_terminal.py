@@ -137,7 +137,7 @@ def run_fleet_viewer(
     """
     import threading
 
-    from monitor.publishing.rerun.fleet import FleetView, detail_key
+    from monitor.publishing.rerun.fleet import FleetView, full_device_key
     from monitor.publishing.rerun.view import RerunView
     from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
     from monitor.publishing.terminal.queued_writer import QueuedWriter
@@ -148,7 +148,7 @@ def run_fleet_viewer(
         loading.check_viewer_mode(mode)
     except ConfigError as error:
         raise ConfigError(f"--viewer: {error}") from None
-    keys = tuple(dict.fromkeys(detail_key(device, keyexpr) for device in detail))
+    keys = tuple(dict.fromkeys(full_device_key(device, keyexpr) for device in detail))
     arriving = ZenohSubscriber(keyexpr, connect, file, keys)
     rerun = RerunView(ViewerSettings(mode=mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
     stop = threading.Event()
@@ -209,7 +209,12 @@ def _stderr_through(writer: "QueuedWriter") -> Iterator[None]:
 
     If the writer is still blocked at the end, standard error is detached, so that the process can end.
     """
-    from monitor.publishing.terminal.queued_writer import QueuedLines, can_write, descriptor_of, detach
+    from monitor.publishing.terminal.queued_writer import (
+        QueuedLines,
+        can_write,
+        descriptor_of,
+        redirect_to_null_device,
+    )
 
     stream = sys.stderr
     with contextlib.redirect_stderr(QueuedLines(writer, stream is not None and stream.isatty())):
@@ -218,7 +223,7 @@ def _stderr_through(writer: "QueuedWriter") -> Iterator[None]:
             yield
         finally:
             if not writer.close() or not can_write(descriptor_of(stream)):
-                detach(stream)
+                redirect_to_null_device(stream)
 
 
 def _same_file(one: TextIO | None, other: TextIO | None) -> bool:

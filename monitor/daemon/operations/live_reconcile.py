@@ -31,7 +31,7 @@ import numpy as np
 from drivers.sample import AXES, Floats
 from monitor.common.program import PROGRAM
 from monitor.estimation.window_snapshot import WindowSnapshot
-from monitor.publishing.messages.results import ReconcileMessage
+from monitor.publishing.messages.results import ReconcileReply
 from monitor.publishing.zenoh.publisher import Command
 
 COMMAND: Final = (*PROGRAM, "reconcile")
@@ -105,7 +105,7 @@ class Reconciler:
         """
         before = self._running.get(job.device)
         if before is not None and before.is_alive():
-            command.refuse("busy: a reconciliation of this device is already running")
+            command.reply_refusal("busy: a reconciliation of this device is already running")
             return
         name = f"reconcile of {job.device}"
         thread = threading.Thread(target=self._run, args=(job, command), name=name, daemon=True)
@@ -135,11 +135,11 @@ class Reconciler:
         try:
             result, status, folder = self._reconcile(job)
         except (OSError, RuntimeError) as error:
-            command.refuse(str(error))
+            command.reply_refusal(str(error))
             self._finished.put(Finished(job.device, f"reconcile failed: {error}"))
             return
-        head = ReconcileMessage(device=job.device, t=job.unix_s, samples=job.samples)
-        command.answer(head.encode_report(result, status, folder))
+        head = ReconcileReply(device=job.device, t=job.unix_s, samples=job.samples)
+        command.reply_result(head.encode_report(result, status, folder))
         self._finished.put(Finished(job.device, format_result(result, status)))
 
     def _reconcile(self, job: Job) -> tuple[dict[str, Any], int, str | None]:

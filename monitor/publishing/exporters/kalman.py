@@ -115,7 +115,7 @@ def _markov_time_s(N: float, K: float) -> float:
     return math.sqrt(3.0) * N / K / MARKOV_PEAK_AT
 
 
-def transition(dt_s: float, time_s: float) -> Floats:
+def bias_state_transition_matrix(dt_s: float, time_s: float) -> Floats:
     """Return the transition matrix F [3, 3] of angle, random-walk bias and Gauss-Markov bias.
 
     Parameters
@@ -129,7 +129,7 @@ def transition(dt_s: float, time_s: float) -> Floats:
     return np.array([[1.0, dt_s, time_s * lost], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0 - lost]])
 
 
-def process_noise(dt_s: float, N: float, K: float, sigma: float, time_s: float) -> Floats:
+def process_noise_matrix(dt_s: float, N: float, K: float, sigma: float, time_s: float) -> Floats:
     """Return the process noise Q [3, 3] of angle, random-walk bias and Gauss-Markov bias: ∫ F(s) G F(s)ᵀ ds.
 
     Parameters
@@ -192,8 +192,8 @@ def _axis(
         *lines,
         f"states = [{listed}]",
         *densities,
-        f"F = {_matrix(transition(dt_s, time_s)[:size, :size])}",
-        f"Q = {_matrix(process_noise(dt_s, N, K, sigma, time_s)[:size, :size])}",
+        f"F = {_matrix(bias_state_transition_matrix(dt_s, time_s)[:size, :size])}",
+        f"Q = {_matrix(process_noise_matrix(dt_s, N, K, sigma, time_s)[:size, :size])}",
     ]
 
 

@@ -21,7 +21,7 @@ from monitor.publishing.messages.message import encode_json, shared_fields
 from monitor.publishing.messages.results import (
     CoefficientValue,
     coefficient_values,
-    deviation_columns,
+    deviations_with_interval_ends,
     measured_axes,
 )
 
@@ -39,10 +39,10 @@ class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
     @classmethod
     def of(cls, curve: AllanCurve | TotalCurve | HadamardCurve, axis: int) -> Self:
         """Return the deviations of column ``axis`` of a curve."""
-        return cls(curve.tau_s, *deviation_columns(curve, axis))
+        return cls(curve.tau_s, *deviations_with_interval_ends(curve, axis))
 
 
-class TemperatureValues(msgspec.Struct, frozen=True, rename={"interval_s": "interval"}):
+class TemperatureDependenceValues(msgspec.Struct, frozen=True, rename={"interval_s": "interval"}):
     """Measures of how strongly the bias of an axis depends on temperature."""
 
     share: float
@@ -52,7 +52,7 @@ class TemperatureValues(msgspec.Struct, frozen=True, rename={"interval_s": "inte
     interval_s: float
 
 
-class WithoutTemperature(msgspec.Struct, frozen=True):
+class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
     """K and R of an axis after its temperature-correlated bias has been removed."""
 
     model: str
@@ -79,8 +79,8 @@ class AxisAnalysis(msgspec.Struct, frozen=True, kw_only=True):
     hadamard: AxisDeviations | UnsetType = UNSET
     coefficients: dict[str, CoefficientValue]
     bandwidth: float | None
-    temperature: TemperatureValues | UnsetType = UNSET
-    without_temperature: WithoutTemperature | UnsetType = UNSET
+    temperature: TemperatureDependenceValues | UnsetType = UNSET
+    without_temperature: CoefficientsWithoutTemperature | UnsetType = UNSET
 
 
 class MotionValues(msgspec.Struct, frozen=True):
@@ -205,7 +205,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
                 temperature=_temperature_values(result, temperature, axis),
                 without_temperature=UNSET
                 if temperature is None or axis not in temperature.models
-                else WithoutTemperature.of(temperature, axis),
+                else CoefficientsWithoutTemperature.of(temperature, axis),
             )
             for i, axis in measured
         }
@@ -246,8 +246,8 @@ class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag
 
 def _temperature_values(
     result: Analysis, temperature: TemperatureRemoval | None, axis: str
-) -> TemperatureValues | UnsetType:
+) -> TemperatureDependenceValues | UnsetType:
     """Return the dependence of an axis on temperature, if temperature explains most of its slow variance."""
     if temperature is None or axis not in result.axes_of_temperature:
         return UNSET
-    return TemperatureValues(**shared_fields(TemperatureValues, temperature.dependences[axis]))
+    return TemperatureDependenceValues(**shared_fields(TemperatureDependenceValues, temperature.dependences[axis]))

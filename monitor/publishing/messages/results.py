@@ -63,7 +63,7 @@ class CoefficientValue(msgspec.Struct, frozen=True):
     """The other symbol of K and R, if the data do not show which of the two is present."""
 
 
-class WindowMessage(
+class WindowResultMessage(
     Message,
     frozen=True,
     kw_only=True,
@@ -78,7 +78,7 @@ class WindowMessage(
     """Filled part of the window."""
 
 
-class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema()):
+class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema()):
     """Message ``imu/<device>/allan``: Allan deviations of each measured axis."""
 
     topic = topics.ALLAN
@@ -91,8 +91,8 @@ class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.sc
         recent = result.display_curve
         axes = {
             axis: AllanAxis(
-                *deviation_columns(result.curve, i),
-                recent=UNSET if recent is None else DeviationCurve(*deviation_columns(recent, i)),
+                *deviations_with_interval_ends(result.curve, i),
+                recent=UNSET if recent is None else DeviationCurve(*deviations_with_interval_ends(recent, i)),
             )
             for i, axis in measured_axes(result.curve)
         }
@@ -139,7 +139,7 @@ class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.sc
         )
 
 
-class CoefficientsMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema()):
+class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema()):
     """Message ``imu/<device>/coefficients``: Q, N, B, K and R of each measured axis."""
 
     topic = topics.COEFFICIENTS
@@ -197,7 +197,7 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     z: Floats | None = None
 
 
-class GapMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
+class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
     """Message ``imu/<device>/gap``: comparison of the measured deviations with the model in force."""
 
     topic = topics.GAP
@@ -285,7 +285,7 @@ class DeviationTable(msgspec.Struct, frozen=True, eq=False):
     @classmethod
     def of(cls, curve: TotalCurve | HadamardCurve) -> Self:
         """Return the deviations of the axes that have at least one."""
-        curves = {axis: DeviationCurve(*deviation_columns(curve, i)) for i, axis in enumerate(AXES)}
+        curves = {axis: DeviationCurve(*deviations_with_interval_ends(curve, i)) for i, axis in enumerate(AXES)}
         return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
 
 
@@ -422,7 +422,7 @@ class StatusMessage(
         return Health(**known, latency_p50_s=self.latency.p50, latency_p99_s=self.latency.p99)
 
 
-class ResetMessage(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
+class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
     """Reply to ``imu/<device>/command/reset``; the result is a text for the user."""
 
     topic = topics.RESET
@@ -434,7 +434,7 @@ class ResetMessage(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()
         return cls(device=device, t=t, samples=samples, text=result)
 
 
-class ReconcileMessage(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
+class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
     """Head of the reply to ``imu/<device>/command/reconcile``; the keys of the report follow."""
 
     topic = topics.RECONCILE
@@ -456,7 +456,9 @@ class ReconcileMessage(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.
         return msgspec.json.encode({**head, **keys, "exit": status, "folder": folder})
 
 
-def coefficient_values(coefficients: Coefficients, axis: int, k_or_r: bool = False) -> dict[str, CoefficientValue]:
+def coefficient_values(
+    coefficients: Coefficients, axis: int, k_r_ambiguous: bool = False
+) -> dict[str, CoefficientValue]:
     """Return the coefficients of one axis by symbol, as in messages and in ``analyze --json``.
 
     Parameters
@@ -465,10 +467,10 @@ def coefficient_values(coefficients: Coefficients, axis: int, k_or_r: bool = Fal
         Coefficients of all axes.
     axis
         Column of the axis.
-    k_or_r
+    k_r_ambiguous
         True if either K or R is present and the data do not show which.
     """
-    other = {"K": "R", "R": "K"} if k_or_r else {}
+    other = {"K": "R", "R": "K"} if k_r_ambiguous else {}
     return {
         symbol: CoefficientValue(
             float(coefficients.value[row, axis]),
@@ -512,7 +514,9 @@ def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -
     return total
 
 
-def deviation_columns(curve: AllanCurve | TotalCurve | HadamardCurve, axis: int) -> tuple[Floats, Floats, Floats]:
+def deviations_with_interval_ends(
+    curve: AllanCurve | TotalCurve | HadamardCurve, axis: int
+) -> tuple[Floats, Floats, Floats]:
     """Return the deviations of one axis and the ends of their intervals, each of shape [m].
 
     Parameters

@@ -14,7 +14,7 @@ from drivers.sample import AXES
 from monitor.common.units import format_duration
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots import diagnostic_figure, style
-from monitor.publishing.plots.diagnostic_figure import detail_view, diagnostic_svg, select_view
+from monitor.publishing.plots.diagnostic_figure import compared_diagnostic_svg, detail_view, select_view
 from monitor.publishing.reports import reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
 from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, PlotData, Reconciliation, Score
@@ -80,14 +80,14 @@ def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list
 
 def _draw_single(view: PlotData, axis: str) -> str:
     """Draw one diagnostic with one model."""
-    return diagnostic_svg([("", view)], axis, *SINGLE_INCHES)
+    return compared_diagnostic_svg([("", view)], axis, *SINGLE_INCHES)
 
 
 def _draw_pairs(before: DiagnosticSnapshot, after: DiagnosticSnapshot, axis: str) -> list[str]:
     """Draw each diagnostic before and after a step."""
     later = {view.lens: view for view in after.views}
     return [
-        diagnostic_svg([("before", view), ("after", later[view.lens])], axis, *PAIR_INCHES)
+        compared_diagnostic_svg([("before", view), ("after", later[view.lens])], axis, *PAIR_INCHES)
         for view in before.views
         if view.lens in later
     ]
@@ -100,6 +100,8 @@ def _draw_range(snapshot: DiagnosticSnapshot, found: Score, axis: str) -> list[s
         return []
     detail = detail_view(view, found.where)
     if detail is None:
-        return [diagnostic_svg([("", view)], axis, *RANGE_INCHES, where=found.where)]
-    whole = diagnostic_svg([("", view)], axis, *RANGE_WITH_DETAIL_INCHES, where=replace(found.where, source=None))
-    return [whole, diagnostic_svg([("", detail)], axis, *DETAIL_INCHES, where=found.where)]
+        return [compared_diagnostic_svg([("", view)], axis, *RANGE_INCHES, where=found.where)]
+    whole = compared_diagnostic_svg(
+        [("", view)], axis, *RANGE_WITH_DETAIL_INCHES, where=replace(found.where, source=None)
+    )
+    return [whole, compared_diagnostic_svg([("", detail)], axis, *DETAIL_INCHES, where=found.where)]

@@ -28,11 +28,11 @@ from monitor.publishing.rerun.allan_chart import (
     HEIGHT,
     WIDTH,
     Scale,
-    band,
-    clip,
-    decades,
+    band_strokes,
+    clip_to_box,
+    decade_range,
     finite_sections,
-    grid,
+    grid_lines,
 )
 from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation
 
@@ -190,7 +190,8 @@ def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult)
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
     """Log the gap of each diagnostic relative to its threshold, for the largest gaps, and the threshold, which is 1."""
     snapshots = [
-        {score.lens: words.gap_ratio(score) for score in snapshot.scores} for snapshot in _snapshots_by_step(result)
+        {score.lens: words.gap_to_threshold_ratio(score) for score in snapshot.scores}
+        for snapshot in _snapshots_by_step(result)
     ]
     path = f"{result.axis}/gap"
     largest = sorted(snapshots[0], key=lambda lens: -max(snapshot.get(lens, 0.0) for snapshot in snapshots))
@@ -217,7 +218,7 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
     ]
     plots = {step: to_field_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
-    scale = Scale(decades(plot.x for plot in every), decades([np.array(value_limits(every))]))
+    scale = Scale(decade_range(plot.x for plot in every), decade_range([np.array(value_limits(every))]))
     for when in ("before", "after") if result.steps else ("before",):
         _log_grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
     stream.reset_time()
@@ -235,7 +236,7 @@ def _log_curves(
     # A lower end of zero has no logarithm; it is drawn below the box.
     low, high = (scale.to_chart(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
     fill = rr.LineStrips2D(
-        list(band(low, high)), colors=[BAND_COLOUR], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0
+        list(band_strokes(low, high)), colors=[BAND_COLOUR], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0
     )
     stream.log(f"{path}/band", fill, static=static)
     colour, at = colours.AXIS_COLOURS[axis], _inside(scale.to_chart(plot.x, plot.measured))
@@ -270,7 +271,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, resul
 
 def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str) -> None:
     """Log frame, decade lines, labels and the key to the curves."""
-    lines = grid(scale)
+    lines = grid_lines(scale)
     for name, strips, colour, order in (
         ("minor", lines.minor, colours.MINOR, -30.0),
         ("major", lines.major, colours.MAJOR, -29.0),
@@ -296,7 +297,7 @@ def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Diagnos
 
 def _inside(at: Floats) -> Floats:
     """Limit a curve to the box; outside values are drawn on its edge."""
-    return np.column_stack([at[:, 0], clip(at[:, 1])])
+    return np.column_stack([at[:, 0], clip_to_box(at[:, 1])])
 
 
 def _markdown(text: str) -> rr.TextDocument:

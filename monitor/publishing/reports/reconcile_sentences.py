@@ -185,7 +185,7 @@ def format_gap(size: float) -> str:
     return f"{size:.2f}" if size < 10.0 else f"{size:.1f}"
 
 
-def gap_ratio(one: Score) -> float:
+def gap_to_threshold_ratio(one: Score) -> float:
     """Return gap divided by threshold; 0 if the ratio is not finite."""
     share = one.gap / one.threshold if one.threshold > 0.0 else 0.0
     return share if isfinite(share) else 0.0

@@ -42,12 +42,12 @@ def print_report(r: Reconciliation, console: Console) -> None:
     """
     console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
     console.print(_verdict(r.verdict), Text(words.summarize(r)))
-    console.print(table(r))
+    console.print(_axes_table(r))
     for note in r.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 
 
-def table(r: Reconciliation) -> RenderableType:
+def _axes_table(r: Reconciliation) -> RenderableType:
     """Return a table with a row per axis, followed by its steps and its unexplained remainder."""
     rows = plain_table("axis", "verdict")
     for head in ("gap", "conf."):
@@ -66,7 +66,7 @@ def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
     ]
     head = (Text(result.axis, style="bold"), _verdict(result.verdict))
     if not lines and result.start.scores:
-        most = max(result.start.scores, key=words.gap_ratio)
+        most = max(result.start.scores, key=words.gap_to_threshold_ratio)
         lines.append(("", "", Text(f"largest: {words.describe_gap(most, result.axis)}", style="dim")))
     for i, line in enumerate(lines or [("", "", Text())]):
         rows.add_row(*(head if i == 0 else ("", "")), *line)

@@ -52,12 +52,12 @@ DUPLICATE_REPORT_S: Final = 10.0
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Query on ``command/<verb>``; it must be answered exactly once, by ``answer`` or ``refuse``."""
+    """Query on ``command/<verb>``; it must be answered exactly once, by ``reply_result`` or ``reply_refusal``."""
 
     device: str
     verb: str
-    answer: Callable[[bytes], None]
-    refuse: Callable[[str], None]
+    reply_result: Callable[[bytes], None]
+    reply_refusal: Callable[[str], None]
 
 
 HistoryFunction = Callable[[str, str], bytes]
@@ -109,7 +109,7 @@ class ZenohPublisher:
             return self._unsent or self._session_state
         if self._connect and is_unconnected(session):
             return f"{self._refusal or 'nobody at ' + mask_secrets(', '.join(self._connect))}; trying again"
-        duplicates = self._duplicates.found(time.monotonic())
+        duplicates = self._duplicates.duplicate_publisher_message(time.monotonic())
         if not duplicates:
             return self._session_state
         return f"{self._session_state}{'; ' if self._session_state != 'ok' else ', but '}{duplicates}"
@@ -181,7 +181,7 @@ class ZenohPublisher:
             self._alive[device] = flowing
             self._update_token(device)
 
-    def add(self, device: str) -> None:
+    def add_device(self, device: str) -> None:
         """Add a device and declare its keys."""
         with self._declaring:
             self._devices += (device,)
@@ -190,7 +190,7 @@ class ZenohPublisher:
                 with contextlib.suppress(*_zenoh_errors()):  # the session may be closing
                     self._declare(self._session, device)
 
-    def remove(self, device: str) -> None:
+    def remove_device(self, device: str) -> None:
         """Remove a device and undeclare its keys."""
         self.set_alive(device, False)
         with self._declaring, contextlib.suppress(*_zenoh_errors()):  # the session may be closing
@@ -199,7 +199,7 @@ class ZenohPublisher:
             keys = {topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
             removed = [self._publishers[key] for key in keys & self._publishers.keys()]
             self._publishers = {key: one for key, one in self._publishers.items() if key not in keys}
-            for one in [*removed, *self._queryables.pop(device, []), *self._duplicates.remove(device)]:
+            for one in [*removed, *self._queryables.pop(device, []), *self._duplicates.forget_device(device)]:
                 one.undeclare()
 
     def close(self) -> None:
@@ -240,7 +240,7 @@ class ZenohPublisher:
         """Close the session, which stops the threads that receive from it."""
         session, self._session = self._session, None
         self._publishers, self._queryables = {}, {}
-        self._duplicates.clear()
+        self._duplicates.forget_devices()
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
         with self._showing:
@@ -265,7 +265,7 @@ class ZenohPublisher:
         new = {key: self._publisher(session, topic, key) for topic, key in published.items()}
         command_key = f"{self.settings.prefix}/{device}/command/*"
         self._declare_queryable(session, device, command_key, partial(self._queue_command, device))
-        self._duplicates.add(session, device)
+        self._duplicates.watch_other_publishers(session, device)
         if self._read_history is not None:
             answer = partial(self._answer_history, device, self._read_history)
             self._declare_queryable(session, device, keys[topics.HISTORY], answer)
@@ -360,14 +360,14 @@ class ZenohPublisher:
 
     def _answer_history(self, device: str, read_history: HistoryFunction, query: Any) -> None:
         """Answer a query of ``history``."""
-        answer, _ = _reply_functions(query, topics.HISTORY.key(self.settings.prefix, device))
+        reply_result, _ = _reply_functions(query, topics.HISTORY.key(self.settings.prefix, device))
         with contextlib.suppress(*_zenoh_errors()):  # the session may have been closed meanwhile
             try:
                 payload = read_history(device, str(query.parameters))
             except ImuError as error:
                 _reply_error(query, error)
             else:
-                answer(payload)
+                reply_result(payload)
 
     def _queue_command(self, device: str, query: Any) -> None:
         """Pass a command to the queue."""
@@ -377,7 +377,7 @@ class ZenohPublisher:
         try:
             self.commands.put_nowait(command)
         except queue.Full:
-            command.refuse("busy: too many commands wait")
+            command.reply_refusal("busy: too many commands wait")
 
 
 class _DuplicatePublishers:
@@ -396,7 +396,7 @@ class _DuplicatePublishers:
         self._subscribers: dict[str, Any] = {}
         self._heard_s: dict[str, float] = {}
 
-    def add(self, session: "zenoh.Session", device: str) -> None:
+    def watch_other_publishers(self, session: "zenoh.Session", device: str) -> None:
         """Subscribe to the status that other sessions publish for a device; the own messages are excluded."""
         import zenoh
 
@@ -405,18 +405,18 @@ class _DuplicatePublishers:
         one = session.declare_subscriber(key, ring, allowed_origin=zenoh.Locality.REMOTE)
         self._subscribers = {**self._subscribers, device: one}
 
-    def remove(self, device: str) -> list[Any]:
+    def forget_device(self, device: str) -> list[Any]:
         """Forget a device; return the subscribers to undeclare."""
         self._heard_s.pop(device, None)
         removed = [one for name, one in self._subscribers.items() if name == device]
         self._subscribers = {name: one for name, one in self._subscribers.items() if name != device}
         return removed
 
-    def clear(self) -> None:
+    def forget_devices(self) -> None:
         """Forget all devices; their subscribers are closed with the session."""
         self._subscribers, self._heard_s = {}, {}
 
-    def found(self, now_s: float) -> str:
+    def duplicate_publisher_message(self, now_s: float) -> str:
         """Return a message if another program published a device's status within DUPLICATE_REPORT_S; else ""."""
         for device, one in self._subscribers.items():
             with contextlib.suppress(*_zenoh_errors()):  # the session is being closed
@@ -432,15 +432,15 @@ def _reply_functions(query: Any, key: str) -> tuple[Callable[[bytes], None], Cal
     """Return functions that end a query with a result or with an error."""
     import zenoh
 
-    def answer(payload: bytes) -> None:
+    def reply_result(payload: bytes) -> None:
         with query:
             query.reply(key, payload, encoding=zenoh.Encoding(topics.JSON))
 
-    def refuse(why: str) -> None:
+    def reply_refusal(reason: str) -> None:
         with query:
-            query.reply_err(json.dumps({"error": why}).encode(), encoding=zenoh.Encoding(topics.JSON))
+            query.reply_err(json.dumps({"error": reason}).encode(), encoding=zenoh.Encoding(topics.JSON))
 
-    return answer, refuse
+    return reply_result, reply_refusal
 
 
 def _reply_error(query: Any, error: ImuError) -> None:

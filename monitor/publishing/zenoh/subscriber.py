@@ -111,7 +111,7 @@ class ZenohSubscriber:
     @property
     def state(self) -> str:
         """``ok``, or a description of the endpoints that are not connected."""
-        absent = {session.endpoint: session.why for session in self._sessions if not session.open}
+        absent = {session.endpoint: session.why for session in self._sessions if not session.is_connected}
         if not absent:
             return "ok"
         every = ", ".join(session.endpoint for session in self._sessions)
@@ -122,9 +122,9 @@ class ZenohSubscriber:
         return f"{there}; {reasons + '; ' if reasons else ''}trying the rest again"
 
     @property
-    def open_s(self) -> float:
+    def all_connected_s(self) -> float:
         """Time since which all endpoints have been connected [s]; 0 if one is not."""
-        return min(session.open_s for session in self._sessions)
+        return min(session.connected_s for session in self._sessions)
 
     def start(self) -> None:
         """Open the sessions in separate threads and return at once."""
@@ -145,7 +145,7 @@ class ZenohSubscriber:
 
     def _push(self, message: Message, stamp: str) -> None:
         """Add a message to the queue, unless it is a duplicate."""
-        if self._duplicate_filter is None or self._duplicate_filter.is_new(message.key, stamp):
+        if self._duplicate_filter is None or self._duplicate_filter.is_unseen(message.key, stamp):
             self._backlog.push(message, 100 + len(message.payload or b""))
 
 
@@ -156,7 +156,7 @@ class _DuplicateFilter:
         self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._lock = threading.Lock()
 
-    def is_new(self, key: str, stamp: str) -> bool:
+    def is_unseen(self, key: str, stamp: str) -> bool:
         """Return True if the message has not been seen before, or has no timestamp."""
         if not stamp:
             return True
@@ -190,13 +190,13 @@ class _EndpointSession:
         self._since_s: float | None = None  # monotonic time at which the connection was established [s]
 
     @property
-    def open(self) -> bool:
+    def is_connected(self) -> bool:
         """True if the session is open and connected."""
         session = self._session
         return session is not None and not is_unconnected(session)
 
     @property
-    def open_s(self) -> float:
+    def connected_s(self) -> float:
         """Time since which the endpoint has been connected [s]; 0 if it is not."""
         since_s = self._since_s
         return 0.0 if since_s is None else time.monotonic() - since_s
@@ -232,7 +232,7 @@ class _EndpointSession:
         """Monitor the connection until closed. zenoh reconnects by itself, but keeps the tokens of a lost endpoint."""
         asked_s = -REFUSAL_CHECK_S
         while not self.closing.wait(CONNECTION_CHECK_S):
-            if self.open:
+            if self.is_connected:
                 self.why, self._since_s = "", self._since_s or time.monotonic()
                 continue
             self._since_s = None

@@ -234,7 +234,7 @@ def test_two_daemons_with_one_prefix_and_the_same_device_name(tmp_path: Path) ->
                 first.put(topics.STATUS, "bench", b"{}")
                 other.put(topics.STATUS, "bench", b"{}")
                 assert other.state == "ok"
-        second.remove("bench")
+        second.remove_device("bench")
         assert "another program" not in second.state
 
 

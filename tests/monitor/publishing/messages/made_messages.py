@@ -34,7 +34,7 @@ from monitor.publishing.messages.results import (
     CoefficientsMessage,
     EventMessage,
     GapMessage,
-    ResetMessage,
+    ResetReply,
     SlowStatistics,
     StatusMessage,
     ThermalMessage,
@@ -182,7 +182,7 @@ def messages() -> dict[str, Message | AnalysisMessage | FailedAnalysisMessage]:
         "event_plain": EventMessage.of(device, UNIX_S, 7, Event("link_back", 0, "back")),
         "status": StatusMessage.of(device, UNIX_S, 0, health()),
         "status_before_the_first_sample": StatusMessage.of(device, None, 0, waiting),
-        "reset": ResetMessage.of(device, UNIX_S, 7, "the window is empty"),
+        "reset": ResetReply.of(device, UNIX_S, 7, "the window is empty"),
         "history": HistoryMessage.reply(past(), query, UNIX_S, 7),
         "history_of_one_coefficient": HistoryMessage.reply(
             past(), HistoryQuery(what=("coefficients",), axes=("gz",), symbols=("B", "N")), UNIX_S, 7

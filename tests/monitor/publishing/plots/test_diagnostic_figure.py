@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from monitor.publishing.plots.diagnostic_figure import (
+    compared_diagnostic_svg,
     detail_view,
-    diagnostic_svg,
     gap_chart_svg,
     interval_chart_svg,
-    range_along,
+    range_on_x_axis,
     select_view,
     to_field_units,
     value_limits,
@@ -33,7 +33,7 @@ def drawing(
     *views: PlotData, where: Location | None = None, width: float = 4.0, height: float = 2.5
 ) -> ElementTree.Element:
     return ElementTree.fromstring(
-        diagnostic_svg([(f"panel {i}", view) for i, view in enumerate(views)], "gz", width, height, where)
+        compared_diagnostic_svg([(f"panel {i}", view) for i, view in enumerate(views)], "gz", width, height, where)
     )
 
 
@@ -84,7 +84,7 @@ def test_a_range_is_marked_and_named_where_the_diagnostic_resolves_it() -> None:
 
 
 def test_names_are_escaped_and_equal_data_give_equal_bytes() -> None:
-    first, second = (diagnostic_svg([("a <b> & $x$", PSD)], "gz", 4.0, 2.5) for _ in range(2))
+    first, second = (compared_diagnostic_svg([("a <b> & $x$", PSD)], "gz", 4.0, 2.5) for _ in range(2))
     assert first == second
     assert "a <b> & $x$" in texts(ElementTree.fromstring(first))
 
@@ -130,10 +130,10 @@ def test_a_narrow_range_has_a_detail_plot_and_a_wide_one_has_not() -> None:
 
 def test_each_range_lies_along_the_views_that_resolve_it() -> None:
     where = Location(frequency=(1, 2), tau=(3, 4), time=(5, 6), temperature=(7, 8), value=(9, 10))
-    assert [range_along(view, where) for view in START.views] == [(1, 2), (3, 4), (5, 6), None]
-    assert range_along(replace(LEVEL, x_name="temperature", x_unit="°C"), where) == (7, 8)
-    assert range_along(replace(LEVEL, x_name="lag"), where) == (3, 4)
-    assert range_along(replace(DISTRIBUTION, x_unit="rad/s"), where) == (9, 10)
+    assert [range_on_x_axis(view, where) for view in START.views] == [(1, 2), (3, 4), (5, 6), None]
+    assert range_on_x_axis(replace(LEVEL, x_name="temperature", x_unit="°C"), where) == (7, 8)
+    assert range_on_x_axis(replace(LEVEL, x_name="lag"), where) == (3, 4)
+    assert range_on_x_axis(replace(DISTRIBUTION, x_unit="rad/s"), where) == (9, 10)
 
 
 def test_a_diagnostic_without_plot_uses_the_one_along_its_range() -> None:

@@ -16,7 +16,7 @@ pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 import rerun as rr
 from PIL import Image
 
-from monitor.publishing.rerun import blueprint, dynamic_surface
+from monitor.publishing.rerun import blueprint, dynamic_heat_map
 from monitor.publishing.rerun.allan_history import COLUMNS
 from monitor.publishing.rerun.scene import Scene
 
@@ -32,20 +32,20 @@ def test_time_goes_right_and_averaging_time_goes_up() -> None:
     relative[0, 0] = np.log(5.0)  # oldest, shortest τ: bottom left, far above the median
     relative[5, 14] = -np.log(5.0)  # newest, longest τ: top right
     relative[2, 7] = np.nan
-    image = pixels(dynamic_surface.picture(relative))
-    rows = round(dynamic_surface.HEIGHT / 15)
+    image = pixels(dynamic_heat_map.encode_heat_map(relative))
+    rows = round(dynamic_heat_map.HEIGHT / 15)
     assert image.shape == (15 * rows, COLUMNS, 3)
-    palette = dynamic_surface.PALETTE
-    assert (image[-rows:, 0] == palette[2 * dynamic_surface.SHADES]).all()
+    palette = dynamic_heat_map.PALETTE
+    assert (image[-rows:, 0] == palette[2 * dynamic_heat_map.SHADES]).all()
     assert (image[:rows, -1] == palette[0]).all()
     sixth = COLUMNS // 6  # few columns are wide ones: they fill the picture
-    assert (image[7 * rows : 8 * rows, 2 * sixth + 2 : 3 * sixth - 2] == palette[dynamic_surface.NO_VALUE_INDEX]).all()
-    assert (image[: 7 * rows, : 5 * sixth - 2] == palette[dynamic_surface.SHADES]).all()
+    assert (image[7 * rows : 8 * rows, 2 * sixth + 2 : 3 * sixth - 2] == palette[dynamic_heat_map.NO_VALUE_INDEX]).all()
+    assert (image[: 7 * rows, : 5 * sixth - 2] == palette[dynamic_heat_map.SHADES]).all()
     assert (image[:rows, 5 * sixth + 6 :] == palette[0]).all()
 
 
 def test_twice_and_half_the_median_are_the_ends_of_the_scale() -> None:
-    image = pixels(dynamic_surface.picture(np.log([[2.0, 4.0], [0.5, 0.1], [1.4, 0.7]])))
+    image = pixels(dynamic_heat_map.encode_heat_map(np.log([[2.0, 4.0], [0.5, 0.1], [1.4, 0.7]])))
     bottom, top = image[-1, [0, COLUMNS // 2, COLUMNS - 1]], image[0, [0, COLUMNS // 2, COLUMNS - 1]]
     assert (bottom[0] == top[0]).all()
     assert (bottom[1] == top[1]).all()
@@ -59,7 +59,7 @@ def test_a_recording_holds_surfaces_labels_and_marks(tmp_path: Path) -> None:
     stream = rr.RecordingStream("imu-monitor")
     stream.save(path)
     scene = Scene(stream)
-    scene.show([DeviceInfo("bench-1")])
+    scene.set_devices([DeviceInfo("bench-1")])
     for i in range(12):
         scene.draw("bench-1", "AllanPanel", [(T0 + i, made.estimate(T0 + i, seed=i))])
     what = {"N": {"before": 1.5e-4, "after": 3.0e-4}, "floor": {"after": 1.0}}
@@ -121,8 +121,8 @@ def test_gaps_have_their_row_only_where_there_is_a_model() -> None:
 
 
 def test_the_view_holds_picture_and_labels() -> None:
-    (left, right), (top, bottom) = dynamic_surface.bounds(17)
+    (left, right), (top, bottom) = dynamic_heat_map.view_bounds(17)
     assert left < -11.0
-    assert right > dynamic_surface.BAR_X + 11.0
+    assert right > dynamic_heat_map.BAR_X + 11.0
     assert top < -4.0
-    assert bottom > 17 * round(dynamic_surface.HEIGHT / 17) + 6.0
+    assert bottom > 17 * round(dynamic_heat_map.HEIGHT / 17) + 6.0

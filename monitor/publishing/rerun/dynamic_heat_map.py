@@ -30,13 +30,13 @@ BAR_STEPS: Final = 24
 LABEL_MARGINS_PX: Final = (24.0, 7.0, 32.0, 13.0)  # left, above, right and below the image, for labels
 
 
-def bounds(taus: int) -> tuple[tuple[float, float], tuple[float, float]]:
+def view_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the bounds in x and y of a view for this number of τ."""
     left, above, right, below = LABEL_MARGINS_PX
-    return (-left, COLUMNS + right), (-above, _rows(taus) * taus + below)
+    return (-left, COLUMNS + right), (-above, _rows(tau_count) * tau_count + below)
 
 
-def draw(log: Log, path: str, surface: AllanHistory) -> None:
+def draw_heat_maps(log: Log, path: str, surface: AllanHistory) -> None:
     """Log the images and labels of all measured axes at the current time of the stream.
 
     Parameters
@@ -48,7 +48,7 @@ def draw(log: Log, path: str, surface: AllanHistory) -> None:
     surface
         Deviations over time.
     """
-    whole = surface.relative()
+    whole = surface.log_ratio_to_median()
     if len(whole) < MIN_COLUMNS:
         return
     for i, axis in enumerate(AXES):
@@ -57,19 +57,19 @@ def draw(log: Log, path: str, surface: AllanHistory) -> None:
         height = _rows(surface.tau_s.size) * surface.tau_s.size
         log(
             f"{path}/{axis}",
-            rr.EncodedImage(contents=picture(whole[:, :, i]), media_type="image/png", draw_order=-20.0),
+            rr.EncodedImage(contents=encode_heat_map(whole[:, :, i]), media_type="image/png", draw_order=-20.0),
         )
         labels = _tau_labels(surface.tau_s, height) + _time_labels(surface, height) + _bar_labels(height)
         log(f"{path}/{axis}/labels", label_points(labels))
         log(f"{path}/{axis}/scale", _bar(height))
 
 
-def picture(relative: Floats) -> bytes:
+def encode_heat_map(log_ratio: Floats) -> bytes:
     """Return a PNG of ln(deviation / median), shape [columns, m]: COLUMNS pixels wide, the longest τ at the top."""
-    share = np.clip(np.nan_to_num(relative) / np.log(COLOUR_SCALE_RATIO), -1.0, 1.0)
-    shade = np.where(np.isfinite(relative), np.rint(SHADES * (1.0 + share)), NO_VALUE_INDEX).astype(np.uint8)
-    wide = shade[np.arange(COLUMNS) * len(relative) // COLUMNS]
-    image = Image.fromarray(np.repeat(wide.T[::-1], _rows(relative.shape[1]), axis=0), "P")
+    share = np.clip(np.nan_to_num(log_ratio) / np.log(COLOUR_SCALE_RATIO), -1.0, 1.0)
+    shade = np.where(np.isfinite(log_ratio), np.rint(SHADES * (1.0 + share)), NO_VALUE_INDEX).astype(np.uint8)
+    wide = shade[np.arange(COLUMNS) * len(log_ratio) // COLUMNS]
+    image = Image.fromarray(np.repeat(wide.T[::-1], _rows(log_ratio.shape[1]), axis=0), "P")
     image.putpalette([part for colour in PALETTE for part in colour])
     data = io.BytesIO()
     image.save(data, "PNG")
