@@ -54,7 +54,7 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
     from rich.console import Console
 
     from monitor.daemon.operations.systemd import SystemdNotifier
-    from monitor.daemon.outputs import LogOutput, TableOutput
+    from monitor.daemon.output_classes import LogOutput, TableOutput
     from monitor.daemon.service import STATUS_INTERVAL_S, Service
     from monitor.publishing.remote_devices import DeviceStates
     from monitor.publishing.terminal.live_table import LiveTable
@@ -81,10 +81,10 @@ def serve(config: "Config", seconds: float | None, viewer: str | None) -> None:
 
             def stop() -> None:
                 asked.set()
-                service.stop()
+                service.request_stop()
 
             # in a terminal, SIGHUP means that the terminal has been closed
-            on_signals(stop, stop if terminal else service.reload)
+            on_signals(stop, stop if terminal else service.request_reload)
             table.states = board
             service.run(seconds)
         finally:

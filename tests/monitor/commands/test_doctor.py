@@ -23,7 +23,7 @@ from monitor.commands.doctor import SAMPLE_BYTES, Finding, bytes_a_day, disk_spa
 from monitor.common.compiled import cache_folder
 from monitor.common.config_files import CONFIG_FOLDER
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, FolderLock
-from monitor.daemon.storage.recorder import origin
+from monitor.daemon.storage.recorder import segment_metadata
 from monitor.noise.catalogue import read_model
 from monitor.settings import loading
 from monitor.settings.loading import Storage
@@ -259,7 +259,7 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     t_ns = 1_760_000_000_000_000_000 + np.arange(60_000) * 10_000_000 + rng.integers(-1000, 1000, 60_000)
     temperature = np.round(25.0 + 0.01 * rng.standard_normal(60_000), 2)
-    writer = SegmentWriter(tmp_path / segment.segment_name(1, 1.76e9), origin("a", AxisMap()))
+    writer = SegmentWriter(tmp_path / segment.segment_name(1, 1.76e9), segment_metadata("a", AxisMap()))
     for at in range(0, 60_000, 50):
         rows = slice(at, at + 50)
         ticks = np.arange(at, at + 50) * 10
