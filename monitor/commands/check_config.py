@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from drivers.errors import ConfigError
-from monitor.settings.loading import Config, ModelUse, examine
+from monitor.settings.loading import Config, ModelDependentSettings, examine
 
 
 def check_configuration(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
@@ -35,7 +35,7 @@ def check_configuration(path: Path, *, pipe: bool = False) -> tuple[Config | Non
     return None if wrong else reading.config, wrong
 
 
-def _problems(use: ModelUse) -> Iterator[str]:
+def _problems(use: ModelDependentSettings) -> Iterator[str]:
     """Yield the mistakes in the model files of a device."""
     # imported only if needed, because most configurations have neither a model nor a simulated sensor
     try:

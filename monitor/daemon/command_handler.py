@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import structlog
 
 from monitor.daemon.device.device_worker import DeviceWorker
-from monitor.daemon.operations.live_reconcile import Job, Reconciler
+from monitor.daemon.operations.reconcile_on_request import Job, Reconciler
 from monitor.publishing.messages.results import ResetReply
 from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
 
@@ -50,7 +50,7 @@ class CommandHandler:
         workers : mapping of str to DeviceWorker
             Worker of each device by its name.
         """
-        for finished in self._reconciler.take():
+        for finished in self._reconciler.take_finished():
             if finished.device in workers:
                 workers[finished.device].publish_event("reconciled", finished.text)
 
@@ -62,7 +62,7 @@ class CommandHandler:
         """Execute one command for a device, and answer it."""
         match command.verb:
             case "reset":
-                worker.reset()
+                worker.empty_window()
                 now_s, received = worker.timeline.now_unix_s(), worker.driver.counts.received
                 command.reply_result(ResetReply.of(worker.name, now_s, received, "the window is empty").encode())
                 _log.info("reset", device=worker.name)
@@ -73,7 +73,7 @@ class CommandHandler:
 
     def _reconcile(self, command: Command, worker: DeviceWorker) -> None:
         """Start a reconciliation with a copy of the window; a thread of its own sends the answer."""
-        window = worker.window_snapshot()
+        window = worker.copy_window_and_temperature()
         if window is None:
             command.reply_refusal("no samples yet")
             return

@@ -17,7 +17,7 @@ class Output:
     samples of the device since the start, up to the result.
     """
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
+    def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Receive a block of samples.
 
         Parameters
@@ -32,7 +32,7 @@ class Output:
             Offset that converts the times to Unix time, in nanoseconds.
         """
 
-    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         """Receive a result of one of the kinds in ``monitor.publishing.result_kinds``.
 
         Estimates arrive at the configured rate. A device without a model in force has no ``ModelGap``, and a device
@@ -52,7 +52,9 @@ class Output:
             The result.
         """
 
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
+    def publish_compensated_samples(
+        self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int
+    ) -> None:
         """Receive a block of samples without the drift of the gyroscopes.
 
         Parameters
@@ -67,7 +69,7 @@ class Output:
             Offset that converts the times to Unix time, in nanoseconds.
         """
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Receive an event of the device.
 
         Parameters
@@ -82,7 +84,7 @@ class Output:
             Kind, axis and text of the event.
         """
 
-    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Receive the status of the device, once a second.
 
         Parameters
@@ -95,5 +97,5 @@ class Output:
             Status of the device.
         """
 
-    def device_removed(self, device: str) -> None:
+    def remove_device(self, device: str) -> None:
         """Forget a device that was removed from the configuration. A device with the same name may be added later."""

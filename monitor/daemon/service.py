@@ -25,16 +25,16 @@ from monitor.common.health import Health, format_service_status
 from monitor.daemon import reload
 from monitor.daemon.command_handler import CommandHandler
 from monitor.daemon.device.device_worker import DeviceWorker
+from monitor.daemon.history_file import HistoryFile
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.hooks import Hooks
-from monitor.daemon.operations.live_reconcile import Reconciler
 from monitor.daemon.operations.log_level import set_log_level
+from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.output import Output
-from monitor.daemon.outputs import TableOutput, ViewerOutput, ZenohOutput
+from monitor.daemon.output_classes import TableOutput, ViewerOutput, ZenohOutput
 from monitor.daemon.reload import ConfigChange
-from monitor.daemon.storage.recorder import Recorder, origin
-from monitor.daemon.stored_history import StoredHistory
+from monitor.daemon.storage.recorder import Recorder, segment_metadata
 from monitor.history.reading import HistoryTable
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.terminal.queued_writer import QueuedWriter
@@ -44,7 +44,7 @@ from monitor.settings.loading import Config, Device, Storage, VirtualTable
 if TYPE_CHECKING:
     from monitor.daemon.operations.metrics import MetricsOutput
     from monitor.publishing.rerun.view import RerunView
-    from monitor.simulator import VirtualImu
+    from monitor.simulator import SimulatedDevice
 
 MAX_IDLE_S: Final = 0.05
 """Longest sleep of the main loop if no samples arrive."""
@@ -100,14 +100,14 @@ class Service:
         self._ready = KernelReadiness()
         self._stop = threading.Event()
         self._reload_asked = False
-        self.virtual: dict[str, VirtualImu] = {}
+        self.virtual: dict[str, SimulatedDevice] = {}
         self.recorder = _build_recorder(config)
         self.outputs: list[Output] = []
         self.workers: list[DeviceWorker] = []
         for device in config.devices:
             self._register_device(*self._build_device(device))
         storage = config.storage
-        self.history = StoredHistory(storage.folder) if storage is not None and storage.history else None
+        self.history = HistoryFile(storage.folder) if storage is not None and storage.history else None
         answer_query = None if self.history is None else self.history.answer_query
         self.zenoh = ZenohPublisher(config.zenoh, [worker.name for worker in self.workers], answer_query)
         self._commands = CommandHandler(self.zenoh, reconciler or Reconciler())
@@ -123,12 +123,12 @@ class Service:
         if self.history is not None:
             self.outputs.append(self.history.output)
 
-    def stop(self) -> None:
+    def request_stop(self) -> None:
         """Request the end of the main loop. May be called from any thread."""
         self._stop.set()
         self._wake.set()
 
-    def reload(self) -> None:
+    def request_reload(self) -> None:
         """Request that the main loop reads the configuration file again. May be called from any thread."""
         self._reload_asked = True
         self._wake.set()
@@ -139,7 +139,7 @@ class Service:
         Parameters
         ----------
         seconds : float, optional
-            Duration in seconds. By default the service runs until ``stop`` is called or all replays have ended.
+            Duration in seconds. By default the service runs until ``request_stop`` is called or all replays have ended.
         """
         threading.Thread(target=self._ready.compile, args=(self._wake,), name="warm-up", daemon=True).start()
         try:
@@ -164,7 +164,7 @@ class Service:
     def loop(self, until_s: float | None) -> None:
         """Run rounds over all devices, and publish the status once a second.
 
-        The loop ends when ``stop`` is called, when all replays have ended, or at the given time.
+        The loop ends when ``request_stop`` is called, when all replays have ended, or at the given time.
 
         Parameters
         ----------
@@ -183,7 +183,7 @@ class Service:
                 self._publish_status()
             if until_s is not None and now_s >= until_s:
                 return
-            if all(worker.ended for worker in self.workers):
+            if all(worker.replay_finished for worker in self.workers):
                 return
             if self._reload_asked:
                 self._reload_asked = False
@@ -196,10 +196,10 @@ class Service:
     def _work_devices(self, now_s: float) -> None:
         """Process the new samples of every device, and announce on zenoh which devices are running."""
         for worker in self.workers:
-            worker.work(now_s)
+            worker.process_new_samples(now_s)
             self.zenoh.set_alive(worker.name, worker.driver.state == "running")
 
-    def states(self) -> dict[str, str]:
+    def output_states(self) -> dict[str, str]:
         """Return the state of each output by its name: "ok", or a text that describes the problem."""
         outputs = {
             "zenoh": self.zenoh,
@@ -229,19 +229,19 @@ class Service:
         """Rebuild the windows of devices from their recordings, as soon as all kernels are compiled."""
         self._ready.all.wait()
         for worker in workers:
-            worker.rebuild()
+            worker.rebuild_window()
 
-    def _build_device(self, device: Device) -> "tuple[DeviceWorker, VirtualImu | None]":
+    def _build_device(self, device: Device) -> "tuple[DeviceWorker, SimulatedDevice | None]":
         """Build the worker of a device, and its virtual IMU if the device is simulated, without opening either."""
         link, imu = device.link, None
         if isinstance(link, VirtualTable):
-            from monitor.simulator import VirtualImu
+            from monitor.simulator import SimulatedDevice
 
-            imu = VirtualImu(link, device.decoder, device.name)
+            imu = SimulatedDevice(link, device.decoder, device.name)
             link = imu.link
         return DeviceWorker(device, link, self.outputs, self._wake, self._ready, self.recorder), imu
 
-    def _register_device(self, worker: DeviceWorker, imu: "VirtualImu | None") -> None:
+    def _register_device(self, worker: DeviceWorker, imu: "SimulatedDevice | None") -> None:
         """Add a worker, and its virtual IMU if the device is simulated, to the service."""
         self.workers = [*self.workers, worker]
         if imu is not None:
@@ -263,7 +263,7 @@ class Service:
         if self._unit.ready_sent:
             self._unit.ready()
 
-    def _apply(self, change: ConfigChange, built: "Sequence[tuple[DeviceWorker, VirtualImu | None]]") -> None:
+    def _apply(self, change: ConfigChange, built: "Sequence[tuple[DeviceWorker, SimulatedDevice | None]]") -> None:
         """Apply the changes of a configuration: stop removed devices, exchange limits, and start added devices."""
         leaving = [worker for worker in self.workers if worker.name in change.removed]
         for worker in leaving:
@@ -284,11 +284,11 @@ class Service:
         for worker, imu in built:
             self._add(worker, imu)
 
-    def _add(self, worker: DeviceWorker, imu: "VirtualImu | None") -> None:
+    def _add(self, worker: DeviceWorker, imu: "SimulatedDevice | None") -> None:
         """Start an added device while the other devices continue."""
         self.zenoh.add_device(worker.name)
         if self.recorder is not None:
-            self.recorder.add(_segment_origins(self.config.storage, worker.device))
+            self.recorder.add_recordings(_segment_origins(self.config.storage, worker.device))
         if imu is not None:
             imu.start()
         worker.start()
@@ -301,14 +301,14 @@ class Service:
             self.virtual.pop(worker.name).stop()
         if not self._work_until(lambda: worker.join(0.0) and not worker.restore.active):
             _log.warning("reader did not end in time", device=worker.name)
-        worker.work(time.monotonic(), drain=True)
+        worker.process_new_samples(time.monotonic(), drain=True)
         self.workers = [one for one in self.workers if one is not worker]
         self.zenoh.remove_device(worker.name)
         if self.recorder is not None:
-            self.recorder.remove(worker.name)
+            self.recorder.remove_device(worker.name)
             self._work_until(lambda: self.recorder is None or not self.recorder.is_recording(worker.name))
         for output in self.outputs:
-            output.device_removed(worker.name)
+            output.remove_device(worker.name)
 
     def _work_until(self, done: Callable[[], bool]) -> bool:
         """Process all devices until ``done`` returns True, or for JOIN_TIMEOUT_S; return its last result."""
@@ -323,9 +323,9 @@ class Service:
     def _publish_status(self) -> None:
         """Publish the status of all devices, and notify systemd."""
         self._publish_recorder_events()
-        states, memory = self.states(), memory_bytes()
+        states, memory = self.output_states(), memory_bytes()
         self._announce_viewer_url()
-        healths = {worker.name: worker.publish_status(states, memory) for worker in self.workers}
+        healths = {worker.name: worker.slew_and_publish_status(states, memory) for worker in self.workers}
         self._notify_systemd(healths, states)
 
     def _notify_systemd(self, healths: Mapping[str, Health], states: Mapping[str, str]) -> None:
@@ -358,7 +358,7 @@ class Service:
             _log.info("viewer", url=page)
         for output in self.outputs:
             if isinstance(output, TableOutput):
-                output.viewer_at(page)
+                output.set_viewer_url(page)
 
     def _close(self) -> None:
         """Stop the devices, publish their remaining samples, and close all outputs."""
@@ -383,10 +383,10 @@ class Service:
         for worker in self.workers:
             until_s = time.monotonic() + JOIN_TIMEOUT_S
             while not (ended := worker.join(ROUND_PAUSE_S)) and time.monotonic() < until_s:
-                worker.work(time.monotonic())  # a replay waits for space in its ring buffer
+                worker.process_new_samples(time.monotonic())  # a replay waits for space in its ring buffer
             if not ended:
                 _log.warning("reader did not end in time", device=worker.name)
-            worker.work(time.monotonic(), drain=True)
+            worker.process_new_samples(time.monotonic(), drain=True)
             self.zenoh.set_alive(worker.name, False)
         self._publish_status()
 
@@ -402,8 +402,10 @@ def _segment_origins(storage: Storage | None, device: Device) -> list[SegmentMet
     """Return the recordings to write for a device: samples, raw bytes, both, or none for a replay."""
     if storage is None or isinstance(device.link, ReplayLink):
         return []
-    origins = [origin(device.name, device.axes)] if storage.record else []
-    return origins + ([origin(device.name, device.axes, "raw", device.decoder.carrier)] if storage.raw else [])
+    origins = [segment_metadata(device.name, device.axes)] if storage.record else []
+    return origins + (
+        [segment_metadata(device.name, device.axes, "raw", device.decoder.carrier)] if storage.raw else []
+    )
 
 
 def memory_bytes() -> int:

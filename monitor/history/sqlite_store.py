@@ -25,7 +25,14 @@ import msgspec
 from drivers.errors import RecordingError
 from drivers.file_access import check_folder_or_absent, check_regular
 from drivers.number_ranges import DAY_S
-from monitor.history.bucket import MAX_COLUMNS, STATES, HistoryRow, merge_rows, pack_statistics, unpack_statistics
+from monitor.history.bucket import (
+    MAX_COLUMNS,
+    STATES,
+    HistoryRow,
+    merge_rows,
+    pack_count_min_max_last,
+    unpack_count_min_max_last,
+)
 from monitor.history.stored_events import (
     MAX_EVENTS,
     THINNING_SPANS_S,
@@ -249,7 +256,7 @@ class HistoryStore:
                 self._layouts.id(row.names),
                 *row.counts,
                 row.state,
-                pack_statistics(row),
+                pack_count_min_max_last(row),
             ),
         )
 
@@ -488,7 +495,7 @@ class _LayoutCache:
             self._names[layout] = tuple(text[0].split())
         names = self._names[layout]
         counts = (received, lost, bad, overflowed)
-        return HistoryRow(start, width, newest, names, *unpack_statistics(data, len(names)), counts, state)
+        return HistoryRow(start, width, newest, names, *unpack_count_min_max_last(data, len(names)), counts, state)
 
 
 def _open_read_only(path: Path) -> sqlite3.Connection:

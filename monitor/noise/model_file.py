@@ -17,7 +17,7 @@ from drivers.sample import AXES
 from monitor.noise.effect import GYROS, Effect, ParameterTable, gyro_and_accel_units, required_parameters
 from monitor.noise.effects import EFFECTS
 from monitor.noise.temperature import Temperature
-from monitor.settings import toml_text
+from monitor.settings import toml_parser
 
 T = TypeVar("T", bound=ParameterTable)
 
@@ -40,7 +40,7 @@ def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature
     ConfigError
         If the text is not valid, with one line for each mistake.
     """
-    tables = toml_text.parse_toml(text)
+    tables = toml_parser.parse_toml(text)
     mistakes: list[str] = []
     rate_hz = tables.pop("sample_rate", None)
     if rate_hz is not None:

@@ -32,7 +32,7 @@ from monitor.settings.field_types import (
     ZenohKey,
     check_memory,
     check_viewer_mode,
-    period_or,
+    period_annotation,
 )
 
 WINDOW_SAMPLES: Final = (100, 10_000_000)
@@ -120,13 +120,13 @@ class Device(SettingsModel):
         Literal["octave", "decade10"] | tuple[float, ...],
         WordOr({"octave": "octave", "decade10": "decade10"}, ListOf[Annotated[float, number_ranges.AVERAGING_TIME_S]]),
     ] = Field("octave", description="averaging times: a grid, or a list of seconds")
-    refit_s: Annotated[float, period_or("every sample")] = Field(
+    refit_s: Annotated[float, period_annotation("every sample")] = Field(
         0.1,
         alias="refit",
         examples=["10 Hz"],
         description='rate at which the coefficients are fitted, or "every sample"',
     )
-    publish_s: Annotated[float, period_or("every block")] = Field(
+    publish_s: Annotated[float, period_annotation("every block")] = Field(
         0.1, alias="publish", examples=["10 Hz"], description='rate at which results are published, or "every block"'
     )
     motion: Literal["tell", "leave out"] = Field(

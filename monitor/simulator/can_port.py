@@ -50,7 +50,7 @@ class CanPort:
             if bus is not None:
                 bus.shutdown()
 
-    def send(self, chunks: Sequence[Chunk]) -> int:
+    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
         """Send each chunk as one frame; return the number of sent chunks."""
         import can
 

@@ -49,22 +49,22 @@ class FaultCounts:
     held_s: float = 0.0  # longest delay of a burst
 
     @property
-    def made(self) -> int:
+    def sample_count(self) -> int:
         """Number of samples so far."""
         return self.sent + self.lost + self.flipped + self.cut + self.dropped
 
-    def count(self, kind: FaultKind, out: bool) -> None:
+    def count_sample(self, kind: FaultKind, all_sent: bool) -> None:
         """Count one sample.
 
         Parameters
         ----------
         kind : FaultKind
             Fault of the sample.
-        out : bool
+        all_sent : bool
             True if all chunks that were to be sent have been sent.
         """
         match kind:
-            case _ if not out:
+            case _ if not all_sent:
                 self.dropped += 1
             case FaultKind.LOST:
                 self.lost += 1
@@ -85,7 +85,7 @@ class DrawnFaults:
     where: Floats  # [n] position of the fault in the frame, 0 to 1
     pulled: NDArray[np.bool_]  # [n] True if the cable is pulled before this sample
 
-    def kinds(self) -> list[FaultKind]:
+    def kind_per_sample(self) -> list[FaultKind]:
         """Return the fault of each sample."""
         return [FaultKind(kind) for kind in self.kind.tolist()]
 
@@ -117,7 +117,7 @@ class Faults:
             np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SPAWN_KEY, i))) for i in range(2)
         )
 
-    def draw(self, n: int) -> DrawnFaults:
+    def draw_faults(self, n: int) -> DrawnFaults:
         """Draw the faults of the next ``n`` samples."""
         u = self._rng.random((n, DRAWS_PER_SAMPLE))
         return DrawnFaults(np.searchsorted(self._edges, u[:, 0], "right"), u[:, 1], u[:, 2] < self._unplug_probability)

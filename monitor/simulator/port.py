@@ -28,7 +28,7 @@ class Port(Protocol):
     def unplug(self) -> None:
         """Disconnect the sensor, as a pulled cable does."""
 
-    def send(self, chunks: Sequence[Chunk]) -> int:
+    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
         """Send chunks without waiting for a reader; return the number of complete chunks, counted from the first."""
 
     def close(self) -> None:

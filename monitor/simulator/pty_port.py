@@ -63,7 +63,7 @@ class PtyPort:
             if master is not None:
                 os.close(master)
 
-    def send(self, chunks: Sequence[Chunk]) -> int:
+    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
         """Write chunks; return the number of complete chunks, counted from the first.
 
         Writing continues as long as the reader empties the buffer.

@@ -18,7 +18,7 @@ from drivers.sample import NO_TICK, Chunk, CounterTimedFormat, Floats, Ints, mak
 from monitor.noise.model_catalogue import read_model
 from monitor.noise.simulation import ModelStream
 from monitor.settings.loading import VirtualTable
-from monitor.simulator.scheduled_effects import parse_effects
+from monitor.simulator.scheduled_effect_parser import parse_effects
 
 DEFAULT_RATE_HZ: Final = 100.0
 """Sample rate if the model has none."""
@@ -101,18 +101,18 @@ class SimulatedSensor:
         self._made = 0
         self._add_effects(self._create_stream(table.seed))  # raises errors of the effects before the sensor starts
 
-    def switch_on(self) -> None:
+    def start_clock(self) -> None:
         """Start the clock of the sensor. Kernels of the simulation are compiled before the first sample."""
         trial = self._create_stream(0)
         self._add_effects(trial)
         trial.draw_with_temperature(1)
         self._unix_ns = time.time_ns()
 
-    def skip(self, n: int) -> None:
+    def skip_samples(self, n: int) -> None:
         """Skip ``n`` samples that are never sent. The counter continues."""
         self._made += n
 
-    def frames(self, n: int) -> list[list[Chunk]]:
+    def encode_next_samples(self, n: int) -> list[list[Chunk]]:
         """Return the chunks of each of the next ``n`` samples."""
         index = np.arange(self._made, self._made + n)
         values, temperature_c = self._measured(n)

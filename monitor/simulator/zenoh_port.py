@@ -61,7 +61,7 @@ class ZenohPort:
             if session is not None:
                 session.close()  # type: ignore[no-untyped-call]
 
-    def send(self, chunks: Sequence[Chunk]) -> int:
+    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
         """Publish each chunk as one message; return the number of published chunks. Zenoh drops messages for slow
         readers.
         """

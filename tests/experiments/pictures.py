@@ -301,7 +301,7 @@ def view(out: Path, folder: Path) -> Path:
             time.sleep(PULLED_AGAIN_S)
             daemons[0].virtual[MEMBERS[3]].unplug()
             daemons[1].virtual[MEMBERS[4]].unplug()
-            daemons[2].stop()
+            daemons[2].request_stop()
             time.sleep(SETTLE_S)
             shoot(path)
         finally:
@@ -543,7 +543,7 @@ def running(config: loading.Config) -> Iterator[Service]:
     try:
         yield service
     finally:
-        service.stop()
+        service.request_stop()
         thread.join(30.0)
 
 

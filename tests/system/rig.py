@@ -39,10 +39,10 @@ class Caught(Output):
         self.events: list[tuple[str, Event]] = []
         self.healths: dict[str, Health] = {}
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         self.blocks.setdefault(device, []).append(samples)
 
-    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         match result:
             case Estimate():
                 self.estimates[device] = result
@@ -55,13 +55,13 @@ class Caught(Output):
             case SlowStatistics():
                 self.totals[device] = result
 
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def publish_compensated_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         self.rates.setdefault(device, []).append(samples)
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.events.append((device, event))
 
-    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         self.healths[device] = health
 
     def values(self, device: str) -> np.ndarray:
@@ -84,7 +84,7 @@ class Running:
         return next(station for station in self.service.workers if station.name == name)
 
     def stop(self) -> None:
-        self.service.stop()
+        self.service.request_stop()
         self.join()
 
     def join(self) -> None:

@@ -54,7 +54,7 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
     from rich.console import Console
 
     from monitor.daemon.operations.systemd import SystemdNotifier
-    from monitor.daemon.outputs import LogOutput, TableOutput
+    from monitor.daemon.output_classes import LogOutput, TableOutput
     from monitor.daemon.service import STATUS_INTERVAL_S, Service
     from monitor.publishing.remote_devices import DeviceStates
     from monitor.publishing.terminal.live_table import LiveTable
@@ -81,10 +81,10 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
 
             def stop() -> None:
                 asked.set()
-                service.stop()
+                service.request_stop()
 
             # in a terminal, SIGHUP means that the terminal has been closed
-            install_signal_handlers(stop, stop if terminal else service.reload)
+            install_signal_handlers(stop, stop if terminal else service.request_reload)
             table.states = board
             service.run(seconds)
         finally:

@@ -99,20 +99,20 @@ class MetricsOutput(Output):
 
     # --- called by the main loop
 
-    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         """Keep the newest estimate of a device."""
         if isinstance(result, Estimate):
             self._estimates[device] = result
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Count an event."""
         self._events[device, event.kind] += 1
 
-    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Keep the newest health of a device."""
         self._healths[device] = health
 
-    def device_removed(self, device: str) -> None:
+    def remove_device(self, device: str) -> None:
         """Remove the values of a device."""
         self._healths.pop(device, None)
         self._estimates.pop(device, None)

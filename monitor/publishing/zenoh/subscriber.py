@@ -323,7 +323,7 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
     """
     import zenoh
 
-    if file is not None and (line := file_permissions.describe_write_access(file)):
+    if file is not None and (line := file_permissions.explain_untrusted_file(file)):
         raise ConfigError(f"{file}: {line}")
     try:
         file_endpoints = find_connect_endpoints(build_session_config({}, file))

@@ -371,11 +371,11 @@ def alarms(seeds: int) -> None:
     for name, records, rate_hz in sources:
         told: list[str] = []
         for values in records:
-            one, by_hand = LiveCompensation(rate_hz), ArmaWorker("", at_once=True)
+            one, by_hand = LiveCompensation(rate_hz), ArmaWorker("", synchronous=True)
             t_ns = np.round(np.arange(len(values)) / rate_hz * 1e9).astype(np.int64)
             for start in range(0, len(values), 100):
                 one.update(make_block(t_ns[start : start + 100].copy(), values[start : start + 100].copy()))
-                by_hand.update(one)
+                by_hand.adopt_and_start_models(one)
             told += [event.text for event in one.take_events()]
         hours = sum(len(values) for values in records) / rate_hz / 3600.0
         made.add_row(name, f"{hours:.1f}", str(len(told)), str(sum("stepped" in text for text in told)))

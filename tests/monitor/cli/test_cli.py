@@ -1114,10 +1114,10 @@ def counted(self, *arguments):
     caught = Caught()
     self.outputs.append(caught)
     run(self, *arguments)
-    truth = self.virtual["demo"].truth
+    truth = self.virtual["demo"].fault_counts
     if "demo" in caught.blocks:
         numbers = (concatenate_blocks(caught.blocks["demo"]).ticks // 10_000_000).tolist()
-        print(json.dumps([numbers, truth.made, truth.dropped]), file=sys.stderr)
+        print(json.dumps([numbers, truth.sample_count, truth.dropped]), file=sys.stderr)
 monitor.daemon.service.Service.run = counted
 sys.argv[0] = "imu-monitor"
 sys.exit(main())
@@ -1341,7 +1341,7 @@ def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path
         there = call("history", str(histories), "--device", "bench-1", "--json", "-", *span)
         nothing = call("history", "--connect", endpoint, "--from", "2000-01-01", "--to", "2000-01-02")
     finally:
-        service.stop()
+        service.request_stop()
         thread.join(PATIENCE_S)
     assert not thread.is_alive()
     told, kept = json.loads(said.out), json.loads(there.out)

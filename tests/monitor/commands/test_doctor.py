@@ -31,7 +31,7 @@ from monitor.commands.doctor import (
 from monitor.common.compiled import cache_folder
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, FolderLock
 from monitor.common.shipped_file_paths import CONFIG_FOLDER
-from monitor.daemon.storage.recorder import origin
+from monitor.daemon.storage.recorder import segment_metadata
 from monitor.noise.model_catalogue import read_model
 from monitor.settings import loading
 from monitor.settings.loading import Storage
@@ -268,7 +268,7 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     t_ns = 1_760_000_000_000_000_000 + np.arange(60_000) * 10_000_000 + rng.integers(-1000, 1000, 60_000)
     temperature = np.round(25.0 + 0.01 * rng.standard_normal(60_000), 2)
-    writer = SingleSegmentWriter(tmp_path / segment.format_segment_name(1, 1.76e9), origin("a", AxisMap()))
+    writer = SingleSegmentWriter(tmp_path / segment.format_segment_name(1, 1.76e9), segment_metadata("a", AxisMap()))
     for at in range(0, 60_000, 50):
         rows = slice(at, at + 50)
         ticks = np.arange(at, at + 50) * 10

@@ -161,7 +161,7 @@ def test_a_frozen_reader_ends_the_signs_of_life_and_nothing_else(tmp_path: Path)
             wait_for(lambda: service.workers[0].driver.counts.received > received + 200)
             assert systemd.count("WATCHDOG=1") == signs
         finally:
-            service.stop()
+            service.request_stop()
             thread.join(PATIENCE_S)
         assert not thread.is_alive()
         assert systemd.lines()[-1].startswith(("STOPPING=1", "STATUS="))

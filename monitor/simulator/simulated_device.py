@@ -2,7 +2,7 @@
 
 An ordinary link reads the other end of ``port``, as for a real sensor. The sensor does not wait for its reader. Samples
 that cannot be sent are dropped, and the counter shows the gap. ``unplug`` and ``plug`` disconnect and connect the
-cable. ``truth`` counts the samples and their faults.
+cable. ``fault_counts`` counts the samples and their faults.
 """
 
 import threading
@@ -30,7 +30,7 @@ MAX_DELAY_S: Final = 1.0
 _log = structlog.get_logger("imu-monitor")
 
 
-class VirtualImu:
+class SimulatedDevice:
     """Simulated device with its own thread.
 
     Parameters
@@ -50,7 +50,7 @@ class VirtualImu:
 
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str = "virtual") -> None:
         self.name = name
-        self.truth = FaultCounts()
+        self.fault_counts = FaultCounts()
         self.now_s: Callable[[], float] = time.monotonic
         """Clock of the simulation, in seconds. It may be replaced before ``start``."""
         self._sensor = SimulatedSensor(table, decoder, name)
@@ -93,7 +93,7 @@ class VirtualImu:
 
     def _run(self) -> None:
         """Send samples in bursts until the sensor is stopped."""
-        self._sensor.switch_on()
+        self._sensor.start_clock()
         begun_s, made = self.now_s(), 0
         step_s = max(BURST_S, 0.5 / self._pace_hz)  # for a slow sensor, two steps per sample are enough
         while not self._stop.wait(step_s + self._burst_delay_s()):
@@ -101,16 +101,16 @@ class VirtualImu:
             late = due - made - int(MAX_DELAY_S * self._pace_hz)
             if late > 0:  # the machine was suspended while the sensor would have continued
                 made += late
-                self._sensor.skip(late)
-                self._faults.draw(late)
-                self.truth.dropped += late
+                self._sensor.skip_samples(late)
+                self._faults.draw_faults(late)
+                self.fault_counts.dropped += late
             if due > made:
                 self._make_and_send(made, due - made)
                 made = due
 
     def _make_and_send(self, first: int, n: int) -> None:
         """Simulate ``n`` samples, and send the samples during which the simulated cable is connected."""
-        frames, draws = self._sensor.frames(n), self._faults.draw(n)
+        frames, draws = self._sensor.encode_next_samples(n), self._faults.draw_faults(n)
         at = 0
         while at < n:
             if self._back_at is None:
@@ -121,7 +121,7 @@ class VirtualImu:
                     self._unplug_by_fault(first + stop)
             else:
                 stop = min(n, max(at, self._back_at - first))
-                self.truth.dropped += stop - at
+                self.fault_counts.dropped += stop - at
                 if first + stop >= self._back_at:
                     self._plug_again()
             at = stop
@@ -130,17 +130,17 @@ class VirtualImu:
         """Apply the faults to samples, send them and count the results."""
         hurt = [
             (kind, self._faults.apply_fault(kind, where, chunks))
-            for kind, where, chunks in zip(draws.kinds(), draws.where.tolist(), frames, strict=True)
+            for kind, where, chunks in zip(draws.kind_per_sample(), draws.where.tolist(), frames, strict=True)
         ]
-        gone = self.port.send([chunk for _, chunks in hurt for chunk in chunks])
+        gone = self.port.send_chunks([chunk for _, chunks in hurt for chunk in chunks])
         for kind, chunks in hurt:
             gone -= len(chunks)
-            self.truth.count(kind, out=gone >= 0)
+            self.fault_counts.count_sample(kind, all_sent=gone >= 0)
 
     def _unplug_by_fault(self, index: int) -> None:
         """Disconnect the cable because of a fault."""
         self.unplug()
-        self.truth.unplugged += 1
+        self.fault_counts.unplugged += 1
         self._back_at = index + self._unplugged_samples
 
     def _plug_again(self) -> None:
@@ -154,5 +154,5 @@ class VirtualImu:
     def _burst_delay_s(self) -> float:
         """Return the delay of the next burst, in seconds."""
         held_s = self._faults.draw_delay_s()
-        self.truth.held_s = max(self.truth.held_s, held_s)
+        self.fault_counts.held_s = max(self.fault_counts.held_s, held_s)
         return held_s

@@ -3,7 +3,7 @@
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.settings.toml_text import parse_toml
+from monitor.settings.toml_parser import parse_toml
 
 
 def test_whole_numbers_of_64_bits() -> None:

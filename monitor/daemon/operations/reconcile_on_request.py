@@ -112,7 +112,7 @@ class Reconciler:
         self._running[job.device] = thread
         thread.start()
 
-    def take(self) -> list[Finished]:
+    def take_finished(self) -> list[Finished]:
         """Return the results since the last call."""
         found = []
         with contextlib.suppress(queue.Empty):

@@ -13,7 +13,7 @@ from drivers.errors import ConfigError
 from drivers.timing.sample_clock import SampleClock
 from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.settings.loading import VirtualTable
-from monitor.simulator import VirtualImu
+from monitor.simulator import SimulatedDevice
 from tests.support.paced_sensor import follow_reader, is_open
 from tests.support.waiting import PATIENCE_S, wait_for
 
@@ -30,7 +30,7 @@ class Rig:
 
     def __init__(self, module=vectornav_binary, speed=1.0, allowed=math.inf):
         decoder = module.build(module.Settings())
-        self.imu = VirtualImu(VirtualTable(model=MODEL, seed=3, speed=speed), decoder)
+        self.imu = SimulatedDevice(VirtualTable(model=MODEL, seed=3, speed=speed), decoder)
         self.blocks = []
         self.driver = Driver(
             "v", self.imu.link, decoder, SampleClock(decoder.timing, self.imu.rate_hz), self.blocks.append
@@ -62,8 +62,8 @@ class Rig:
 @pytest.mark.parametrize("module", [vectornav_binary, stim300, xsens_mtdata2], ids=lambda m: m.__name__)
 def test_what_it_sends_is_received(module):
     with Rig(module, allowed=100) as rig:
-        rig.wait(lambda: rig.imu.truth.made == rig.driver.counts.received == 100)
-    counts, truth = rig.driver.counts, rig.imu.truth
+        rig.wait(lambda: rig.imu.fault_counts.sample_count == rig.driver.counts.received == 100)
+    counts, truth = rig.driver.counts, rig.imu.fault_counts
     assert (truth.sent, truth.dropped) == (100, 0)
     assert (counts.lost, counts.bad) == (0, 0)
     values = np.concatenate([one.values for one in rig.blocks])
@@ -74,8 +74,8 @@ def test_what_it_sends_is_received(module):
 
 def test_a_pulled_cable_and_back():
     with Rig(allowed=50) as rig:
-        counts, truth = rig.driver.counts, rig.imu.truth
-        rig.wait(lambda: truth.made == counts.received == 50)  # nothing is on the way when the cable is pulled
+        counts, truth = rig.driver.counts, rig.imu.fault_counts
+        rig.wait(lambda: truth.sample_count == counts.received == 50)  # nothing is on the way when the cable is pulled
         rig.imu.unplug()
         rig.wait(lambda: rig.driver.state == "lost")
         assert not rig.imu.port.path.exists()
@@ -85,7 +85,7 @@ def test_a_pulled_cable_and_back():
         rig.imu.plug()
         rig.allowed = 150
         rig.wait(lambda: rig.driver.state == "running")
-        rig.wait(lambda: truth.made == 150 and counts.received == 100)
+        rig.wait(lambda: truth.sample_count == 150 and counts.received == 100)
         kinds = rig.kinds()
     assert kinds.count("link_lost") == kinds.count("link_back") == 1
     assert "samples_lost" in kinds
@@ -97,10 +97,10 @@ def test_nobody_reads_and_the_sensor_goes_on():
     rig = Rig(speed=20.0)
     rig.imu.start()
     try:
-        rig.wait(lambda: rig.imu.truth.dropped > 200)
+        rig.wait(lambda: rig.imu.fault_counts.dropped > 200)
     finally:
         rig.imu.stop()
-    assert rig.imu.truth.sent > 0
+    assert rig.imu.fault_counts.sent > 0
     assert not rig.imu.port.path.parent.exists()
 
 
@@ -129,4 +129,4 @@ def test_a_model_that_cannot_be_read(tmp_path):
     (tmp_path / "bad.toml").write_text("[gz.no_such_effect]\nx = 1\n")
     decoder = vectornav_binary.build(vectornav_binary.Settings())
     with pytest.raises(ConfigError):
-        VirtualImu(VirtualTable(model=str(tmp_path / "bad.toml")), decoder)
+        SimulatedDevice(VirtualTable(model=str(tmp_path / "bad.toml")), decoder)

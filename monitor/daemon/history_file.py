@@ -4,7 +4,7 @@ import time
 from pathlib import Path
 
 from drivers.errors import NotReady, RecordingError
-from monitor.daemon.outputs import HistoryOutput
+from monitor.daemon.output_classes import HistoryOutput
 from monitor.history.query import parse_query
 from monitor.history.reading import HistoryTable, read_history
 from monitor.history.sqlite_store import FILE_NAME, open_history
@@ -13,7 +13,7 @@ from monitor.history.writer import HistoryWriter
 from monitor.publishing.messages.history import HistoryMessage
 
 
-class StoredHistory:
+class HistoryFile:
     """History file of the service.
 
     Parameters
@@ -37,7 +37,7 @@ class StoredHistory:
 
     def close(self) -> None:
         """Store the incomplete minutes and close the file."""
-        self.output.end()
+        self.output.store_incomplete_minutes()
         self.writer.close()
 
     def read_newest(self, device: str, span_s: float) -> HistoryTable | None:

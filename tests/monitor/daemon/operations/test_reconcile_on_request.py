@@ -14,7 +14,7 @@ import pytest
 import imu_monitor
 from drivers.recordings import load_samples
 from drivers.sample import make_block
-from monitor.daemon.operations.live_reconcile import COMMAND, NICENESS_INCREASE, Job, Reconciler, format_result
+from monitor.daemon.operations.reconcile_on_request import COMMAND, NICENESS_INCREASE, Job, Reconciler, format_result
 from monitor.estimation.estimator import Estimator
 from monitor.publishing.zenoh.publisher import Command
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
@@ -72,7 +72,7 @@ def run(text: str, one: Job | None = None, limit_s: float = PATIENCE_S) -> tuple
     reconciler.start(one or job(), asked.command)
     asked.wait()
     reconciler.close()
-    return asked, [finished.text for finished in reconciler.take()]
+    return asked, [finished.text for finished in reconciler.take_finished()]
 
 
 def test_the_answer_is_what_the_program_says() -> None:
