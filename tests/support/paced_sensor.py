@@ -66,7 +66,10 @@ def follow_reader(imu: SimulatedDevice, driver: Driver, allowed: Callable[[], fl
             return min(host_s - begun_s, (allowed() + 0.5) / imu._pace_hz)
         if is_open(imu):
             waiting = (
-                imu.fault_counts.sent + imu.fault_counts.repeated - driver.counts.received - driver.clock.dropped_repeated_rows
+                imu.fault_counts.sent
+                + imu.fault_counts.repeated
+                - driver.counts.received
+                - driver.clock.dropped_repeated_rows
             )
             limit = max(limit, min(imu.fault_counts.sample_count + AHEAD - waiting, allowed()))
         return min(host_s - begun_s, (limit + 0.5) / imu._pace_hz)
