@@ -4,7 +4,7 @@ If no cache folder can be written (a read-only system, a user without a home fol
 start.
 
 Before Numba loads cached code, it checks only whether the file of the kernel has changed. A kernel also contains the
-functions and constants of other files that it uses. The stamp of the cache therefore covers all imported files.
+functions and constants of other files that it uses. The version of the cache therefore covers all imported files.
 
 Without further measures, Numba generates machine code for each kernel before another kernel can call it, and again for
 the copy in the calling kernel. A function four calls below the kernel that Python calls would go through LLVM five
@@ -186,7 +186,8 @@ def _cached(kernel: Kernel, function: Callable[P, R]) -> Callable[P, R]:
     with contextlib.suppress(RuntimeError):  # no cache folder can be written
         kernel.enable_caching()
         kept = cast("Any", kernel)._cache._cache_file  # noqa: SLF001
-        kept._source_stamp = (kept._source_stamp, source_hash(Path(inspect.getfile(function))))  # noqa: SLF001
+        # Numba compares the version before it reads the index, which may name types that no longer exist
+        kept._version = f"{kept._version} {source_hash(Path(inspect.getfile(function)))}"  # noqa: SLF001
     return cast("Callable[P, R]", kernel)
 
 
