@@ -31,7 +31,7 @@ from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.report import SCHEMA, encode_report
 from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.several_recordings import comparison_report
-from monitor.reconcile.several_recordings.comparison import Comparison, NamedResult, compare
+from monitor.reconcile.several_recordings.comparison import Comparison, NamedResult, compare_results
 
 ProgressCallback = Callable[[str, float | None], None]
 """Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
@@ -137,7 +137,7 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
         _write(request.out / REPORT, encode_failure(why, 0, comparison_report.SCHEMA))
         raise NotReady(why)
     tell("writing", None)
-    comparison = compare(runs, fitted_to, silent)
+    comparison = compare_results(runs, fitted_to, silent)
     write_comparison(comparison, request.out)
     return comparison
 

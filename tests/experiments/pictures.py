@@ -444,7 +444,7 @@ def reconcile_hidden_effects(folder: Path) -> AxisResult:
 
 def save_diagnostic_picture(result: AxisResult, when: str, path: Path) -> Path:
     """Draw spectrum, Allan deviation and tails of one axis with one model, as in the report."""
-    views = {view.lens: view for view in getattr(result, when).views}
+    views = {view.lens: view for view in getattr(result, when).plots}
     drawn = [compared_diagnostic_svg([("", views[lens])], result.axis, 5.2, 3.3) for lens in ("psd", "allan", "tails")]
     page = path.with_suffix(".html")
     style = "body{margin:8px;display:flex;font-family:sans-serif;background:white}svg{width:520px;height:330px}"

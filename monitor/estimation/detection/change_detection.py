@@ -24,8 +24,8 @@ its last change. The detector returns a ``Change`` of one of three kinds:
   removed from the reference.
 
 ``analyze`` and the live service share this detector. ``reconcile`` tests steps of level and noise by the likelihood
-ratio of its own model of the axis (``diagnostics.step_gains``, ``single_steps``, ``variance_history``), because the
-gain of a step must be comparable with the gain of every other effect.
+ratio of its own model of the axis (``diagnostics.level_step_gains``, ``single_steps``, ``variance_history``), because
+the gain of a step must be comparable with the gain of every other effect.
 """
 
 from collections.abc import Mapping

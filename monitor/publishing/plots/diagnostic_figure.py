@@ -22,7 +22,7 @@ from monitor.publishing.reports.reconcile_sentences import (
     gap_to_threshold_ratio,
     readable_name,
 )
-from monitor.reconcile.result import Location, ParameterInterval, PlotData, Score
+from monitor.reconcile.result import DiagnosticGap, Location, ParameterInterval, PlotData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -255,7 +255,7 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[
     panel.set_title(plot.y_label, loc="left", fontsize=9, color=style.GREY)
 
 
-def gap_chart_svg(before: Sequence[Score], after: Sequence[Score] = ()) -> str:
+def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap] = ()) -> str:
     """Draw the gap of each diagnostic divided by its threshold, and return the chart as an SVG element.
 
     Parameters
@@ -273,7 +273,7 @@ def gap_chart_svg(before: Sequence[Score], after: Sequence[Score] = ()) -> str:
         for y, score in enumerate(before):
             scores = [score] + ([later[score.lens]] if score.lens in later else [])
             x = [max(gap_to_threshold_ratio(one), MIN_GAP_RATIO) for one in scores]
-            colours = [ABOVE_THRESHOLD_COLOUR if one.passes else BELOW_THRESHOLD_COLOUR for one in scores]
+            colours = [ABOVE_THRESHOLD_COLOUR if one.is_significant else BELOW_THRESHOLD_COLOUR for one in scores]
             panel.plot(x, [y] * len(x), color=style.GREY, linewidth=1.4, zorder=2)
             if len(x) > 1:
                 panel.plot(x[0], y, "o", mfc="white", mec=colours[0], mew=1.4, markersize=6)

@@ -118,7 +118,7 @@ def _steps_text(r: Reconciliation, result: AxisResult) -> str:
             f"**Step {count}: {step.kind} {words.readable_name(step.effect)}** "
             f"({words.format_probability(step.confidence)})",
             "\n".join(f"- {words.readable_name(one.name)} **{one.short}**" for one in known),
-            f"{words.diagnostic_name(step.found.lens)}, {words.format_range(step.found.where, result.axis)}: gap "
+            f"{words.diagnostic_name(step.before.lens)}, {words.format_range(step.before.where, result.axis)}: gap "
             f"**{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}**, "
             f"threshold {words.format_gap(step.after.threshold)}",
             step.because,
@@ -136,12 +136,12 @@ def _axes(r: Reconciliation) -> list[str]:
 
 def _snapshots_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
     """Return the diagnostics with the first model and after each step; the last one excludes withdrawn effects."""
-    return [result.start, *(step.look for step in result.steps[:-1]), *([result.end] if result.steps else [])]
+    return [result.start, *(step.snapshot_after for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
 def _drawn_diagnostics(result: AxisResult) -> list[str]:
     """Return the logarithmic diagnostics of an axis that are drawn."""
-    return [view.lens for view in result.start.views if view.log][:MAX_PLOTTED_DIAGNOSTICS]
+    return [view.lens for view in result.start.plots if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
 
 def _tab(result: AxisResult) -> rrb.Container:
@@ -190,7 +190,7 @@ def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult)
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
     """Log the gap of each diagnostic relative to its threshold, for the largest gaps, and the threshold, which is 1."""
     snapshots = [
-        {score.lens: words.gap_to_threshold_ratio(score) for score in snapshot.scores}
+        {score.lens: words.gap_to_threshold_ratio(score) for score in snapshot.gaps}
         for snapshot in _snapshots_by_step(result)
     ]
     path = f"{result.axis}/gap"
@@ -214,7 +214,7 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
     """Log both plots of one diagnostic with the same scale."""
     axis = result.axis
     views = [
-        next((view for view in snapshot.views if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
+        next((view for view in snapshot.plots if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
     ]
     plots = {step: to_field_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
@@ -256,8 +256,8 @@ def _log_curves(
 
 def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, result: AxisResult, lens: str) -> None:
     """Log a frame around each range in which this diagnostic found a gap."""
-    view = next(view for view in result.start.views if view.lens == lens)
-    founds = [step.found for step in result.steps] + list(result.left_over)
+    view = next(view for view in result.start.plots if view.lens == lens)
+    founds = [step.before for step in result.steps] + list(result.left_over)
     marks = [to_field_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
     bounds = [mark.mark for mark in marks if mark.mark is not None]
     if not bounds:

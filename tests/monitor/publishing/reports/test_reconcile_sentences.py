@@ -9,13 +9,13 @@ from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.effects import EFFECTS, AngleRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.reconcile.result import Location, ParameterInterval, Reconciliation, ReconciliationStep, RunnerUp
+from monitor.reconcile.result import AddedOrResizedEffect, Location, ParameterInterval, Reconciliation, RunnerUp
 from tests.monitor.reconcile import samples
 
 NO_MODEL = NoiseModel({})
 
 
-def one(effect: str, axis: str = "gz", kind: str = "added", **parameters: ParameterInterval) -> ReconciliationStep:
+def one(effect: str, axis: str = "gz", kind: str = "added", **parameters: ParameterInterval) -> AddedOrResizedEffect:
     step = samples.explained().axes["gz"].steps[0]
     return replace(step, effect=effect, parameters=parameters, kind=kind)
 

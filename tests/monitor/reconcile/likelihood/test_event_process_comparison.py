@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from monitor.reconcile.likelihood.hidden_state import (
+from monitor.reconcile.likelihood.event_process_comparison import (
     MAX_LOG_PARAMETER_RANGE,
     BackgroundNoise,
     _flicker_processes,
     _log_interval,
     block_markov_noise,
     block_means,
-    fit_process,
+    fit_event_process,
     kalman_log_likelihood,
     maximise,
     prior_level_variance,
@@ -68,7 +68,7 @@ def test_maximum_and_its_width():
     height, at = maximise(likelihood, (5e-4, 9.0))
     assert height == pytest.approx(7.0, abs=0.02)
     assert at == pytest.approx(target, abs=0.05)
-    found = fit_process(lambda a, b, odds: likelihood(a, b) + 12.0 * np.log(odds), {"a": 5e-4, "b": 9.0})
+    found = fit_event_process(lambda a, b, odds: likelihood(a, b) + 12.0 * np.log(odds), {"a": 5e-4, "b": 9.0})
     assert found.log_likelihood == height
     assert found.events == pytest.approx(12.0, rel=1e-3)
     for k, name in enumerate(("a", "b")):
@@ -79,7 +79,7 @@ def test_maximum_and_its_width():
 
 
 def test_no_interval_without_a_peak():
-    flat = fit_process(lambda a, b, _odds: -0.0 * a * b, {"a": 1.0, "b": 1.0})
+    flat = fit_event_process(lambda a, b, _odds: -0.0 * a * b, {"a": 1.0, "b": 1.0})
     assert flat.parameters["a"].lo is None
     assert _log_interval(1.0, MAX_LOG_PARAMETER_RANGE).hi is None
 

@@ -5,11 +5,11 @@ import pytest
 
 from drivers.sample import AXES
 from monitor.noise.effects import AngleRandomWalk, Outliers, RandomSampleHold, Resolution, Saturation
-from monitor.reconcile.search.axis_preparation import (
+from monitor.reconcile.search.axis_repair import (
     _may_leak,
     _repair_samples,
     measure_value_statistics,
-    repair_again,
+    repair_axis_again,
 )
 from tests.monitor.reconcile.axes import RATE_HZ, WHITE, N, axes, axis, correlated, white
 
@@ -65,7 +65,7 @@ def test_clipped_samples_are_drawn_from_beyond_the_limit():
     limit = 2.0 * SIGMA
     clipped = np.clip(y, -limit, limit)
     shown = measure_value_statistics(clipped)
-    assert shown.clipped is not None
+    assert shown.clipping is not None
     mended = _repair_samples(clipped, shown, (WHITE, Saturation(limit=limit)), np.random.default_rng(RNG))
     at_limit = np.abs(clipped) >= limit
     np.testing.assert_array_equal(mended[~at_limit], clipped[~at_limit])
@@ -102,9 +102,9 @@ def test_the_same_generator_gives_the_same_axis():
 def test_put_right_for_other_effects_is_prepared_for_them():
     y = np.clip(noise(), -1.5 * SIGMA, 1.5 * SIGMA)
     model = (WHITE, Saturation(limit=1.5 * SIGMA))
-    later = repair_again(axis(y, (WHITE,)), model, np.random.default_rng(0))
+    later = repair_axis_again(axis(y, (WHITE,)), model, np.random.default_rng(0))
     np.testing.assert_allclose(later.coefficients, axis(y, model).coefficients)
-    back = repair_again(later, (WHITE,), np.random.default_rng(0))
+    back = repair_axis_again(later, (WHITE,), np.random.default_rng(0))
     np.testing.assert_array_equal(back.repaired, y)
 
 
@@ -113,16 +113,16 @@ def test_which_axes_may_leak_into_which():
     assert into["gx"] == {"gy", "gz", "ax", "ay", "az"}
     assert into["ay"] == {"ax", "az"}
     every = axes({name: noise(k) for k, name in enumerate(AXES)}, (AngleRandomWalk(N=N),))
-    assert {name: set(one.others) for name, one in every.items()} == into
+    assert {name: set(one.leak_sources) for name, one in every.items()} == into
 
 
 def test_what_the_values_show():
     y = noise()
     shown = measure_value_statistics(y)
-    assert shown.levels is None
+    assert shown.quantization is None
     coarse = measure_value_statistics(4e-4 * np.rint(y / 4e-4))
-    assert coarse.levels is not None
-    assert coarse.levels.step.value == pytest.approx(4e-4)
+    assert coarse.quantization is not None
+    assert coarse.quantization.step.value == pytest.approx(4e-4)
     # repeats of coarse values are no repeats of samples
     one = axis(4e-4 * np.rint(y / 4e-4), (WHITE, Resolution(step=4e-4)))
     np.testing.assert_array_equal(one.repaired, one.raw)

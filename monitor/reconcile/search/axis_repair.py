@@ -15,7 +15,7 @@ from drivers.sample import Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Outliers, RandomSampleHold, Saturation
 from monitor.reconcile.likelihood.axis import Axis, Effects, RegressorCache, ValueStatistics
-from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
+from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
 from monitor.reconcile.likelihood.outlier_statistics import fit_outliers
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins
@@ -32,7 +32,7 @@ SIGMA_RELATIVE_TOLERANCE: Final = 5e-4
 E = TypeVar("E", bound=Effect)
 
 
-def prepare_axes(
+def build_repaired_axes(
     recording: Recording, effects: Mapping[str, Effects], regressors: RegressorCache, rng: np.random.Generator
 ) -> dict[str, Axis]:
     """Return the prepared axes of one recording.
@@ -50,20 +50,28 @@ def prepare_axes(
     """
     raw = recording.values
     bins = frequency_bins(recording.samples, recording.rate_hz)
-    shown = {name: measure_value_statistics(y) for name, y in raw.items()}
-    repaired = {name: _repair_samples(y, shown[name], effects[name], rng) for name, y in raw.items()}
+    statistics = {name: measure_value_statistics(y) for name, y in raw.items()}
+    repaired = {name: _repair_samples(y, statistics[name], effects[name], rng) for name, y in raw.items()}
     coefficients = {name: cosine_transform(y) for name, y in repaired.items()}
     axes = {}
     for name, y in raw.items():
         others = {other: one for other, one in coefficients.items() if _may_leak(other, name)}
         axis = Axis(
-            name, y, repaired[name], coefficients[name], bins, others, recording.temperature_c, shown[name], regressors
+            name,
+            y,
+            repaired[name],
+            coefficients[name],
+            bins,
+            others,
+            recording.temperature_c,
+            statistics[name],
+            regressors,
         )
         axes[name] = _replace_outliers(axis, effects[name], rng)
     return axes
 
 
-def repair_again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
+def repair_axis_again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
     """Return the same axis, repaired for other effects.
 
     Parameters
@@ -75,7 +83,9 @@ def repair_again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis
     rng : numpy.random.Generator
         Generator for the replacement samples.
     """
-    return _replace_outliers(axis.with_samples(_repair_samples(axis.raw, axis.shown, effects, rng)), effects, rng)
+    return _replace_outliers(
+        axis.with_samples(_repair_samples(axis.raw, axis.value_statistics, effects, rng)), effects, rng
+    )
 
 
 def _may_leak(source: str, axis: str) -> bool:
@@ -94,19 +104,19 @@ def measure_value_statistics(y: Floats) -> ValueStatistics:
     return ValueStatistics(grid, ends, detect_repeats(y, step, ends.limit.value if ends and ends.symmetric else np.inf))
 
 
-def _repair_samples(y: Floats, shown: ValueStatistics, effects: Effects, rng: np.random.Generator) -> Floats:
+def _repair_samples(y: Floats, statistics: ValueStatistics, effects: Effects, rng: np.random.Generator) -> Floats:
     """Return the samples ``y``, shape (n,), with missing, repeated and clipped samples replaced.
 
     Repeats and clipping are repaired only if they are among the effects.
     """
     missing = ~np.isfinite(y)
-    if _first_of_type(effects, RandomSampleHold) and shown.repeats:
-        missing = missing | shown.repeats.mask
+    if _first_of_type(effects, RandomSampleHold) and statistics.repeats:
+        missing = missing | statistics.repeats.mask
     repaired = fill_missing(y, missing, rng)
     limit = _first_of_type(effects, Saturation)
-    if limit is None or shown.clipped is None or not shown.clipped.symmetric:
+    if limit is None or statistics.clipping is None or not statistics.clipping.symmetric:
         return repaired
-    return _restore_clipped(repaired, shown.clipped.limit.value, rng)
+    return _restore_clipped(repaired, statistics.clipping.limit.value, rng)
 
 
 def _restore_clipped(y: Floats, limit: float, rng: np.random.Generator) -> Floats:
@@ -129,7 +139,7 @@ def _replace_outliers(axis: Axis, effects: Effects, rng: np.random.Generator) ->
     """Return the axis with the outliers replaced, if the effects include outliers."""
     if _first_of_type(effects, Outliers) is None:
         return axis
-    found = fit_outliers(whiten_axis(fit_with_given_sizes(axis, effects).fit).fast)
+    found = fit_outliers(whiten_axis(fit_with_fixed_noise(axis, effects).fit).flat_series)
     return axis if found is None else axis.with_samples(fill_missing(axis.repaired, found.mask, rng))
 
 

@@ -2,8 +2,8 @@
 
 A random telegraph has the same second moments as exponentially correlated noise. Poisson steps have the same second
 moments as a random walk. Only the distributions differ. Both effects of a pair therefore get their full likelihood on
-the same data with the same background noise. The result is a ``ModelComparison``. Its gain is the logarithm of the
-ratio of the two likelihoods, each at its maximum. The caller subtracts penalties for parameters and prior odds.
+the same data with the same background noise. The gain of an ``EventProcessComparison`` is the
+logarithm of the ratio of the two maximum likelihoods. The caller subtracts penalties for parameters and prior odds.
 
 The data are block means. The background noise consists of white noise, random walk, flicker noise and exponentially
 correlated noise. It is written as a sum of independent first-order processes whose block means are known given the
@@ -49,7 +49,7 @@ MAX_LOG_PARAMETER_RANGE: Final = log(30.0)
 
 
 @dataclass(frozen=True, slots=True)
-class ModelComparison:
+class EventProcessComparison:
     """Comparison of a process of random events with an effect that has the same spectrum, on one axis."""
 
     gain: float  # log-likelihood of the process minus that of the other effect
@@ -87,7 +87,7 @@ class EventProcessFit(NamedTuple):
     parameters: dict[str, ParameterInterval]
     events: float  # expected number of events, given the data
 
-    def compare(self, log_likelihood: float, single_steps: int = 0) -> ModelComparison:
+    def compare(self, log_likelihood: float, single_steps: int = 0) -> EventProcessComparison:
         """Compare the process with another effect.
 
         Parameters
@@ -97,7 +97,9 @@ class EventProcessFit(NamedTuple):
         single_steps : int, optional
             Number of steps, if the other effect is a number of single steps.
         """
-        return ModelComparison(self.log_likelihood - log_likelihood, self.parameters, round(self.events), single_steps)
+        return EventProcessComparison(
+            self.log_likelihood - log_likelihood, self.parameters, round(self.events), single_steps
+        )
 
 
 def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float]:
@@ -246,7 +248,9 @@ def maximise(log_likelihood: Callable[..., float], start: Sequence[float]) -> tu
     return -float(found.fun), np.asarray(found.x)
 
 
-def fit_process(likelihood: Callable[[float, float, float], float], start: Mapping[str, float]) -> EventProcessFit:
+def fit_event_process(
+    likelihood: Callable[[float, float, float], float], start: Mapping[str, float]
+) -> EventProcessFit:
     """Maximise the likelihood of a process of random events over its two parameters.
 
     The number of events expected from the data is the derivative of the log-likelihood by the logarithm of the odds of
@@ -320,7 +324,7 @@ def initial_covariance(noise: StateSpaceNoise, start: float) -> Floats:
 
 
 @compiled
-def predict_block(noise: StateSpaceNoise, covariance: Floats, reach: Floats) -> float:
+def predict_block_mean_variance(noise: StateSpaceNoise, covariance: Floats, reach: Floats) -> float:
     """Return the variance of a block mean, and store its covariance with the next state in ``reach`` [d]."""
     table = noise.table
     d = table.shape[0]
@@ -335,7 +339,7 @@ def predict_block(noise: StateSpaceNoise, covariance: Floats, reach: Floats) -> 
 
 
 @compiled
-def innovation_of(z: float, noise: StateSpaceNoise, at: Floats) -> float:
+def innovation_of_block(z: float, noise: StateSpaceNoise, at: Floats) -> float:
     """Return the difference of a block mean from the prediction by the state ``at`` [d]."""
     innovation = z
     for i in range(noise.table.shape[0]):
@@ -354,7 +358,7 @@ def innovation_variances(free: Floats, noise: StateSpaceNoise, start: float) -> 
     variances, reaches, covariance = np.empty(m), np.empty((m, d)), initial_covariance(noise, start)
     for k in range(m):
         covariance[0, 0] += free[k]
-        variances[k] = predict_block(noise, covariance, reaches[k])
+        variances[k] = predict_block_mean_variance(noise, covariance, reaches[k])
         for i in range(d):
             for j in range(d):
                 covariance[i, j] *= table[i, 0] * table[j, 0]
@@ -364,13 +368,13 @@ def innovation_variances(free: Floats, noise: StateSpaceNoise, start: float) -> 
 
 
 @compiled
-def innovations_of(series: Floats, noise: StateSpaceNoise, variances: Floats, reaches: Floats) -> Floats:
+def innovations_of_series(series: Floats, noise: StateSpaceNoise, variances: Floats, reaches: Floats) -> Floats:
     """Return the innovations of a series, shape (m,): the differences from the predictions of the Kalman filter."""
     table = noise.table
     d = table.shape[0]
     at, innovations = np.zeros(d), np.empty(series.size)
     for k in range(series.size):
-        innovations[k] = innovation_of(series[k], noise, at)
+        innovations[k] = innovation_of_block(series[k], noise, at)
         for i in range(d):
             at[i] = table[i, 0] * at[i] + reaches[k, i] * innovations[k] / variances[k]
     return innovations
@@ -383,7 +387,7 @@ def kalman_log_likelihood(means: Floats, noise: StateSpaceNoise, start: float) -
     The Kalman filter follows Anderson & Moore, "Optimal Filtering", 1979, sections 5.5 and 10.4.
     """
     variances, reaches = innovation_variances(np.zeros(means.size), noise, start)
-    innovations = innovations_of(means, noise, variances, reaches)
+    innovations = innovations_of_series(means, noise, variances, reaches)
     total = 0.0
     for k in range(means.size):
         total -= 0.5 * (np.log(2.0 * np.pi * variances[k]) + innovations[k] * innovations[k] / variances[k])
