@@ -190,7 +190,7 @@ def _fit_curve(
     measured = MeasuredCurve(
         avar, terms, slope_of_recording(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
     )
-    found = fit(columns, covariances, avar, terms, slope=measured.slope, slopes=measured.slopes)
+    found = fit(columns, covariances, measured)
     filters = [
         find_low_pass(columns, covariances, measured.axis(axis), power_spectrum(values[:, axis]))
         if is_contradicted(found, axis)

@@ -262,15 +262,12 @@ class Estimator:
         fits = []
         for axes in groups:
             n = int(lengths[axes[0]])
-            table = self._tables.of_axis(int(axes[0]), n, self._window.samples_in_window).at(n)
+            table = self._tables.at(int(axes[0]), n, self._window.samples_in_window)
             measured = MeasuredCurve(
                 avar[:, axes], terms[:, axes], slope[axes] * self.rate_hz, slopes[: self._m, axes] * self.rate_hz,
                 before[:, axes],
             )  # fmt: skip
-            one = fit(
-                self._design, table, measured.avar, measured.terms, measured.before, measured.slope, measured.slopes,
-                start=self._theta[:, axes],
-            )  # fmt: skip
+            one = fit(self._design, table, measured, start=self._theta[:, axes])
             self._theta[:, axes] = one.theta
             for column, axis in enumerate(axes.tolist()):
                 self._contradicting[axis] = (table, measured.axis(column)) if is_contradicted(one, column) else None

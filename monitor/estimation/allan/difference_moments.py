@@ -16,7 +16,7 @@ increases the variance of the estimate. A ramp without noise adds no variance.
 All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final, NamedTuple
@@ -61,7 +61,7 @@ def octaves(longest: int) -> Ints:
     return 2 ** np.arange(max(longest, 1).bit_length(), dtype=np.int64)
 
 
-def integrate_to_phase(values: Floats) -> PhaseRing:
+def _integrate_to_phase(values: Floats) -> PhaseRing:
     """Return the phase of the mean-free rates [n, k], in C order."""
     phase = np.zeros((len(values) + 1, values.shape[1]))
     missing = np.zeros(phase.shape, np.int32)
@@ -75,6 +75,30 @@ def integrate_to_phase(values: Floats) -> PhaseRing:
     np.cumsum(rate, axis=0, out=rate)
     np.cumsum(absent, axis=0, out=missing[1:])
     return PhaseRing(phase, missing, 0, len(values))
+
+
+def mean_squares(
+    values: Floats, factors: Ints, squared_weights: float, add_squares: Callable[[PhaseRing, int, Floats, Ints], None]
+) -> tuple[Floats, Ints]:
+    """Return the variances [m, k] of rates [n, k] and the number of terms [m, k].
+
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, k)
+        Rates of k axes; values that are not finite are missing.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    squared_weights : float
+        Factor of the variance definition, see ``variance_of_sums``.
+    add_squares : callable
+        Function that adds the squared differences at one cluster size to the sums [k] and the numbers of terms [k].
+    """
+    ring = _integrate_to_phase(values)
+    sums = np.zeros((factors.size, values.shape[1]))
+    terms = np.zeros(sums.shape, np.int64)
+    for i, m in enumerate(factors):
+        add_squares(ring, int(m), sums[i], terms[i])
+    return variance_of_sums(sums, terms, factors, squared_weights), terms
 
 
 def variance_of_sums(sums: Floats, terms: Ints, factors: Ints, squared_weights: float) -> Floats:
@@ -109,7 +133,7 @@ def theta_per_sample(theta: Floats, rate_hz: float) -> Floats:
 
 
 def correct_bias(
-    moments: Iterable[Moments], theta: Floats, variance: Floats, terms: Ints
+    moments: Sequence[Moments], theta: Floats, variance: Floats, terms: Ints
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Correct measured variances for bias, and compute their degrees of freedom and intervals.
 
@@ -118,7 +142,7 @@ def correct_bias(
 
     Parameters
     ----------
-    moments : iterable of Moments
+    moments : sequence of Moments
         Moments of the m cluster sizes.
     theta : ndarray of float64, shape (5, k)
         Q² N² B² K² R² in units of one sample; NaN means unknown.
@@ -136,11 +160,10 @@ def correct_bias(
     lo, hi : ndarray of float64, shape (m, k)
         Ends of the 95 % interval of the deviation.
     """
-    each = list(moments)
-    mean = np.stack([one.mean for one in each]) @ theta
-    allan = np.stack([one.allan for one in each]) @ theta
-    square = np.einsum("ak,mab,bk->mk", theta, np.stack([one.covariance for one in each]), theta)
-    whole = np.array([one.terms for one in each])[:, None]
+    mean = np.stack([one.mean for one in moments]) @ theta
+    allan = np.stack([one.allan for one in moments]) @ theta
+    square = np.einsum("ak,mab,bk->mk", theta, np.stack([one.covariance for one in moments]), theta)
+    whole = np.array([one.terms for one in moments])[:, None]
     with np.errstate(invalid="ignore", divide="ignore"):
         edf = np.where(variance > 0.0, 2.0 * mean * mean / square * (terms / whole), np.nan)
         corrected = variance * (allan / mean)

@@ -23,7 +23,7 @@ from drivers.sample import Floats
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow
-from monitor.estimation.fit.coefficient_fit import fit, make_design
+from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design
 
 STEPS_PER_WINDOW: Final = 20
 """Default number of steps per window length."""
@@ -108,7 +108,8 @@ def compute_dynamic_allan(
         window.update(values[start:end])
         start = end
         avar, (slope, slopes) = window.avar(), window.slopes_of_axes_and_taus()
-        found = fit(columns, covariances, avar, window.terms(), entered, slope * rate_hz, slopes * rate_hz)
+        measured = MeasuredCurve(avar, window.terms(), slope * rate_hz, slopes * rate_hz, entered)
+        found = fit(columns, covariances, measured)
         entered = found.entered
         deviation[row] = np.sqrt(avar)
         lo[row], hi[row] = deviation_intervals(avar, found.edf)

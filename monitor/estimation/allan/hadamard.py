@@ -11,7 +11,7 @@ differences. The formula of Greenhall & Riley (PTTI 2003, d = 3) holds only for 
 that contain a missing sample are left out.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,12 +24,11 @@ from monitor.estimation.allan.difference_moments import (
     Moments,
     PhaseRing,
     correct_bias,
-    integrate_to_phase,
+    mean_squares,
     octaves,
     phase_autocovariance,
     quadrature_nodes,
     theta_per_sample,
-    variance_of_sums,
 )
 
 SQUARED_WEIGHTS: Final = 6.0
@@ -76,12 +75,7 @@ def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     >>> hadamard_variance(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
     [0.166666666667, 0.0]
     """
-    ring = integrate_to_phase(values)
-    sums = np.zeros((factors.size, values.shape[1]))
-    terms = np.zeros(sums.shape, np.int64)
-    for i, m in enumerate(factors):
-        add_hadamard(ring, int(m), sums[i], terms[i])
-    return variance_of_sums(sums, terms, factors, SQUARED_WEIGHTS), terms
+    return mean_squares(values, factors, SQUARED_WEIGHTS, add_hadamard)
 
 
 def hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> HadamardCurve:
@@ -101,15 +95,17 @@ def hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints 
     n = len(values)
     factors = octaves(n // 3) if factors is None else factors
     raw, terms = hadamard_variance(values, factors)
-    return make_curve([moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
+    return make_hadamard_curve([hadamard_moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
 
 
-def make_curve(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> HadamardCurve:
+def make_hadamard_curve(
+    moments: Sequence[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints
+) -> HadamardCurve:
     """Compute degrees of freedom and confidence intervals of Hadamard variances.
 
     Parameters
     ----------
-    known : iterable of Moments
+    moments : sequence of Moments
         Moments of the m cluster sizes.
     rate_hz : float
         Sample rate in Hz.
@@ -120,13 +116,12 @@ def make_curve(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Flo
     terms : ndarray of int64, shape (m, k)
         Number of terms.
     """
-    each = list(known)
-    _, edf, lo, hi = correct_bias(each, theta_per_sample(theta, rate_hz), raw, terms)
-    factors = np.array([one.factor for one in each])
+    _, edf, lo, hi = correct_bias(moments, theta_per_sample(theta, rate_hz), raw, terms)
+    factors = np.array([one.factor for one in moments])
     return HadamardCurve(factors / rate_hz, factors, raw, terms, edf, lo, hi)
 
 
-def moments(n: int, factor: int) -> Moments:
+def hadamard_moments(n: int, factor: int) -> Moments:
     """Return the mean and the covariance of the Hadamard variance at one cluster size, which takes a millisecond.
 
     The example computes edf for white noise at m = 1 and 35 000 terms. The result is 18/35 of the number of terms,
@@ -139,7 +134,7 @@ def moments(n: int, factor: int) -> Moments:
     factor : int
         Cluster size in samples, at most n/3.
 
-    >>> one = moments(35_002, 1)
+    >>> one = hadamard_moments(35_002, 1)
     >>> round(2 * one.mean[1] ** 2 / one.covariance[1, 1])
     18000
     """

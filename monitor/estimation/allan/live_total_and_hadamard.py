@@ -118,8 +118,8 @@ class LiveTotalAndHadamard:
             return None
         totals, hadamards = self._last
         return (
-            total.curve_of([one.moments for one in totals], rate_hz, theta, *_stack(totals)),
-            hadamard.make_curve([one.moments for one in hadamards], rate_hz, theta, *_stack(hadamards)),
+            total.make_total_curve([one.moments for one in totals], rate_hz, theta, *_stack(totals)),
+            hadamard.make_hadamard_curve([one.moments for one in hadamards], rate_hz, theta, *_stack(hadamards)),
         )
 
     def _steps(self) -> Iterator[None]:
@@ -186,7 +186,7 @@ class LiveTotalAndHadamard:
         known = self._moments[statistic].get(m)
         full = n == self._window.length
         if known is None or not (known.n == n or (known.n < n < MOMENTS_RENEWAL_RATIO * known.n and not full)):
-            known = total.moments(n, m) if statistic == TOTAL else hadamard.moments(n, m)
+            known = total.total_moments(n, m) if statistic == TOTAL else hadamard.hadamard_moments(n, m)
             self._moments[statistic][m] = known
         return known
 

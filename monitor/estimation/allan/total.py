@@ -1,4 +1,6 @@
-"""Total variance of a rate, which is the Allan variance of a record reflected at both ends, for τ up to the record length.
+"""Total variance of a rate: the Allan variance of a record that is reflected at both ends.
+
+The total variance is defined for τ up to the record length.
 
 "Applications of total variance method in random error analysis of the fiber optic gyro signal" shows that a rate must
 be reflected as a rate (y*_{-j} = y_{j-1}) and not as a phase. The paper defines σ² as the mean of D²/2, where D_k(m) =
@@ -24,7 +26,7 @@ Terms that contain a missing sample are left out. The bias and the degrees of fr
 record without gaps. If fewer than ``MIN_SHARE`` of the terms remain, the corrected variance and the interval are NaN.
 """
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -37,12 +39,11 @@ from monitor.estimation.allan.difference_moments import (
     Moments,
     PhaseRing,
     correct_bias,
-    integrate_to_phase,
+    mean_squares,
     octaves,
     phase_autocovariance,
     quadrature_nodes,
     theta_per_sample,
-    variance_of_sums,
 )
 
 MIN_SHARE: Final = 0.5
@@ -97,13 +98,7 @@ def total_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     >>> total_variance(np.tile([1.0, 2.0], 50)[:, None], np.array([1, 2]))[0].ravel().round(9).tolist()
     [0.5, 0.002525253]
     """
-    ring, n = integrate_to_phase(values), len(values)
-    sums = np.zeros((factors.size, values.shape[1]))
-    terms = np.zeros(sums.shape, np.int64)
-    for i, m in enumerate(factors):
-        if m < n:
-            add_total(ring, int(m), 1, n, sums[i], terms[i])
-    return variance_of_sums(sums, terms, factors, SQUARED_WEIGHTS), terms
+    return mean_squares(values, factors, SQUARED_WEIGHTS, _add_all_terms)
 
 
 def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> TotalCurve:
@@ -123,15 +118,15 @@ def total_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | N
     n = len(values)
     factors = octaves(n - 1) if factors is None else factors
     raw, terms = total_variance(values, factors)
-    return curve_of([moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
+    return make_total_curve([total_moments(n, int(m)) for m in factors], rate_hz, theta, raw, terms)
 
 
-def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> TotalCurve:
+def make_total_curve(moments: Sequence[Moments], rate_hz: float, theta: Floats, raw: Floats, terms: Ints) -> TotalCurve:
     """Correct total variances for bias, and compute degrees of freedom and confidence intervals.
 
     Parameters
     ----------
-    known : iterable of Moments
+    moments : sequence of Moments
         Moments of the m cluster sizes.
     rate_hz : float
         Sample rate in Hz.
@@ -142,16 +137,15 @@ def curve_of(known: Iterable[Moments], rate_hz: float, theta: Floats, raw: Float
     terms : ndarray of int64, shape (m, k)
         Number of terms.
     """
-    each = list(known)
-    enough = terms >= MIN_SHARE * np.array([one.terms for one in each])[:, None]
-    tvar, edf, lo, hi = correct_bias(each, theta_per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
-    factors = np.array([one.factor for one in each])
-    unsure = 2 * factors > np.array([one.n for one in each])
+    enough = terms >= MIN_SHARE * np.array([one.terms for one in moments])[:, None]
+    tvar, edf, lo, hi = correct_bias(moments, theta_per_sample(theta, rate_hz), np.where(enough, raw, np.nan), terms)
+    factors = np.array([one.factor for one in moments])
+    unsure = 2 * factors > np.array([one.n for one in moments])
     lo[unsure] = hi[unsure] = np.nan
     return TotalCurve(factors / rate_hz, factors, tvar, terms, edf, lo, hi)
 
 
-def moments(n: int, factor: int) -> Moments:
+def total_moments(n: int, factor: int) -> Moments:
     """Return the mean and the covariance of the total variance at one cluster size, which takes a few milliseconds.
 
     Parameters
@@ -161,7 +155,7 @@ def moments(n: int, factor: int) -> Moments:
     factor : int
         Cluster size in samples, from 1 to n − 1.
 
-    >>> one = moments(100_000, 50_000)               # random walk at T/2: 1 − 0.750/2
+    >>> one = total_moments(100_000, 50_000)               # random walk at T/2: 1 − 0.750/2
     >>> print(f"{one.mean[3] / one.allan[3]:.3f}")
     0.625
     """
@@ -174,7 +168,7 @@ def moments(n: int, factor: int) -> Moments:
 
 
 def _points(places: Floats, n: int, m: int) -> tuple[Floats, Floats]:
-    """Return the phase points [i, 5] of the terms at ``places``, with the ends of the record, and the weights of the points."""
+    """Return the phase points [i, 5] of the terms at ``places`` and the ends of the record, with weights."""
     front, behind = places < m, places > n - m
     points = [0.0 * places, np.abs(places - m), places, np.minimum(places + m, 2 * n - m - places), n + 0.0 * places]
     signs = [2.0 * front, 1.0 - 2.0 * front, -2.0 + 0.0 * places, 1.0 - 2.0 * behind, 2.0 * behind]
@@ -243,6 +237,12 @@ def _combine_points(of_points: Floats, rows: Ints, signs: Floats) -> Floats:
     for p in range(1, rows.shape[1]):
         terms += signs[:, p, None] * of_points[:, rows[:, p]]
     return np.asarray(terms)
+
+
+def _add_all_terms(ring: PhaseRing, m: int, sums: Floats, terms: Ints) -> None:
+    """Add the squares of all terms of the total variance. There are none if the cluster is as long as the record."""
+    if m < ring.n:
+        add_total(ring, m, 1, ring.n, sums, terms)
 
 
 @compiled

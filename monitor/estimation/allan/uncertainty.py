@@ -24,7 +24,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import AXES, Floats, Ints
+from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import chi2_quantile
 from monitor.noise.effects.ieee952.bias_instability import FLICKER_AVAR, BiasInstability
@@ -68,42 +68,8 @@ class CovarianceTable:
     bend: Floats  # [m, 4] covariance of this slope with ``batch.rate_slope_per_tau``
 
 
-class CovarianceTables:
-    """Cache of the covariance table for a growing window.
-
-    Parameters
-    ----------
-    factors : ndarray of int64, shape (m,)
-        Cluster sizes in samples.
-    capacity : int
-        Length of the full window in samples.
-    """
-
-    def __init__(self, factors: Ints, capacity: int) -> None:
-        self._factors = factors
-        self._capacity = capacity
-        self._table: CovarianceTable | None = None
-
-    def at(self, n: int) -> CovarianceTable:
-        """Return the table for n samples. While the window grows, a table for up to 10 % fewer samples is used."""
-        known = self._table
-        if known is None or not (known.n == n or known.n < n < min(self._capacity, TABLE_STEP * known.n)):
-            known = self._table = covariance_table(n, self._factors)
-        return known
-
-    def remaining_valid_samples(self, n: int) -> int:
-        """Return for how many samples the table of ``at(n)`` stays valid, including sample n.
-
-        The table of a full window stays valid without limit, so the result is ``UNLIMITED_SAMPLES``.
-        """
-        known = self.at(n)
-        if n >= self._capacity:
-            return UNLIMITED_SAMPLES
-        return min(self._capacity, math.ceil(TABLE_STEP * known.n)) - n
-
-
 class AxisCovarianceTables:
-    """Covariance tables of six axes.
+    """Covariance tables of six axes of a growing window.
 
     Axes that use the whole window share a table. A restarted axis has a separate table.
 
@@ -116,11 +82,12 @@ class AxisCovarianceTables:
     """
 
     def __init__(self, factors: Ints, capacity: int) -> None:
-        self._shared = CovarianceTables(factors, capacity)
-        self._own = [CovarianceTables(factors, capacity) for _ in AXES]
+        self._factors = factors
+        self._capacity = capacity
+        self._tables: dict[int | None, CovarianceTable] = {}  # by restarted axis, or None for the whole window
 
-    def of_axis(self, axis: int, n: int, window_samples: int) -> CovarianceTables:
-        """Return the tables of an axis.
+    def at(self, axis: int, n: int, window_samples: int) -> CovarianceTable:
+        """Return the table of an axis. While the window grows, a table for up to 10 % fewer samples is used.
 
         Parameters
         ----------
@@ -131,7 +98,27 @@ class AxisCovarianceTables:
         window_samples : int
             Number of samples in the window.
         """
-        return self._shared if n == window_samples else self._own[axis]
+        key = None if n == window_samples else axis
+        known = self._tables.get(key)
+        if known is None or not (known.n == n or known.n < n < min(self._capacity, TABLE_STEP * known.n)):
+            known = self._tables[key] = covariance_table(n, self._factors)
+        return known
+
+    def remaining_valid_samples(self, table: CovarianceTable, n: int) -> int:
+        """Return for how many samples a table stays valid, including sample n.
+
+        The table of a full window stays valid without limit, so the result is ``UNLIMITED_SAMPLES``.
+
+        Parameters
+        ----------
+        table : CovarianceTable
+            Table that ``at`` has returned for n samples.
+        n : int
+            Number of newest samples that the axis uses.
+        """
+        if n >= self._capacity:
+            return UNLIMITED_SAMPLES
+        return min(self._capacity, math.ceil(TABLE_STEP * table.n)) - n
 
 
 def covariance_table(n: int, factors: Ints) -> CovarianceTable:

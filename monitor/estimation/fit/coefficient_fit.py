@@ -25,8 +25,8 @@ is reported.
 The fit accepts any curve. An axis with too few τ, or without noise, is UNESTIMATED.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -126,107 +126,69 @@ def shared_inputs(
 
 @dataclass(frozen=True, slots=True)
 class MeasuredCurve:
-    """Measured curve of k axes, and the slopes of the same window."""
+    """Measured Allan curve of k axes, and the slopes of the rate in the same window."""
 
     avar: Floats  # [m, k] Allan variance, squared unit of the axis; NaN if the window is too short
     terms: Ints  # [m, k] number of second differences averaged
-    slope: Floats  # [k] unit/s, ``batch.slope_of_recording``; NaN means not measured, then a ramp is only bounded
-    slopes: Floats  # [m, k] unit/s, mean second difference of phase over τ² at each τ
-    before: NDArray[np.bool_] | None = None  # [5, k] ``entered`` of the previous fit; None for a single fit
+    slope: Floats | None = None  # [k] unit/s, ``batch.slope_of_recording``; None or NaN: a ramp is only bounded
+    slopes: Floats | None = None  # [m, k] unit/s, ``batch.rate_slope_per_tau``; None: a strong ramp biases K
+    entered_before: NDArray[np.bool_] | None = None  # [5, k] ``entered`` of the previous fit; None for a single fit
 
     def axis(self, column: int) -> "MeasuredCurve":
         """Return the data of one axis."""
         one = slice(column, column + 1)
-        before = None if self.before is None else self.before[:, one]
-        return MeasuredCurve(self.avar[:, one], self.terms[:, one], self.slope[one], self.slopes[:, one], before)
+        slope = None if self.slope is None else self.slope[one]
+        slopes = None if self.slopes is None else self.slopes[:, one]
+        before = None if self.entered_before is None else self.entered_before[:, one]
+        return MeasuredCurve(self.avar[:, one], self.terms[:, one], slope, slopes, before)
 
 
 def fit(
     design: Design,
     table: CovarianceTable,
-    avar: Floats,
-    terms: Ints,
-    before: NDArray[np.bool_] | None = None,
-    slope: Floats | None = None,
-    slopes: Floats | None = None,
+    measured: MeasuredCurve,
     full: bool = True,
     start: Floats | None = None,
+    blind: Floats | None = None,
+    ask: bool = True,
 ) -> Fit:
-    """Fit the coefficients of six axes to overlapping Allan variances.
+    """Fit the coefficients of k axes to overlapping Allan variances.
+
+    If the measured curve contains the terms of a previous fit, terms are added at 3 σ and dropped at 1.5 σ. In a single
+    fit, both thresholds are 2.33 σ.
 
     Parameters
     ----------
     design : Design
         Columns for the cluster sizes of the curve.
-    table : Table
-        Covariances for the window length.
-    avar : ndarray of float64, shape (m, 6)
-        Allan variance in squared units of the axis; NaN if the window is too short.
-    terms : ndarray of int64, shape (m, 6)
-        Number of second differences averaged.
-    before : ndarray of bool, shape (5, 6), or None
-        ``entered`` of the previous fit of a live window. Terms are then added at 3 σ and dropped at 1.5 σ. None means a
-        single fit with a threshold of 2.33 σ.
-    slope : ndarray of float64, shape (6,), or None
-        Slope of the rate in unit/s of the same window, see ``batch.slope_of_recording``; NaN means not measured.
-        Without a slope, a ramp is never estimated, only bounded.
-    slopes : ndarray of float64, shape (m, 6), or None
-        Mean second difference of phase over τ² at each τ of the same window, in unit/s. Without it, the products of a
-        strong ramp with the noise bias K.
-    full : bool
-        True to weight by the covariances of all τ, False to weight by their variances alone.
-    start : ndarray of float64, shape (5, 6), or None
-        ``theta`` of a recent fit whose weights start this one. This takes a third of the work.
-    """
-    m, axes = avar.shape
-    slope = np.full(axes, np.nan) if slope is None else slope
-    measured = MeasuredCurve(avar, terms, slope, np.tile(slope, (m, 1)) if slopes is None else slopes, before)
-    return _fit(design, table, measured, shared_inputs(design, table), full, start)
-
-
-def fit_columns(
-    design: Design, table: CovarianceTable, measured: MeasuredCurve, full: bool = False, blind: Floats | None = None
-) -> Fit:
-    """Fit with the columns exactly as given, without leaving out any τ.
-
-    Parameters
-    ----------
-    design : Design
-        Columns for the cluster sizes of the curve.
-    table : Table
+    table : CovarianceTable
         Covariances for the window length.
     measured : MeasuredCurve
         Measured curve and slopes.
     full : bool
-        True to weight by the covariances of all τ, False to weight by their variances alone.
+        True to weight by the covariances of all τ, False to weight by the variances alone.
+    start : ndarray of float64, shape (5, k), or None
+        ``theta`` of a recent fit, from which the first weights are computed. A fit from a start takes a third of the
+        time.
     blind : ndarray of float64, shape (m,), or None
         Direction of the curve that the fit ignores.
+    ask : bool
+        True to leave out short τ that contradict the fit.
     """
-    in_samples = np.zeros(design.factors.size) if blind is None else blind
-    return _fit(design, table, measured, shared_inputs(design, table, in_samples, ask=False), full)
-
-
-def _fit(
-    design: Design,
-    table: CovarianceTable,
-    measured: MeasuredCurve,
-    shared: SharedInputs,
-    full: bool,
-    start: Floats | None = None,
-) -> Fit:
-    """Run the compiled fit and convert its results to SI."""
-    avar, terms, before = measured.avar, measured.terms, measured.before
+    avar, terms, before = measured.avar, measured.terms, measured.entered_before
     m, axes = avar.shape
     found = empty_fit_output(
         axes, m, np.zeros((axes, 5), np.bool_) if before is None else np.array(before.T, order="C")
     )
-    frozen = empty_solution_maps(axes, m)
+    maps = empty_solution_maps(axes, m)
     if start is not None:
         found.theta[:] = start.T / design.rate_hz ** (2.0 * TO_SI)
     curves, counts = np.ascontiguousarray(avar.T), np.ascontiguousarray(terms.T, np.float64)
-    slope, slopes = measured.slope / design.rate_hz, np.ascontiguousarray(measured.slopes.T) / design.rate_hz
+    slope = np.full(axes, np.nan) if measured.slope is None else measured.slope / design.rate_hz
+    slopes = np.tile(slope, (m, 1)).T if measured.slopes is None else measured.slopes.T / design.rate_hz
     options = FitOptions(*(THRESHOLDS_ONCE if before is None else THRESHOLDS_WATCHED), full, start is not None)
-    fit_axes(0, axes, shared, CurvesOfAxes(curves, counts, slope, slopes), options, found, frozen)
+    shared = shared_inputs(design, table, blind, ask)
+    fit_axes(0, axes, shared, CurvesOfAxes(curves, counts, slope, np.ascontiguousarray(slopes)), options, found, maps)
     to_si = design.rate_hz**TO_SI
     value = np.where(found.status == Status.ESTIMATED, np.sqrt(np.maximum(found.theta, 0.0)), np.nan)
     coefficients = Coefficients((value * to_si).T, (found.lo * to_si).T, (found.hi * to_si).T, found.status.T)
@@ -236,12 +198,12 @@ def _fit(
         edf = np.where(missing, _white_edf(design, table, terms), edf)
     return Fit(
         coefficients, (found.theta * to_si**2).T, found.fitted.T, edf, found.entered.T, found.left_out,
-        found.scatter, found.misfit, frozen.either,
+        found.scatter, found.misfit, maps.either,
     )  # fmt: skip
 
 
 def replace_axis(whole: Fit, axis: int, one: Fit) -> Fit:
-    """Return a fit in which one axis comes from another fit.
+    """Return a fit in which the results of one axis are replaced.
 
     Parameters
     ----------
@@ -253,19 +215,16 @@ def replace_axis(whole: Fit, axis: int, one: Fit) -> Fit:
         Fit of this axis alone.
     """
 
-    def put(into: NDArray[Any], part: NDArray[Any]) -> NDArray[Any]:
-        result = into.copy()
-        result[..., axis] = part[..., 0]
+    def put(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+        result = parts[0].copy()
+        result[..., axis] = parts[1][..., 0]
         return result
 
-    names = ("value", "lo", "hi", "status")
-    coefficients = [put(getattr(whole.coefficients, name), getattr(one.coefficients, name)) for name in names]
-    fields: dict[str, Any] = {name: put(getattr(whole, name), getattr(one, name)) for name in PER_AXIS_FIELDS}
-    return replace(whole, coefficients=Coefficients(*coefficients), **fields)
+    return _combine((whole, one), put)
 
 
 def concatenate_fits(fits: Sequence[Fit], axes: Ints) -> Fit:
-    """Concatenate fits of some axes each, in the order of the axes.
+    """Join fits of different axes to one fit in the order of the axes.
 
     Parameters
     ----------
@@ -275,13 +234,15 @@ def concatenate_fits(fits: Sequence[Fit], axes: Ints) -> Fit:
         Axis of each column of the fits, in the order of the fits.
     """
     order = np.argsort(axes)
+    return _combine(fits, lambda parts: np.concatenate(parts, axis=-1)[..., order])
 
-    def side_by_side(field: str, of: str = "") -> NDArray[Any]:
-        parts = [getattr(getattr(one, of) if of else one, field) for one in fits]
-        return np.concatenate(parts, axis=-1)[..., order]
 
-    coefficients = Coefficients(*(side_by_side(field, "coefficients") for field in ("value", "lo", "hi", "status")))
-    return Fit(coefficients, **{name: side_by_side(name) for name in PER_AXIS_FIELDS})
+def _combine(fits: Sequence[Fit], join: Callable[[Sequence[NDArray[Any]]], NDArray[Any]]) -> Fit:
+    """Return a fit in which a function has joined each array of several fits."""
+    names = ("value", "lo", "hi", "status")
+    coefficients = (join([getattr(one.coefficients, name) for one in fits]) for name in names)
+    fields = {name: join([getattr(one, name) for one in fits]) for name in PER_AXIS_FIELDS}
+    return Fit(Coefficients(*coefficients), **fields)
 
 
 def empty_fit(avar: Floats) -> Fit:

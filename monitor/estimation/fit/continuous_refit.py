@@ -174,13 +174,12 @@ class ContinuousRefit:
         lasts = UNLIMITED_SAMPLES
         for axis in range(AXES):
             n = min(int(lengths[axis]) + 1, filled)
-            tables = self._tables.of_axis(axis, n, filled)
-            table = tables.at(n)
+            table = self._tables.at(axis, n, filled)
             if table is not self._used[axis]:
                 self._used[axis] = table
                 self._request_fit(axis)
                 self._known[axis : axis + 1] = [shared_inputs(design, table)]
-            lasts = min(lasts, tables.remaining_valid_samples(n))
+            lasts = min(lasts, self._tables.remaining_valid_samples(table, n))
         return lasts
 
     def _request_fit(self, axis: int) -> None:

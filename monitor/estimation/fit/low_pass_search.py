@@ -23,7 +23,7 @@ from drivers.sample import Floats, Ints
 from monitor.common.minimization import golden_section
 from monitor.estimation.allan.batch import MIN_PRESENT_SHARE
 from monitor.estimation.allan.uncertainty import CovarianceTable
-from monitor.estimation.fit.coefficient_fit import Design, Fit, MeasuredCurve, fit_columns, replace_axis
+from monitor.estimation.fit.coefficient_fit import Design, Fit, MeasuredCurve, fit, replace_axis
 from monitor.estimation.fit.coefficients import Status
 from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, upper_limit
 from monitor.estimation.fit.least_squares import N, Q
@@ -264,7 +264,7 @@ def search_low_pass(
         grids.append([])
         for number, cutoff in enumerate(CUTOFFS):
             column = _column(LowPass(kind, order, float(cutoff)), factors)
-            grids[-1].append(float(fit_columns(_with_noise_column(design, column), table, measured).scatter[0]))
+            grids[-1].append(float(_fit_columns(_with_noise_column(design, column), table, measured).scatter[0]))
             if number % CUTOFFS_PER_STEP == CUTOFFS_PER_STEP - 1:
                 yield
     found = []
@@ -275,7 +275,7 @@ def search_low_pass(
 
         def of(log_cutoff: float, kind: Kind = kind, order: int = order) -> float:
             column = LowPass(kind, order, float(np.exp(log_cutoff))).avar(design.factors)
-            return float(fit_columns(_with_noise_column(design, column), table, measured).scatter[0])
+            return float(_fit_columns(_with_noise_column(design, column), table, measured).scatter[0])
 
         least, log_cutoff = yield from _yield_after_several_steps(
             golden_section(of, float(ends[0]), float(ends[1]), CUTOFF_TOLERANCE)
@@ -302,6 +302,11 @@ def _yield_after_several_steps(
             yield
 
 
+def _fit_columns(design: Design, table: CovarianceTable, measured: MeasuredCurve) -> Fit:
+    """Fit quickly with exactly these columns and all τ."""
+    return fit(design, table, measured, full=False, ask=False)
+
+
 def _with_noise_column(design: Design, column: Floats) -> Design:
     """Return the design with another column for N and without Q."""
     columns = design.columns.copy()
@@ -316,8 +321,7 @@ def _fit_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurv
         _column(replace(low_pass, cutoff=low_pass.cutoff * by), factors) for by in (CUTOFF_STEP, 1.0 / CUTOFF_STEP)
     )
     own = _with_noise_column(design, _column(low_pass, factors))
-    rough = fit_columns(own, table, measured)
+    rough = _fit_columns(own, table, measured)
     level = max(float(rough.theta[N, 0]) * design.rate_hz, 0.0)
-    return fit_columns(
-        own, table, measured, full=True, blind=level * LOG_CUTOFF_SIGMA * (up - down) / (2.0 * np.log(CUTOFF_STEP))
-    )
+    blind = level * LOG_CUTOFF_SIGMA * (up - down) / (2.0 * np.log(CUTOFF_STEP))
+    return fit(own, table, measured, blind=blind, ask=False)

@@ -26,7 +26,7 @@ from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table as covariances
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.fit.coefficient_fit import fit, make_design
+from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design
 from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
 
 L: Final = 202
@@ -226,7 +226,7 @@ def each_sample(length: int, taus: int, rounds: int) -> tuple[str, ...]:
             "plain": for_each(plain.update, parts),
             "fitting": for_each(fitting.update, parts),
             "solved": for_each(
-                lambda known: fit(*known, slope=slope, full=False), [(model, table_, avar, terms)] * 100
+                lambda curve: fit(model, table_, curve, full=False), [MeasuredCurve(avar, terms, slope)] * 100
             ),
         },
         rounds,

@@ -32,7 +32,7 @@ from scipy.optimize import least_squares, nnls
 from drivers.sample import Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_per_tau, slope_of_recording
 from monitor.estimation.allan.uncertainty import CovarianceTable, covariance_table
-from monitor.estimation.fit.coefficient_fit import Design, fit, make_design
+from monitor.estimation.fit.coefficient_fit import Design, MeasuredCurve, fit, make_design
 from monitor.estimation.fit.coefficients import SYMBOLS
 from tests.experiments.benchmarks.records import (
     HOURS_3,
@@ -88,7 +88,7 @@ def _fitted(values: Floats, rate_hz: float, full: bool) -> Floats:
     factors, columns, covariances = _octaves(len(values), rate_hz)
     avar, terms = overlapping_avar(values, factors)
     straight, each = slope_of_recording(values) * rate_hz, rate_slope_per_tau(values, factors) * rate_hz
-    found = fit(columns, covariances, avar, terms, slope=straight, slopes=each, full=full)
+    found = fit(columns, covariances, MeasuredCurve(avar, terms, straight, each), full=full)
     return np.asarray(np.sqrt(np.maximum(found.theta, 0.0)))
 
 

@@ -17,12 +17,10 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
 from monitor.estimation.allan.difference_moments import correct_bias, theta_per_sample
-from monitor.estimation.allan.hadamard import hadamard_variance
-from monitor.estimation.allan.hadamard import moments as hadamard_moments
-from monitor.estimation.allan.total import moments as total_moments
-from monitor.estimation.allan.total import total_variance
+from monitor.estimation.allan.hadamard import hadamard_moments, hadamard_variance
+from monitor.estimation.allan.total import total_moments, total_variance
 from monitor.estimation.allan.uncertainty import covariance_table
-from monitor.estimation.fit.coefficient_fit import fit, make_design
+from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design
 from monitor.noise.effect import Source
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
@@ -55,9 +53,8 @@ def fitted(values: Floats) -> Floats:
     """θ [5, k] of the records themselves."""
     factors = cluster_sizes(len(values), 1.0)
     avar, terms = overlapping_avar(values, factors)
-    return fit(
-        make_design(factors, 1.0), covariance_table(len(values), factors), avar, terms, slope=slope_of_recording(values)
-    ).theta
+    measured = MeasuredCurve(avar, terms, slope_of_recording(values))
+    return fit(make_design(factors, 1.0), covariance_table(len(values), factors), measured).theta
 
 
 Spread = tuple[Floats, Floats, Floats, Floats]

@@ -19,7 +19,7 @@ from drivers.sample import AXES, Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table as covariances
 from monitor.estimation.allan.window import AllanWindow, display_spans
-from monitor.estimation.fit.coefficient_fit import Fit, fit, make_design
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit, make_design
 from monitor.estimation.fit.coefficients import Status
 from monitor.noise.effect import Source
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
@@ -236,7 +236,7 @@ def fitted(name: str, factors: Ints, avar: Floats, length: int = LENGTH) -> Fit:
     whole = covariances(length, factors)
     spans = display_spans(factors, RATE_HZ, length) if name == "a window per τ" else np.full(factors.size, length)
     terms = np.repeat(np.maximum(spans + 1 - 2 * factors, 0)[:, None], 6, axis=1)
-    return fit(make_design(factors, RATE_HZ), whole, avar, terms)
+    return fit(make_design(factors, RATE_HZ), whole, MeasuredCurve(avar, terms))
 
 
 def restarted(values: Floats, factors: Ints, before: int, ends: Sequence[int]) -> Iterator[Fit]:

@@ -7,7 +7,7 @@ from drivers.errors import ConfigError, NotReady
 from monitor.estimation.allan import batch
 from monitor.estimation.allan.dynamic_allan import MAX_STEPS, compute_dynamic_allan
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
-from monitor.estimation.fit.coefficient_fit import fit, make_design
+from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.noise.effects import (
     AngleRandomWalk,
@@ -61,7 +61,7 @@ def test_every_step_is_a_batch_over_its_window() -> None:
         window = values[end - length : end]
         avar, terms = batch.overlapping_avar(window, factors)
         slope, slopes = batch.slope_of_recording(window) * RATE_HZ, batch.rate_slope_per_tau(window, factors) * RATE_HZ
-        expected = fit(columns, covariances, avar, terms, entered, slope, slopes)
+        expected = fit(columns, covariances, MeasuredCurve(avar, terms, slope, slopes, entered))
         entered = expected.entered
         lo, hi = deviation_intervals(avar, expected.edf)
         assert found.deviation[row] == pytest.approx(np.sqrt(avar), rel=1e-9)

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from monitor.estimation.allan.difference_moments import phase_autocovariance
-from monitor.estimation.allan.hadamard import hadamard_curve, hadamard_variance, moments
-from monitor.estimation.allan.total import moments as total_moments
+from monitor.estimation.allan.hadamard import hadamard_curve, hadamard_moments, hadamard_variance
+from monitor.estimation.allan.total import total_moments
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
 from tests.support.allan_references import columns, nist_1000
 
@@ -66,11 +66,11 @@ def test_a_linear_drift_of_a_thousand_times_the_noise_is_not_seen():
         hadamard_variance(noise, factors)[0],
         rtol=1e-8,
     )
-    assert moments(2000, 64).mean[4] == 0.0
+    assert hadamard_moments(2000, 64).mean[4] == 0.0
 
 
 def test_white_noise_reads_as_in_allan_s_variance():
-    one, allan = moments(10_000, 100), total_moments(10_000, 100).allan
+    one, allan = hadamard_moments(10_000, 100), total_moments(10_000, 100).allan
     assert one.mean[:4] / allan[:4] == pytest.approx([10.0 / 9.0, 1.0, 0.8113, 0.5], abs=1e-4)
 
 
@@ -82,7 +82,7 @@ def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
         rows[starts, starts + p * m] = weight
     lags = phase_autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
     noise = np.stack([rows @ g @ rows.T for g in lags])
-    one = moments(n, m)
+    one = hadamard_moments(n, m)
     np.testing.assert_allclose(one.mean[:4], noise[:, 0, 0] / (6 * m * m), rtol=1e-9)
     exact = 2.0 * np.einsum("aij,bij->ab", noise, noise) / (6.0 * m * m * starts.size) ** 2
     scale = np.sqrt(np.outer(exact.diagonal(), exact.diagonal()))
@@ -91,7 +91,7 @@ def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
 
 def test_degrees_of_freedom_agree_with_greenhall_and_riley_where_that_is_good():
     for m in (32, 125, 333):
-        one = moments(1000, m)
+        one = hadamard_moments(1000, m)
         edf = 2.0 * one.mean[1:4] ** 2 / one.covariance.diagonal()[1:4]
         formula = [edf_greenhall(alpha, 3, m, 1001, overlapping=True, modified=False) for alpha in (0, -1, -2)]
         assert edf == pytest.approx(formula, rel=2e-3)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from monitor.estimation.allan import difference_moments as moments_module
 from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.allan.difference_moments import octaves
-from monitor.estimation.allan.total import MIN_SHARE, moments, total_curve, total_variance
+from monitor.estimation.allan.total import MIN_SHARE, total_curve, total_moments, total_variance
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from tests.support.allan_references import nist_1000
 
@@ -98,7 +98,7 @@ def test_columns_do_not_mix_and_the_input_is_left_alone():
 
 def test_bias_is_the_published_one_up_to_half_the_record():
     for share, m in ((8, 12_500), (4, 25_000), (2, 50_000)):
-        one = moments(100_000, m)
+        one = total_moments(100_000, m)
         loss = (1.0 - one.mean / one.allan) * share
         assert loss[:4] == pytest.approx([-4.0 / 3.0, 0.0, 0.481, 0.750], abs=1e-3)
 
@@ -110,7 +110,7 @@ def test_moments_are_the_plain_sums_over_all_pairs_of_terms(n, m):
     noise = np.stack([rows @ g @ rows.T for g in lags])
     ramp = rows @ (0.5 * np.arange(n + 1.0) ** 2)
     mean = np.append(noise.diagonal(axis1=1, axis2=2).mean(axis=1), np.mean(ramp**2)) / (2 * m * m)
-    one = moments(n, m)
+    one = total_moments(n, m)
     np.testing.assert_allclose(one.mean, mean, rtol=1e-7)
     theta = np.array([3.0, 1.0, 0.3, 1.0 / n**2, 1.0 / n**3])
     together = np.tensordot(theta[:4], noise, 1)
@@ -124,12 +124,12 @@ def test_the_coarse_grid_of_a_long_record_is_good_to_a_few_percent(m):
     rows = differences(n, m)
     lags = moments_module.phase_autocovariance(np.subtract.outer(np.arange(n + 1.0), np.arange(n + 1.0)))
     exact = [2.0 * ((rows @ g @ rows.T) ** 2).sum() / (2 * m * m * (n - 1.0)) ** 2 for g in lags]
-    np.testing.assert_allclose(moments(n, m).covariance.diagonal()[:4], exact, rtol=0.05)
+    np.testing.assert_allclose(total_moments(n, m).covariance.diagonal()[:4], exact, rtol=0.05)
 
 
 @pytest.mark.parametrize(("share", "stated"), [(8, (12.0, 9.14, 7.08)), (4, (6.0, 4.46, 3.36)), (2, (3.0, 2.12, 1.5))])
 def test_degrees_of_freedom_are_howe_s_up_to_half_the_record(share, stated):
-    one = moments(64_000, 64_000 // share)
+    one = total_moments(64_000, 64_000 // share)
     edf = 2.0 * one.mean[1:4] ** 2 / one.covariance.diagonal()[1:4]
     assert edf == pytest.approx(stated, rel=0.02)
 

@@ -10,7 +10,7 @@ from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.allan.uncertainty import (
     PAIRS,
     TABLE_STEP,
-    CovarianceTables,
+    AxisCovarianceTables,
     covariance_table,
     deviation_intervals,
 )
@@ -111,11 +111,11 @@ def test_too_short_a_window_is_nan_not_a_number():
 
 
 def test_tables_are_renewed_as_the_window_grows_and_kept_when_it_is_full():
-    tables = CovarianceTables(np.array([1, 2, 4]), capacity=10_000)
-    made = [tables.at(n) for n in range(8, 10_001)]
+    tables = AxisCovarianceTables(np.array([1, 2, 4]), capacity=10_000)
+    made = [tables.at(0, n, n) for n in range(8, 10_001)]
     lengths = sorted({t.n for t in made})
     assert len(lengths) < np.log(10_000 / 8) / np.log(TABLE_STEP) + 12
     assert all(t.n <= n < TABLE_STEP * t.n + 1 for n, t in zip(range(8, 10_001), made, strict=True))
-    assert tables.at(10_000).n == 10_000
-    assert tables.at(10_000) is tables.at(10_000)
-    assert tables.at(50).n == 50
+    assert tables.at(0, 10_000, 10_000).n == 10_000
+    assert tables.at(0, 10_000, 10_000) is tables.at(0, 10_000, 10_000)
+    assert tables.at(0, 50, 50).n == 50

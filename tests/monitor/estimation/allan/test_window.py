@@ -56,7 +56,8 @@ def assert_same(one, other):
     """Bit for bit: how the samples were cut must not be seen."""
     assert np.array_equal(one.avar(), other.avar(), equal_nan=True)
     assert np.array_equal(one.terms(), other.terms())
-    assert (one.n, one.total) == (other.n, other.total)
+    assert one.samples_in_window == other.samples_in_window
+    assert one.samples_since_reset == other.samples_since_reset
 
 
 # --- one truth, whatever the cut
@@ -263,7 +264,7 @@ def test_slope_and_length_are_those_of_the_whole_window():
     plain, spanned = AllanWindow(300, np.array([1, 2])), AllanWindow(300, np.array([1, 2]), np.array([10, 20]))
     for window in (plain, spanned):
         window.update(values)
-    assert spanned.n == 300
+    assert spanned.samples_in_window == 300
     assert np.array_equal(plain.slopes_of_axes_and_taus()[0], spanned.slopes_of_axes_and_taus()[0])
 
 

@@ -1,5 +1,6 @@
 """The fit: exact curves, intervals counted over simulations, terms that are not there, sensors' own filters."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -10,7 +11,7 @@ from scipy.stats import binom
 from drivers.sample import AXES
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
-from monitor.estimation.fit.coefficient_fit import Fit, fit, make_design
+from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit, make_design
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.noise.effect import Source
@@ -33,8 +34,9 @@ RECORDS = 144
 def fit_values(values: np.ndarray, with_slope: bool = True, **more) -> Fit:
     factors = cluster_sizes(len(values), RATE_HZ)
     avar, terms = overlapping_avar(values, factors)
-    given = {"slope": slope_of_recording(values) * RATE_HZ} if with_slope else {}
-    return fit(make_design(factors, RATE_HZ), covariance_table(len(values), factors), avar, terms, **given, **more)
+    slope = slope_of_recording(values) * RATE_HZ if with_slope else None
+    measured = MeasuredCurve(avar, terms, slope)
+    return fit(make_design(factors, RATE_HZ), covariance_table(len(values), factors), measured, **more)
 
 
 @cache
@@ -59,7 +61,7 @@ def exact_curve(theta: np.ndarray, n: int = N) -> Fit:
     avar = sum(t * s.avar(factors / RATE_HZ, 1.0 / RATE_HZ) for t, s in zip(theta, UNIT_SOURCES, strict=True))
     t = covariance_table(n, factors)
     columns = np.repeat(avar[:, None], 6, axis=1)
-    return fit(make_design(factors, RATE_HZ), t, columns, np.repeat(t.terms[:, None], 6, axis=1))
+    return fit(make_design(factors, RATE_HZ), t, MeasuredCurve(columns, np.repeat(t.terms[:, None], 6, axis=1)))
 
 
 def test_an_exact_curve_gives_its_coefficients_back():
@@ -175,13 +177,9 @@ def test_hysteresis_enters_late_and_leaves_late():
     for b in np.linspace(1e-5, 1e-4, 60):
         theta[2] = b**2
         avar = sum(x * s.avar(factors / RATE_HZ, 1.0 / RATE_HZ) for x, s in zip(theta, UNIT_SOURCES, strict=True))
-        arguments = (
-            make_design(factors, RATE_HZ),
-            t,
-            np.repeat(avar[:, None], 6, 1),
-            np.repeat(t.terms[:, None], 6, 1),
-        )
-        entered.append([fit(*arguments, before=before).entered[2, 0] for before in (never, always)])
+        measured = MeasuredCurve(np.repeat(avar[:, None], 6, 1), np.repeat(t.terms[:, None], 6, 1))
+        both = [replace(measured, entered_before=before) for before in (never, always)]
+        entered.append([fit(make_design(factors, RATE_HZ), t, one).entered[2, 0] for one in both])
     entered = np.array(entered)
     assert (entered[:, 1] >= entered[:, 0]).all()
     assert not entered[0].any()
@@ -195,7 +193,7 @@ def test_too_few_tau_is_unestimated_but_has_degrees_of_freedom():
     factors = 2 ** np.arange(MIN_ROWS - 1)
     values = np.random.default_rng(0).standard_normal((64, 6))
     avar, terms = overlapping_avar(values, factors)
-    result = fit(make_design(factors, RATE_HZ), covariance_table(64, factors), avar, terms)
+    result = fit(make_design(factors, RATE_HZ), covariance_table(64, factors), MeasuredCurve(avar, terms))
     assert (result.coefficients.status == Status.UNESTIMATED).all()
     assert np.isnan(result.coefficients.hi).all()
     assert np.isnan(result.fitted).all()
@@ -249,7 +247,7 @@ def test_where_the_terms_are_no_description_none_is_more_than_the_curve():
     factors = cluster_sizes(t.size, 100.0)
     avar, terms = overlapping_avar(values, factors)
     columns = make_design(factors, 100.0)
-    found = fit(columns, covariance_table(t.size, factors), avar, terms)
+    found = fit(columns, covariance_table(t.size, factors), MeasuredCurve(avar, terms))
     assert (found.misfit > 1.0).all()
     c = found.coefficients
     for axis in range(6):

@@ -5,10 +5,10 @@ import pytest
 
 from drivers.sample import AXES, make_block
 from monitor.estimation.allan.batch import cluster_sizes
-from monitor.estimation.allan.uncertainty import AxisCovarianceTables, CovarianceTables
+from monitor.estimation.allan.uncertainty import AxisCovarianceTables
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
-from monitor.estimation.fit.coefficient_fit import fit, make_design
+from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design
 from monitor.estimation.fit.continuous_refit import ContinuousRefit
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
@@ -38,12 +38,11 @@ def follow(values, blocks=(1000,)):
 
 def fresh(window, before):
     """A fit from nothing to the curve of a window; diagonal weights, as at every sample."""
-    tables = CovarianceTables(FACTORS, LENGTH)
+    n = window.samples_in_window
+    table = AxisCovarianceTables(FACTORS, LENGTH).at(0, n, n)
     slope, slopes = window.slopes_of_axes_and_taus()
     avar, terms = window.avar(), window.terms()
-    return fit(
-        DESIGN, tables.at(window.samples_in_window), avar, terms, before, slope * RATE_HZ, slopes * RATE_HZ, full=False
-    )
+    return fit(DESIGN, table, MeasuredCurve(avar, terms, slope * RATE_HZ, slopes * RATE_HZ, before), full=False)
 
 
 @pytest.mark.long
