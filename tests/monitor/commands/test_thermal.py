@@ -65,8 +65,8 @@ def test_hardly_moved_is_no_answer_and_says_so(tmp_path, capsys):
     np.savez(path, fs=1.0, gz=1e-5 * rng.standard_normal(n), temp=25.0 + 0.01 * rng.standard_normal(n))
     out = tmp_path / "out.json"
     assert exit_status("thermal", "fit", path, "--json", out) == 3
-    assert "temperature hardly moved" in capsys.readouterr().err
-    assert "temperature hardly moved" in json.loads(out.read_bytes())["refused"]["gz"]
+    assert "temperature hardly changed" in capsys.readouterr().err
+    assert "temperature hardly changed" in json.loads(out.read_bytes())["refused"]["gz"]
 
 
 def test_no_temperature_is_said(tmp_path, capsys):
