@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 MAX_TABLE_ROWS: Final = 24
 """Number of rows in the table of one axis over time."""
 Get = Callable[["HistoryQuery"], "HistoryTable"]
-"""Function that answers a question about the history of a device."""
+"""Function that returns the results of a query."""
 
 
 def history(
@@ -49,7 +49,7 @@ def history(
         Path | None, typer.Option(metavar="FILE.png", help="Coefficients over time and events as a picture.")
     ] = None,
 ) -> None:
-    """Print past coefficients, temperatures, losses and events of hours or years."""
+    """Print past coefficients, temperatures, lost samples and events, over periods from hours to years."""
     from rich.console import Console
 
     from drivers.sample import AXES
@@ -87,7 +87,7 @@ def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) 
     Raises
     ------
     ConfigError
-        A file cannot be written, or its suffix is not supported.
+        If a file cannot be written, or if a suffix is not supported.
     """
     from drivers.recordings.formats import format_for_path
 
@@ -117,7 +117,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:
-    """Return a function that answers from a history file. A daemon may write to the file at the same time."""
+    """Return a function that reads results from a history file. A daemon may write to the file at the same time."""
     from monitor.history import reading as past
     from monitor.history.sqlite_store import open_history
 
@@ -135,7 +135,7 @@ def _from_file(source: Path | None, name: str | None) -> Get:
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
-    """Return a function that answers over zenoh."""
+    """Return a function that queries the history of a running daemon over zenoh."""
     from monitor.publishing.zenoh.history_query import query_histories
 
     def get(asked: "HistoryQuery") -> "HistoryTable":
@@ -166,9 +166,9 @@ def _select_device(name: str | None, there: list[str], where: str) -> str:
     Raises
     ------
     NotReady
-        There is no history yet.
+        If there is no history yet.
     ConfigError
-        No device has this name, or a name is needed to choose between devices.
+        If no device has this name, or if a name is needed to choose between devices.
     """
     from drivers.discovery import format_suggestion
     from drivers.errors import NotReady

@@ -1,7 +1,7 @@
 """Commands ``thermal fit`` and ``thermal predict``: fit thermal models to a recording, and predict the bias of another.
 
-If an axis cannot be fitted or predicted, the reason is reported, and the other axes are processed. The model file is
-JSON. ``predict`` reads the file that ``fit`` writes.
+If an axis cannot be fitted or predicted, the reason is reported, and the remaining axes are processed. The model file
+is JSON. ``predict`` reads the file that ``fit`` writes.
 """
 
 from collections.abc import Mapping
@@ -67,7 +67,7 @@ def fit_recording(
     recording : Path
         Recording with temperature.
     interval_s : float, optional
-        Length of an interval mean in seconds. By default it follows from the length of the recording.
+        Length of an interval in seconds. By default, the length is derived from the length of the recording.
     rate_hz : float, optional
         Sample rate, if the recording has none.
     last_s : float, optional
@@ -76,7 +76,7 @@ def fit_recording(
     Raises
     ------
     RecordingError, ConfigError
-        The recording cannot be read, or it has no temperature.
+        If the recording cannot be read, or if it has no temperature.
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     means = _means(values, temperature_c, rate, interval_s or choose_interval_s(temperature_c.size / rate, rate))
@@ -109,7 +109,7 @@ def predict_recording(
     Raises
     ------
     RecordingError, ConfigError
-        The recording cannot be read, or it has no temperature.
+        If the recording cannot be read, or if it has no temperature.
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     interval = next(iter(models.values())).interval_s
@@ -137,7 +137,7 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
     Raises
     ------
     ConfigError
-        The file cannot be read, or its content is invalid.
+        If the file cannot be read, or if its content is invalid.
     """
     try:
         found = msgspec.json.decode(file_access.read_small_file(path, pipe=True), type=ModelFile)

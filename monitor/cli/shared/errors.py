@@ -26,7 +26,7 @@ MAX_CAUSE_CHARACTERS: Final = 300
 
 
 def message_and_status(error: Exception) -> tuple[str, int]:
-    """Return the line for standard error and the exit status of an error that ended a command."""
+    """Return the message and the exit status for an error that ended a command."""
     match error:
         case TyperException():
             return format_one_line(_usage(error)), WRONG
@@ -57,7 +57,7 @@ def _cause(error: Exception) -> str:
 
 
 def _system_error(error: OSError) -> str:
-    """Return the text of a system error; a missing working directory gets its own message."""
+    """Return the text of a system error. A missing working directory has a special message."""
     if error.filename is None:
         try:
             os.getcwd()
