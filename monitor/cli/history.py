@@ -64,7 +64,7 @@ def history(
     _check_output_files(json, out, plot)
     live = connect is not None or zenoh is not None
     if source is not None and live:
-        raise ConfigError(f"{source}: either a file's history or --connect, not both")
+        raise ConfigError(f"{source}: give either a file or --connect, not both")
     step_s = None if step is None else max(int(_for_option("--step", parse_duration_s, step)), 1)
     axes = AXES if axis is None else (axis,)
     asked = HistoryQuery(_span(since, until), step_s, PARTS, axes)
@@ -122,7 +122,7 @@ def _from_file(source: Path | None, name: str | None) -> Get:
     from monitor.history.sqlite_store import open_history
 
     if source is None:
-        raise ConfigError("CONFIG.toml or a folder is missing; or --connect ENDPOINT for a running daemon")
+        raise ConfigError("CONFIG.toml or a folder is needed, or --connect ENDPOINT for a running daemon")
     path = _history_path(source)
     with open_history(path) as reader:
         device = _select_device(name, list(reader.devices()), str(path))
@@ -156,7 +156,7 @@ def _history_path(source: Path) -> Path:
         return source
     config = loading.load(source, pipe=True)
     if config.storage is None:
-        raise ConfigError(f"{source}: keeps no history; [storage] folder is missing")
+        raise ConfigError(f"{source}: stores no history, because [storage] has no folder")
     return config.storage.folder / FILE_NAME
 
 
@@ -174,11 +174,11 @@ def _select_device(name: str | None, there: list[str], where: str) -> str:
     from drivers.errors import NotReady
 
     if not there:
-        raise NotReady(f"{where}: nothing is kept yet")
+        raise NotReady(f"{where}: there is no history yet")
     if name is None and len(there) == 1:
         return there[0]
     if name is None:
-        raise ConfigError(f"{where}: history of {len(there)} devices; choose with --device: {', '.join(there)}")
+        raise ConfigError(f"{where}: history of {len(there)} devices; choose one with --device: {', '.join(there)}")
     if name not in there:
         raise ConfigError(f'--device: "{name}"{format_suggestion(name, there)}')
     return name

@@ -99,7 +99,7 @@ def run_analysis(request: Request, tell: ProgressCallback = lambda _what, _share
         return _make(request, tell)
     except MemoryError as error:
         raise ConfigError(
-            f"{request.recording}: the analysis needs more memory than is free; take the end alone with --last, or "
+            f"{request.recording}: the analysis needs more memory than is free; use only the end with --last, or "
             "split the recording"
         ) from error
 

@@ -81,7 +81,7 @@ def run_compensation(request: Request, tell: ProgressCallback = lambda _what, _s
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
-        raise ConfigError(f"{request.recording}: no gyro axis in it; columns gx, gy, gz in rad/s are needed")
+        raise ConfigError(f"{request.recording}: there is no gyro axis; columns gx, gy, gz in rad/s are needed")
     values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     orders = ORDERS if request.order is None else (request.order,)
     live = Compensator(rate_hz, adapts=request.method != "fixed", orders=orders)
@@ -91,12 +91,12 @@ def run_compensation(request: Request, tell: ProgressCallback = lambda _what, _s
     learned, judged = _split_learning(rest)
     if not judged.any():
         raise NotReady(
-            f"{request.recording}: never at rest for {MIN_CONFIRMED_INTERVALS * live.interval_s:g} s: "
-            "no drift can be learned from it"
+            f"{request.recording}: never at rest for {MIN_CONFIRMED_INTERVALS * live.interval_s:g} s, "
+            "so the drift cannot be learned"
         )
     if request.method in REFERENCE_METHODS:
         out = _compensate_offline(request.method, values, learned, axes, tell)
-    tell("judging", None)
+    tell("evaluating", None)
     judged_axes: dict[str, AxisCompensation] = {
         str(axis): _evaluate_axis(AXES.index(axis), values, out, learned, judged, live, intervals) for axis in axes
     }

@@ -121,7 +121,9 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
     model, runs, silent = request.model, list[NamedResult](), dict[str, str]()
     fitted_to = next(iter(named)) if model is None else None
     for at, (name, path) in enumerate(named.items(), start=1):
-        notes = (f"The model under test are the five terms of {fitted_to}.",) if fitted_to and at > 1 else ()
+        notes = (
+            (f"The model under test consists of the five noise terms of {fitted_to}.",) if fitted_to and at > 1 else ()
+        )
         one = Request(path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s)
         try:
             result = run_reconciliation(one, _tell_for(tell, f"{name}, {at} of {len(named)}"))
@@ -134,7 +136,7 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
         runs.append(NamedResult(name, result))
     if len(runs) < 2:
         why = "; ".join(f"{name}: {said}" for name, said in silent.items())
-        why = f"two recordings at least are compared with each other, and {len(runs)} can be: {why}"
+        why = f"at least two recordings are needed for a comparison, but only {len(runs)} can be evaluated: {why}"
         _write(request.out / REPORT, encode_failure(why, 0, comparison_report.SCHEMA))
         raise NotReady(why)
     tell("writing", None)
@@ -176,7 +178,7 @@ def unique_recording_names(recordings: Sequence[Path]) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in recordings:
         if real_path(path) in [real_path(other) for other in found.values()]:
-            raise ConfigError(f"{path}: is given twice; recordings that are compared must be different ones")
+            raise ConfigError(f"{path}: is given twice; a comparison needs different recordings")
         full = real_path(path).name
         suffix = next((one for one in FORMATS if full.lower().endswith(one)), "")
         stem = full[: len(full) - len(suffix)] or full
@@ -191,7 +193,9 @@ def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
         if not path.exists():
             raise RecordingError(f"{path}: cannot be read: there is no such file or folder")
         if any(real_path(out / name) == real_path(path) for name in named):
-            raise ConfigError(f"--out: {out}: {path} is a recording, and a report would be written into it")
+            raise ConfigError(
+                f"--out: {out}: {path} is a recording; choose a folder that contains no recording of the comparison"
+            )
 
 
 def _tell_for(tell: ProgressCallback, which: str) -> ProgressCallback:
@@ -250,7 +254,7 @@ def create_report_folder(folder: Path) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"--out: {folder}: cannot be made: {error.strerror}") from error
+        raise ConfigError(f"--out: {folder}: cannot be created: {error.strerror}") from error
 
 
 def _to_regular_grid(found: Samples) -> tuple[Recording, list[str]]:

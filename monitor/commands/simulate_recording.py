@@ -124,7 +124,7 @@ def run_simulation(request: Request, tell: ProgressCallback = lambda _what, _sha
         raise ConfigError(f"{request.seconds:g} s at {rate_hz:g} Hz: {error}") from None
     axes = tuple(axis for axis in AXES if axis in request.model.effects)
     if not axes:
-        raise ConfigError(f"{request.name}: names no axis; axes are {' '.join(AXES)}")
+        raise ConfigError(f"{request.name}: the model has no axis; possible are {' '.join(AXES)}")
     tell("preparing", None)
     temperature_c = _temperature(request, rate_hz, n)
     try:
@@ -162,7 +162,7 @@ def _rate_hz(request: Request) -> float:
     """Return the requested sample rate, or else the rate of the model."""
     rate_hz = request.rate_hz or request.model.sample_rate_hz
     if rate_hz is None:
-        raise ConfigError(f"{request.name}: has no sample_rate; give one with --rate HZ")
+        raise ConfigError(f"{request.name}: the model has no sample_rate; set the rate with --rate HZ")
     return rate_hz
 
 
@@ -176,7 +176,7 @@ def _temperature(request: Request, rate_hz: float, n: int) -> Floats | None:
     found = _load_recording(request.temperature_from, request.rate_hz)
     known = np.isfinite(found.temperature_c)
     if not known.any():
-        raise ConfigError(f"{request.temperature_from}: has no temperature; the column is temperature, in °C")
+        raise ConfigError(f"{request.temperature_from}: has no temperature; a column temperature in °C is needed")
     t_s = np.arange(len(found)) / (found.rate_hz or rate_hz) if found.t_s is None else found.t_s - found.t_s[0]
     t_s, temperature_c = t_s[known], found.temperature_c[known]
     order = np.argsort(t_s, kind="stable")

@@ -117,7 +117,7 @@ def predict_recording(
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
-            refused[axis] = "the model says nothing of it"
+            refused[axis] = "the model file has no model of this axis"
         elif one.known.sum() < 2:
             refused[axis] = f"fewer than two intervals of {interval:g} s"
         else:
@@ -144,11 +144,11 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"{path}: no thermal model: {error}") from error
+        raise ConfigError(f"{path}: not a thermal model: {error}") from error
     if found.schema != SCHEMA:
-        raise ConfigError(f'{path}: schema "{found.schema}"; "{SCHEMA}" is read')
+        raise ConfigError(f'{path}: unknown schema "{found.schema}"; "{SCHEMA}" is expected')
     if not found.axes:
-        raise ConfigError(f"{path}: no axis in it")
+        raise ConfigError(f"{path}: there is no axis in the file")
     try:
         DURATION_S.check(found.interval)
     except ConfigError as error:
@@ -184,9 +184,12 @@ def _model(path: Path, axis: str, row: AxisModelRecord, interval_s: float) -> Th
         (row.powers >= 0, f"powers: {row.powers}; it must be 0 or more"),
         (all(map(DURATION_S.supports, row.time_constants)), f"time_constants: each must be {DURATION_S.range_text()}"),
         (all(map(FIT_NUMBER.supports, numbers)), f"a number is outside the supported range {FIT_NUMBER.range_text()}"),
-        (len(row.sizes) == terms, f"sizes: {len(row.sizes)} of them; {terms} are needed"),
-        (len(row.start) == k, f"start: {len(row.start)} of them; {k} are needed"),
-        (row.temperature[0] < row.temperature[1], "temperature: the coldest and the warmest of the fit are needed"),
+        (len(row.sizes) == terms, f"sizes: {len(row.sizes)} values; {terms} are needed"),
+        (len(row.start) == k, f"start: {len(row.start)} values; {k} are needed"),
+        (
+            row.temperature[0] < row.temperature[1],
+            "temperature: the lowest and then the highest temperature of the fit are needed",
+        ),
         (0.0 <= row.phi < 1.0, f"phi: {row.phi:g}; it must be from 0 to below 1"),
         (square, f"covariance: {size} rows and columns are needed"),
     ]
@@ -214,7 +217,7 @@ def _read(
     found = load_samples(recording, rate_hz, last_s)
     values, temperature_c, rate, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
-        raise ConfigError(f"{recording}: no temperature in it; a column temp or temperature, in °C, is needed")
+        raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")
     return values, temperature_c, rate, (*found.notes, *notes)
 
 

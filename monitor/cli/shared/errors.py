@@ -42,7 +42,7 @@ def message_and_status(error: Exception) -> tuple[str, int]:
             return format_one_line(_system_error(error)), FAILED
         case MemoryError():
             why = f" ({cause})" if (cause := _cause(error)) else ""
-            return f"not enough memory{why}; read less at once, e.g. the end of a recording with --last 1h", FAILED
+            return f"not enough memory{why}; read less data, e.g. the end of a recording with --last 1h", FAILED
     return (
         f"internal error: {type(error).__name__}: {_cause(error)}; please report it with the output of the same "
         f"command with {DEBUG}",
@@ -62,7 +62,7 @@ def _system_error(error: OSError) -> str:
         try:
             os.getcwd()
         except OSError:
-            return f"the current folder is gone or cannot be read ({error.strerror}); change to another folder"
+            return f"the current folder has been removed or cannot be read ({error.strerror}); change to another folder"
     return str(error)
 
 

@@ -184,7 +184,7 @@ def with_history_span(config: "Config", history_s: float | None) -> "Config":
     if history_s is None:
         return config
     if config.storage is None or not config.storage.history:
-        raise ConfigError("--history: there is no history to show; add folder to [storage]")
+        raise ConfigError("--history: there is no history to show; set folder in [storage]")
     return dataclasses.replace(config, viewer=config.viewer.model_copy(update={"history": history_s}))
 
 
