@@ -23,25 +23,26 @@ def check(
 ) -> None:
     """Read a configuration file and report all mistakes. No device is opened."""
     from monitor.commands.check_config import check_configuration
+    from monitor.common.units import format_count
 
     if print_defaults:
         typer.echo(_defaults(link, decoder), nl=False)
         return
     if link is not None or decoder is not None:
-        raise ConfigError("--link and --decoder belong to --print-defaults")
+        raise ConfigError("--link and --decoder require --print-defaults")
     if config is None:
-        raise ConfigError("CONFIG.toml is missing; --print-defaults prints one to start from")
+        raise ConfigError("CONFIG.toml is missing; --print-defaults prints an example")
     found, wrong = check_configuration(config, pipe=True)
     for line in (*wrong, *(f"warning: {line}" for line in (found.warnings if found else ()))):
         typer.echo(line, err=True)
     if wrong:
         raise typer.Exit(WRONG)
     count = len(found.devices) if found else 0
-    typer.echo(f"{config}: {count} device{'s' if count != 1 else ''}, nothing wrong")
+    typer.echo(f"{config}: {format_count(count, 'device')}, no mistakes")
 
 
 def _defaults(link: str | None, decoder: str | None) -> str:
-    """Return the text of all keys, or of the keys of a link and a decoder."""
+    """Return a configuration file with all keys and defaults, or only with the keys of a link and a decoder."""
     from monitor.settings import printed_defaults
 
     texts = []

@@ -42,7 +42,7 @@ def compensate(
         output.check_output_folder(option, place)
     for option, place in (("--json", json), ("--plot", plot), ("RECORDING", recording)):
         if place is not None and real_path(place) == real_path(out):
-            raise ConfigError(f"{option}: {place} is what --out writes; another name is needed")
+            raise ConfigError(f"{option}: {place} is also the output file of --out; choose another name")
     service_in_terminal.exit_on_sigterm()
     last_s = options.parse_duration("--last", last)
     wanted = compensating.Request(recording, out, method, rate, options.parse_arma_order(order), last_s)

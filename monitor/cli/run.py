@@ -17,7 +17,7 @@ def run(
         typer.Option(metavar="S", help="Show the last part of the history in the live view: 1d, 12h; needs [storage]."),
     ] = None,
 ) -> None:
-    """Run the service for all devices of a file, until a signal."""
+    """Run the service for all devices of a configuration file until the process is interrupted."""
     from monitor.settings import loading
 
     found = service_in_terminal.with_history_span(

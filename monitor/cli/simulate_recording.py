@@ -37,7 +37,7 @@ def simulate(
     output.check_output_folder("--json", json)
     for option, path in (("--json", json), ("--temperature-from", temperature_from)):
         if path is not None and real_path(path) == real_path(out):
-            raise ConfigError(f"{option}: {path} is what --out writes; another name is needed")
+            raise ConfigError(f"{option}: {path} is also the output file of --out; choose another name")
     noise = load_model(model, Path.cwd())
     request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
     service_in_terminal.exit_on_sigterm()

@@ -87,7 +87,7 @@ def _check_thermal(json: Path | None, plot: Path | None) -> None:
     Raises
     ------
     ConfigError
-        A file cannot be written, or the picture has another suffix than .png.
+        If a file cannot be written, or if the suffix of the picture is not .png.
     """
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")

@@ -1,9 +1,9 @@
-"""Command ``check``: finds all mistakes in a configuration file and in the model files that it names. It opens no
-device.
+"""Command ``check``: finds all mistakes in a configuration file and in the model files that it names. No device is
+opened.
 
 ``settings.examine`` reads the configuration. Model files are read here, because the modules for models are in a higher
-layer than the settings. The check covers the model in force of each device with its relative limits, and the model and
-the effects of each simulated sensor.
+layer than the settings. The check covers the noise model of each device with the limits that are relative to the model,
+and the model and effects of each simulated sensor.
 """
 
 from collections.abc import Iterator

@@ -1,13 +1,13 @@
 """Command ``doctor``: checks a machine and a configuration for unattended operation, and returns findings with advice.
 
-Each check returns findings and raises no error. If a check cannot determine the state, its finding says so. No device
-is opened. The checks have three side effects: a port is bound for a moment, a connection to a router is opened and
-closed, and an empty file is created in the storage folder and removed.
+Each check returns findings and raises no error. If a check cannot determine a state, the finding says so. No device is
+opened. The checks have three side effects: a port is bound for a moment, a connection to a router is opened and closed,
+and an empty file is created in the storage folder and removed.
 
 The disk use per day, in bytes, is rate · 86400 · SAMPLE_BYTES for each recorded device. Raw bytes add RAW_BYTES for
-each sample. SAMPLE_BYTES is the size of a sample in a packed segment with six axes, temperature and counter, for noise
-that fills a 32-bit float. Sensors with coarser resolution need less. The history of results is small in comparison and
-not counted.
+each sample. SAMPLE_BYTES is the size of a sample in a packed segment with six axes, temperature and counter, if the
+noise uses all digits of a 32-bit float. Sensors with a coarser resolution need less. The history of results is
+comparatively small and is not counted.
 """
 
 import ctypes
@@ -43,7 +43,7 @@ Mark = Literal["well", "doubt", "wrong"]
 SAMPLE_BYTES: Final = 35.0
 """Size of a sample in a packed segment.
 
-It is 32.5 to 33.3 bytes for a sensor that fills a float, and 17 to 23 bytes for a sensor with a coarse resolution.
+Sensors that use all digits of a float need 32.5 to 33.3 bytes, and sensors with a coarse resolution 17 to 23 bytes.
 """
 RAW_BYTES: Final = 60.0
 """Approximate size of the received frame of a sample. It depends on the protocol."""
@@ -60,7 +60,7 @@ UNIT: Final = "imu-monitor.service"
 PACKAGE: Final = "imu-monitor"
 """Name of the distribution package."""
 PACKAGES: Final = ("monitor", "drivers")
-"""Import packages of the program. Their names are common, so other packages may have the same."""
+"""Import packages of the program. The names are common, so other packages may have the same names."""
 TCP_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
 """Regular expression for the host and the port of a zenoh endpoint over TCP or TLS."""
 REQUIREMENT: Final = re.compile(r"([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;(.*))?")
@@ -265,7 +265,7 @@ def _check_zenoh(config: Config) -> list[Finding]:
 
 
 def check_port_free(about: str, endpoint: str) -> list[Finding]:
-    """Check that a port can be listened on, by binding it for a moment.
+    """Check that a port is free, by listening on the port for a moment.
 
     Parameters
     ----------
@@ -408,7 +408,7 @@ def recorded_bytes_per_day(config: Config) -> float | None:
 
 
 def check_disk_space(own: Storage, a_day: float | None, total: int, available: int) -> list[Finding]:
-    """Check that the data to be kept fit on the disk.
+    """Check that the disk has enough space for the data to be kept.
 
     Parameters
     ----------
@@ -468,7 +468,7 @@ def check_library_versions() -> list[Finding]:
 
 
 def required_libraries() -> Iterator[tuple[str, str, bool]]:
-    """Yield name, versions and whether it is optional, for every library except those for tests."""
+    """Yield the name, the versions and True if it is optional, for every library that is not only for tests."""
     try:
         lines = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
@@ -503,7 +503,7 @@ def version_satisfies(version: str, wanted: str) -> bool:
 
 
 def check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
-    """Report foreign packages and modules that have the name of one of the program's packages and are found first.
+    """Report foreign modules that Python would import in place of the packages of the program.
 
     Parameters
     ----------
@@ -517,7 +517,7 @@ def check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
         if folder == own:
             break
         for name in PACKAGES:
-            # a folder without __init__.py is a namespace package, and a regular package that is found later replaces it
+            # a folder without __init__.py is a namespace package, and Python prefers a regular package on a later path
             places = (folder / name / "__init__.py", folder / f"{name}.py")
             foreign = next((one for one in places if one.is_file()), None)
             if foreign is not None:
@@ -546,7 +546,7 @@ def _check_kernels() -> list[Finding]:
 
 
 def check_clock() -> list[Finding]:
-    """Check that the host clock is synchronised, because results carry its time."""
+    """Check that the host clock is synchronised, because the times of results are taken from this clock."""
     state = _adjtimex()
     if state is None:
         return [Finding("doubt", "clock", "the system does not report whether it is synchronised")]
@@ -557,7 +557,7 @@ def check_clock() -> list[Finding]:
 
 
 def _check_systemd_unit() -> list[Finding]:
-    """Check the service under systemd, if it is installed there."""
+    """Check the state of the systemd unit, if it is installed."""
     if shutil.which("systemctl") is None or not Path("/run/systemd/system").is_dir():
         return []
     command = ["systemctl", "show", UNIT, "--property=LoadState,ActiveState,SubState,NRestarts,UnitFileState"]

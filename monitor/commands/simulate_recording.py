@@ -4,8 +4,8 @@ The time series is drawn and written block by block, so that the memory does not
 column ``t`` (seconds from 0, at the nominal rate) and the axes that the model names. Other axes are absent, not zero.
 The column ``temperature`` is present if the model or a recording provides it.
 
-The recording is written completely or not at all, and so is the file with the truth. The truth contains the model, the
-seed, and the values drawn from the seed that the samples do not show.
+Recording and truth file are each written completely or not at all. The truth file contains the model, the seed, and
+random values such as the times of events.
 """
 
 import tomllib
@@ -34,7 +34,7 @@ CHUNK_ROWS: Final = 1 << 16
 """Number of rows that are drawn and written at a time."""
 
 ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
+"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,7 +47,7 @@ class Request:
     seed: int
     rate_hz: float | None = None  # None for the rate of the model
     temperature_from: Path | None = None  # recording whose temperature replaces that of the model
-    truth: bool = False  # True if the truth is written as well
+    truth: bool = False  # True if a file with the drawn random values is also written
     name: str = "the model"  # name of the model in messages
 
 
@@ -112,9 +112,9 @@ def run_simulation(request: Request, tell: ProgressCallback = lambda _what, _sha
     Raises
     ------
     ConfigError
-        There is no rate or no axis, the model cannot be simulated at this rate, or the file cannot be written.
+        If there is no rate or no axis, if the model cannot be simulated at this rate, or if the file cannot be written.
     RecordingError
-        The recording with the temperature cannot be read.
+        If the recording with the temperature cannot be read.
     """
     rate_hz = _rate_hz(request)
     n = round(request.seconds * rate_hz)
@@ -124,7 +124,7 @@ def run_simulation(request: Request, tell: ProgressCallback = lambda _what, _sha
         raise ConfigError(f"{request.seconds:g} s at {rate_hz:g} Hz: {error}") from None
     axes = tuple(axis for axis in AXES if axis in request.model.effects)
     if not axes:
-        raise ConfigError(f"{request.name}: names no axis; axes are {' '.join(AXES)}")
+        raise ConfigError(f"{request.name}: the model has no axis; possible are {' '.join(AXES)}")
     tell("preparing", None)
     temperature_c = _temperature(request, rate_hz, n)
     try:
@@ -162,21 +162,21 @@ def _rate_hz(request: Request) -> float:
     """Return the requested sample rate, or else the rate of the model."""
     rate_hz = request.rate_hz or request.model.sample_rate_hz
     if rate_hz is None:
-        raise ConfigError(f"{request.name}: has no sample_rate; give one with --rate HZ")
+        raise ConfigError(f"{request.name}: the model has no sample_rate; set the rate with --rate HZ")
     return rate_hz
 
 
 def _temperature(request: Request, rate_hz: float, n: int) -> Floats | None:
     """Return the temperature of the recording at the times of the samples, [≤ n] in °C, by linear interpolation.
 
-    None stands for the temperature of the model.
+    None means that the temperature of the model is used.
     """
     if request.temperature_from is None:
         return None
     found = _load_recording(request.temperature_from, request.rate_hz)
     known = np.isfinite(found.temperature_c)
     if not known.any():
-        raise ConfigError(f"{request.temperature_from}: has no temperature; the column is temperature, in °C")
+        raise ConfigError(f"{request.temperature_from}: has no temperature; a column temperature in °C is needed")
     t_s = np.arange(len(found)) / (found.rate_hz or rate_hz) if found.t_s is None else found.t_s - found.t_s[0]
     t_s, temperature_c = t_s[known], found.temperature_c[known]
     order = np.argsort(t_s, kind="stable")

@@ -1,7 +1,7 @@
 """Commands ``thermal fit`` and ``thermal predict``: fit thermal models to a recording, and predict the bias of another.
 
-If an axis cannot be fitted or predicted, the reason is reported, and the other axes are processed. The model file is
-JSON. ``predict`` reads the file that ``fit`` writes.
+If an axis cannot be fitted or predicted, the reason is reported, and the remaining axes are processed. The model file
+is JSON. ``predict`` reads the file that ``fit`` writes.
 """
 
 from collections.abc import Mapping
@@ -67,7 +67,7 @@ def fit_recording(
     recording : Path
         Recording with temperature.
     interval_s : float, optional
-        Length of an interval mean in seconds. By default it follows from the length of the recording.
+        Length of an interval in seconds. By default, the length is derived from the length of the recording.
     rate_hz : float, optional
         Sample rate, if the recording has none.
     last_s : float, optional
@@ -76,7 +76,7 @@ def fit_recording(
     Raises
     ------
     RecordingError, ConfigError
-        The recording cannot be read, or it has no temperature.
+        If the recording cannot be read, or if it has no temperature.
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     means = _means(values, temperature_c, rate, interval_s or choose_interval_s(temperature_c.size / rate, rate))
@@ -109,7 +109,7 @@ def predict_recording(
     Raises
     ------
     RecordingError, ConfigError
-        The recording cannot be read, or it has no temperature.
+        If the recording cannot be read, or if it has no temperature.
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     interval = next(iter(models.values())).interval_s
@@ -117,7 +117,7 @@ def predict_recording(
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
-            refused[axis] = "the model says nothing of it"
+            refused[axis] = "the model file has no model of this axis"
         elif one.known.sum() < 2:
             refused[axis] = f"fewer than two intervals of {interval:g} s"
         else:
@@ -137,18 +137,18 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
     Raises
     ------
     ConfigError
-        The file cannot be read, or its content is invalid.
+        If the file cannot be read, or if its content is invalid.
     """
     try:
         found = msgspec.json.decode(file_access.read_small_file(path, pipe=True), type=ModelFile)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"{path}: no thermal model: {error}") from error
+        raise ConfigError(f"{path}: not a thermal model: {error}") from error
     if found.schema != SCHEMA:
-        raise ConfigError(f'{path}: schema "{found.schema}"; "{SCHEMA}" is read')
+        raise ConfigError(f'{path}: unknown schema "{found.schema}"; "{SCHEMA}" is expected')
     if not found.axes:
-        raise ConfigError(f"{path}: no axis in it")
+        raise ConfigError(f"{path}: there is no axis in the file")
     try:
         DURATION_S.check(found.interval)
     except ConfigError as error:
@@ -190,9 +190,12 @@ def _model(path: Path, axis: str, row: AxisModelRecord, interval_s: float) -> Th
             all(map(FIT_NUMBER.supports, numbers)),
             f"a number is outside the supported range {FIT_NUMBER.format_range()}",
         ),
-        (len(row.sizes) == terms, f"sizes: {len(row.sizes)} of them; {terms} are needed"),
-        (len(row.start) == k, f"start: {len(row.start)} of them; {k} are needed"),
-        (row.temperature[0] < row.temperature[1], "temperature: the coldest and the warmest of the fit are needed"),
+        (len(row.sizes) == terms, f"sizes: {len(row.sizes)} values; {terms} are needed"),
+        (len(row.start) == k, f"start: {len(row.start)} values; {k} are needed"),
+        (
+            row.temperature[0] < row.temperature[1],
+            "temperature: the lowest and then the highest temperature of the fit are needed",
+        ),
         (0.0 <= row.phi < 1.0, f"phi: {row.phi:g}; it must be from 0 to below 1"),
         (square, f"covariance: {size} rows and columns are needed"),
     ]
@@ -220,7 +223,7 @@ def _read(
     found = load_samples(recording, rate_hz, last_s)
     values, temperature_c, rate, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
-        raise ConfigError(f"{recording}: no temperature in it; a column temp or temperature, in °C, is needed")
+        raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")
     return values, temperature_c, rate, (*found.notes, *notes)
 
 

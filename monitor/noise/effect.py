@@ -163,7 +163,7 @@ class Effect(ParameterTable, ABC):
         if self.events_hz > MAX_EVENTS_PER_SAMPLE * rate_hz:
             raise ConfigError(
                 f"{self.name}: {self.events_hz:g} events a second at {rate_hz:g} Hz; "
-                f"at most {MAX_EVENTS_PER_SAMPLE:g} in a sample are possible"
+                f"at most {MAX_EVENTS_PER_SAMPLE:g} per sample are possible"
             )
 
 

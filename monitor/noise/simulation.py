@@ -81,7 +81,9 @@ def check_effects(axis_effects: Mapping[str, tuple[Effect, ...]], true_hz: float
                 if isinstance(effect, NoiseStep) and not any(isinstance(one, AngleRandomWalk) for one in effects):
                     raise ConfigError(f"{axis} has no angle_random_walk to multiply")
                 if isinstance(effect, Source) and effect.uses_temperature and not temperature:
-                    raise ConfigError("no temperature: the model has no [temperature], and no recording gives one")
+                    raise ConfigError(
+                        "no temperature: neither the model has a table [temperature], nor does a recording provide one"
+                    )
 
 
 class ModelStream:
@@ -167,7 +169,7 @@ class ModelStream:
         if axis not in AXES:
             raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
         if isinstance(effect, SampleRateError):
-            raise ConfigError(f"{axis}.{effect.name}: the clock of a stream that runs cannot change")
+            raise ConfigError(f"{axis}.{effect.name}: the sample rate error of a running stream cannot change")
         with error_location(f"{axis}.{effect.name}"):
             effect.check_axis(axis)
         effects = self._effects | {axis: (*self._effects[axis], effect)}
@@ -208,7 +210,7 @@ class ModelStream:
             line.insert(TRANSFORM_ORDER.index(type(effect)), running)
             self._truths.append((axis, effect, running))
         else:
-            raise TypeError(f"{effect.name} is no source, leak, noise step or transform")
+            raise TypeError(f"{effect.name} is not a source, leak, noise step or transform")
 
     def _rng(self, axis: str, effect: str, occurrence: int) -> np.random.Generator:
         """Return the random generator of one effect."""

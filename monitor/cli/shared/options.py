@@ -1,4 +1,5 @@
-"""Options of the commands, and parsers for arguments with a structure. A ConfigError names the option."""
+"""Command-line options that several commands share, and parsers for option values such as durations. Error messages
+name the option."""
 
 import sys
 from collections.abc import Callable
@@ -29,12 +30,12 @@ MAX_AVERAGING_TIMES: Final = 1000
 
 
 def range_callback(quantity: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
-    """Return a typer callback that checks the number of an option against a quantity.
+    """Return a typer callback that checks the value of an option against the range of a quantity.
 
     Raises
     ------
     ConfigError
-        The number is outside the supported range. The text begins with the name of the option.
+        If the value is outside the supported range. The message begins with the name of the option.
     """
 
     def check(option: typer.CallbackParam, value: Number | None) -> Number | None:
@@ -112,7 +113,7 @@ def parse_averaging_times(text: str) -> "TauGrid":
     Raises
     ------
     ConfigError
-        The text is neither the name of a grid nor a list of seconds, or a time is outside the supported range.
+        If the text is neither the name of a grid nor a list of seconds, or if a time is outside the supported range.
     """
     if text in ("octave", "decade10"):
         return text  # type: ignore[return-value]
@@ -149,7 +150,7 @@ def parse_duration(option: str, text: str | None) -> float | None:
     Raises
     ------
     ConfigError
-        The text is not a duration.
+        If the text is not a duration.
     """
     from monitor.settings.loading import seconds
 
@@ -165,7 +166,7 @@ def parse_arma_order(text: str | None) -> "Order | None":
     Raises
     ------
     ConfigError
-        The text is not a supported order.
+        If the text is not a supported order.
     """
     from monitor.drift.compensation.arma import ORDERS
 
@@ -178,13 +179,12 @@ def parse_arma_order(text: str | None) -> "Order | None":
 
 
 def read_noise_coefficients(source: Path) -> "NoiseCoefficients":
-    """Read noise parameters from a model or from the JSON of ``analyze``. JSON begins with a brace, and a model does
-    not.
+    """Read noise coefficients from a model file or from the JSON output of ``analyze``.
 
     Raises
     ------
     ConfigError
-        The file cannot be read, or its content is invalid.
+        If the file cannot be read, or if its content is invalid.
     """
     from drivers import file_access
     from monitor.noise.model import NoiseModel

@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from monitor.estimation.analysis import Analysis
 
 ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
+"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 
 
 def check_output_folder(option: str, path: Path | None) -> None:
-    """Check before the work begins that ``write_bytes`` can create a file.
+    """Check that the folder of an output file exists, before the work begins.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ def check_output_folder(option: str, path: Path | None) -> None:
     Raises
     ------
     ConfigError
-        The folder does not exist.
+        If the folder does not exist.
     """
     if path is not None and path != Path("-") and not path.parent.is_dir():
         raise ConfigError(f"{option}: {path}: cannot be written: there is no folder {path.parent}")
@@ -49,7 +49,7 @@ def write_bytes(option: str, path: Path, data: bytes) -> None:
     Raises
     ------
     ConfigError
-        The file cannot be written.
+        If the file cannot be written.
     """
     if path == Path("-"):
         sys.stdout.buffer.write(data)
@@ -63,7 +63,7 @@ def write_bytes(option: str, path: Path, data: bytes) -> None:
 
 @contextlib.contextmanager
 def show_progress() -> Iterator[ProgressCallback]:
-    """Show a progress bar on a terminal, or nothing if the output is piped; yield the callback that updates it."""
+    """Show a progress bar if the output is a terminal, and yield the callback that updates the bar."""
     from rich.console import Console
     from rich.progress import Progress
 

@@ -1,7 +1,7 @@
 """Service in a terminal: live table, log lines, and the signals that stop the service.
 
-Table and log are written by threads (``QueuedWriter``). A terminal or pipe that nobody reads therefore delays neither
-samples nor the end of the process.
+Table and log are written by threads (``QueuedWriter``). A blocked terminal or pipe therefore delays neither samples nor
+the end of the process.
 """
 
 import contextlib
@@ -37,16 +37,16 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
     config : Config
         Configuration to run.
     seconds : float or None
-        Duration in seconds. None runs until a signal or the end of all replays.
+        Duration in seconds. If None, the service runs until a signal or the end of all replays.
     viewer : str or None
         Viewer mode that replaces the mode of the configuration.
 
     Raises
     ------
     ConfigError
-        The viewer mode or a device cannot be used.
+        If the viewer mode or a device cannot be used.
     OSError
-        The run ended by itself, and the final table could not be written to a file or pipe.
+        If the run ended without a signal, and the final table could not be written to a file or pipe.
     """
     import threading
 
@@ -97,14 +97,14 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
 
 
 def _table_error(screen: "QueuedWriter", unread: bool) -> Exception | None:
-    """Return why the final table is not on standard output, or None if it is."""
+    """Return the reason why the final table has not been written to standard output, or None if it has."""
     from monitor.publishing.terminal.queued_writer import CLOSE_S
 
     if unread:
         return TimeoutError(f"{STDOUT}: the final table was not written, because nobody read it for {CLOSE_S:g} s")
     error = screen.error
     if isinstance(error, OSError) and error.errno == errno.EBADF:
-        return None  # standard output was closed before the start, so nobody wants the table
+        return None  # standard output was already closed at the start, so no table is expected
     if isinstance(error, OSError) and not isinstance(error, BrokenPipeError):
         return OSError(f"{STDOUT}: the final table could not be written: {error.strerror}")
     return error
@@ -124,16 +124,16 @@ def run_fleet_viewer(
     file : Path or None
         Zenoh configuration file.
     detail : sequence of str
-        Devices that are shown with samples and curves.
+        Devices that are shown with samples and Allan deviations.
     mode : str
         Viewer mode.
     seconds : float or None
-        Duration in seconds. None runs until a signal.
+        Duration in seconds. If None, the viewer runs until a signal.
 
     Raises
     ------
     ConfigError
-        The viewer mode is invalid.
+        If the viewer mode is invalid.
     """
     import threading
 
@@ -165,26 +165,26 @@ def run_fleet_viewer(
 
 
 def with_history_span(config: "Config", history_s: float | None) -> "Config":
-    """Return the configuration with another time span of history in the viewer.
+    """Return the configuration with another length of the history in the viewer.
 
     Parameters
     ----------
     config : Config
         Configuration.
     history_s : float or None
-        Time span in seconds. None keeps the value of the configuration.
+        Length of the history in seconds. None keeps the value of the configuration.
 
     Raises
     ------
     ConfigError
-        The configuration stores no history.
+        If the configuration stores no history.
     """
     import dataclasses
 
     if history_s is None:
         return config
     if config.storage is None or not config.storage.history:
-        raise ConfigError("--history: there is no history to show; add folder to [storage]")
+        raise ConfigError("--history: there is no history to show; set folder in [storage]")
     return dataclasses.replace(config, viewer=config.viewer.model_copy(update={"history": history_s}))
 
 
@@ -297,7 +297,7 @@ def install_signal_handlers(stop: Callable[[], None], hung_up: Callable[[], None
 
     def first(number: int, _frame: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        # a thread of its own is needed, because the main thread may hold the lock of the event that stop sets
+        # a separate thread is needed, because the main thread may hold the lock of the event that stop sets
         threading.Thread(target=stop, name="stop", daemon=True).start()
 
     signal.signal(signal.SIGINT, first)

@@ -1,20 +1,20 @@
 """Rate of a carrier that may move at any time: a bank of filters with the "current" statistical model.
 
 Each filter follows Zhou & Kumar 1984, with the one-step prediction as the mean of the acceleration (Yuan et al. 2010).
-The state is [ω, ω̇], the transition is [[1, T], [0, 1]], and the process noise is 2ασ_a² ∫ over T. With this mean, the
-manoeuvre frequency α and the variance σ_a² enter only as a product. While αT ≪ 1, the product acts as white noise of
-intensity 2ασ_a² in ω̈. In units of one sample and of the noise of the measured rate, a single number q remains. It
-determines the gains, and with them a filter of ``memory`` samples.
+The state is [ω, ω̇] with the transition matrix [[1, T], [0, 1]]. For αT ≪ 1, the process noise is white noise of
+intensity 2ασ_a² in ω̈. The manoeuvre frequency α and the variance σ_a² appear only in this product. If time is measured
+in samples and the noise of the measured rate has unit variance, the product is a single number q. The number q
+determines the gains and the memory of the filter.
 
 σ_a² adapts to the motion. Filters with memories of 2, 4, 8, … samples run in parallel. At every sample the output comes
-from the filter with the least estimated error, or from the measured rate itself. By Mallows' C_p (Technometrics 15,
-1973), the mean square error of a linear filter is its own noise variance plus the growth of its residual. Both are
-learned at rest, where the rate is known to be zero. The method therefore assumes neither white noise nor any other
-noise model. A residual beyond GATE standard deviations excludes a filter immediately, and resets the filter if it
-persists.
+from the filter with the least estimated error, or from the measured rate itself. The mean square error of a filter is
+the noise variance of its output plus the increase of its mean square residual (Mallows' C_p, Technometrics 15, 1973).
+The noise variance and the usual residual are learned at rest, where the rate is zero. The method therefore assumes
+neither white noise nor any other noise model. A residual beyond GATE standard deviations excludes a filter immediately,
+and resets the filter if it persists.
 
-Changes between filters would lose angle. The difference between input and output is therefore accumulated and fed back
-slowly.
+A change between filters would cause an error of the integrated angle. The difference between input and output is
+therefore accumulated and slowly added to the output.
 """
 
 from math import inf, log2, sqrt
@@ -34,8 +34,8 @@ GATE: Final = 5.0
 MAX_GATE_EXCEEDANCES: Final = 3
 """Successive samples beyond the gate after which a filter is reset."""
 SETTLING_SAMPLES: Final = (6, 48)
-"""Age at which a filter has reached its steady gains after a reset: a multiple of its memory, and a
-minimum in samples."""
+"""Age after a reset at which a filter has reached the steady gains: a multiple of its memory, and a minimum in
+samples."""
 MIN_REST_INTERVALS: Final = 5
 """Intervals at rest before the output of the filters is used."""
 NOISE_MEMORY_INTERVALS: Final = 60
@@ -45,7 +45,7 @@ DIFFUSE_VARIANCE: Final = 1e12
 
 RATE, SLOPE, RESIDUAL, NOISE, REST_RESIDUAL = range(5)
 """Columns of ``bank``: ω, ω̇ per sample, recent mean square residual, variance of the estimate at rest, and mean square
-residual at rest. The first row is the measured rate itself. Only its NOISE is used."""
+residual at rest. The first row describes the measured rate itself, of which only NOISE is used."""
 AGE, EXCEEDANCES = range(2)
 """Columns of ``ages``: samples since the reset of a filter, and successive samples beyond the gate."""
 
@@ -62,21 +62,21 @@ def filter_memories(rate_hz: float) -> Ints:
 def process_noise_intensity(memory: int) -> float:
     """Return the noise intensity 2ασ_a² of a filter that reduces the noise variance by the factor ``memory``.
 
-    The result is in units of one sample and of the measured variance. The gain of the steady filter is about √2 q^¼,
-    and the remaining variance is 3/4 of the gain.
+    Time is measured in samples, and the noise of the measured rate has unit variance. For the intensity q, the steady
+    gain is about √2 q^¼, and the variance of the output is 3/4 of the gain.
     """
     return (4.0 / (3.0 * memory) / sqrt(2.0)) ** 4
 
 
-def gain_table(each: Ints) -> tuple[Floats, Ints]:
-    """Return the gains [rows, 2] of ω and ω̇ by age, and the first row of each filter [filters + 1].
+def gain_table(memories: Ints) -> tuple[Floats, Ints]:
+    """Return one table with the gains of all filters, and the first row of each filter.
 
-    The filters follow one another in the table. The last row of a filter holds its steady gains. ``each`` holds the
-    memories in samples.
+    The table [rows, 2] has the gains of ω and ω̇, with one row for each age of a filter in samples. The last row of a
+    filter has the steady gains. ``memories`` are the memories of the filters in samples.
     """
     tables = [
         _gains(process_noise_intensity(int(memory)), max(SETTLING_SAMPLES[0] * int(memory), SETTLING_SAMPLES[1]))
-        for memory in each
+        for memory in memories
     ]
     return np.concatenate(tables), np.cumsum([0, *(len(one) for one in tables)])
 
@@ -112,8 +112,8 @@ def filter_sample(
     table, first : ndarray
         Gains and first rows as ``gain_table`` returns them.
     sums : ndarray, shape (filters + 1, 2)
-        Sums of the squares of estimate and residual, in case the sample turns out to be at rest. They are updated in
-        place.
+        Sums of the squares of estimate and residual. They are updated in place, and used later if the sample was at
+        rest.
     feedback : ndarray, shape (1,)
         Accumulated difference of input and output, in rad/s times samples. It is updated in place.
     keep : float

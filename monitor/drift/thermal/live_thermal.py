@@ -4,7 +4,8 @@ The input consists of blocks of samples in order, with NaN for samples in motion
 ``ThermalIntervalResult`` holds the measured and the predicted mean of each axis. Changes that temperature does not
 explain are reported as events. Nothing is stored or computed before the first temperature has been received.
 
-``update`` takes a few ms at the end of an interval. ``step`` chooses models in small pieces between the intervals.
+``update`` takes a few milliseconds at the end of an interval. ``step`` selects models in short steps between the
+intervals.
 """
 
 from collections.abc import Mapping
@@ -55,7 +56,7 @@ class LiveThermal:
         self._reset()
 
     def update(self, samples: SampleBlock) -> list[ThermalIntervalResult]:
-        """Return the intervals with a temperature that have ended with these samples."""
+        """Add samples, and return the results of the intervals that ended and have a known temperature."""
         # Samples that are missing before the first temperature belong to no interval.
         lost = samples.lost if self._has_temperature else 0
         self._has_temperature = self._has_temperature or bool(np.isfinite(samples.temperature_c).any())
@@ -68,11 +69,11 @@ class LiveThermal:
 
     @property
     def choosing(self) -> bool:
-        """True if ``step`` has work to do."""
+        """True if a model selection is active, so that ``step`` has work to do."""
         return any(one.choosing for one in self._axes.values())
 
     def step(self) -> bool:
-        """Do one piece of the choice of a model, about 1 ms, and return False if there is nothing to do."""
+        """Run one step of the model selection, which takes about 1 ms. Return False if no selection is active."""
         for axis, one in self._axes.items():
             if one.step():
                 self._events += [self._event(axis, found) for found in one.take_unexplained_changes()]
@@ -93,15 +94,15 @@ class LiveThermal:
     def set_rate(self, rate_hz: float) -> None:
         """Set a better estimate of the sample rate in Hz.
 
-        If the rate differs by more than MAX_RATE_CHANGE, the models start anew, because the intervals had
-        another length.
+        If the rate differs by more than MAX_RATE_CHANGE, the models are discarded, because the length of an interval
+        has changed.
         """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._rate_hz = rate_hz
             self._reset()
 
     def _reset(self) -> None:
-        """Start anew at the current sample rate."""
+        """Discard all models, and start at the current sample rate."""
         length = max(round(self._requested_interval_s * self._rate_hz), PARTS_PER_INTERVAL)
         self._interval_s = length / self._rate_hz
         self._means = RunningIntervalMeans(length, MAX_INTERVALS)
@@ -127,8 +128,8 @@ class LiveThermal:
         """Return the event of an unexplained change."""
         size = format_rate(axis, found.size, sign=True)
         text = (
-            f"{axis} is {size} off what its temperature lets expect: {found.outside} of the last {found.of} means "
-            f"were outside of their interval"
+            f"{axis} differs by {size} from the bias that its temperature predicts: {found.outside} of the last "
+            f"{found.of} means were outside their prediction interval"
         )
         what = {"bias": {"size": found.size, "outside": float(found.outside), "of": float(found.of)}}
         since_ns = self._t_ns - round(found.since * self._interval_s * 1e9)

@@ -1,13 +1,14 @@
 """Recursive least squares: update of the coefficients of a thermal model with each interval.
 
-The form, the time constants and φ stay as they were chosen. The triangle R of a QR decomposition holds the information
-of all intervals: their whitened rows beside their whitened values. A new interval is one more row, and R is made
-triangular again (Golub & Van Loan, Matrix Computations, 6.5). The coefficients agree with least squares over the whole
-record up to rounding, and the cost does not grow with the record. The derivatives by the time constants are further
-columns. They do not affect the coefficients, but the uncertainty of the time constants widens the prediction intervals.
+The terms of the model, the time constants and φ are not changed. The whitened regressors and values of all intervals
+are stored as the triangular factor R of their QR decomposition. A new interval adds one row, and R is made triangular
+again (Golub & Van Loan, Matrix Computations, 6.5). Except for rounding, the coefficients agree with least squares over
+the whole record, and the cost does not grow with the record. R has further columns for the derivatives with respect to
+the time constants. These columns do not affect the coefficients, but they add the uncertainty of the time constants to
+the prediction intervals.
 
-If the temperature of an interval is missing, the temperature of the interval before is used. A fit of the whole record
-interpolates instead, because it also has the later temperatures.
+If the temperature of an interval is missing, the previous temperature is used. A fit to the whole record interpolates
+missing temperatures.
 """
 
 from dataclasses import dataclass, replace
@@ -49,9 +50,9 @@ class RecursiveThermalFit:
     Parameters
     ----------
     model : ThermalModel
-        Model with the form, the time constants, φ and the reference to use. Its coefficients are computed again.
+        Model whose terms, time constants, φ and reference temperature are used. The coefficients are computed again.
     means : IntervalMeans
-        The intervals so far, from the first one that the model is to use.
+        Intervals so far.
     """
 
     def __init__(self, model: ThermalModel, means: IntervalMeans) -> None:
@@ -90,7 +91,8 @@ class RecursiveThermalFit:
     def predict_multi_and_one_step(self, temperature_c: float) -> tuple[PredictionInterval, PredictionInterval]:
         """Return the multi-step and the one-step prediction of the next interval from its temperature in °C.
 
-        The prediction intervals use Student's t distribution, because few intervals determine the scatter at first.
+        The prediction intervals use Student's t distribution, because the scatter is at first estimated from few
+        intervals.
         """
         model = self.model
         excess = np.array([self._excess, temperature_c - model.reference_c if np.isfinite(temperature_c) else np.nan])
@@ -136,7 +138,8 @@ class RecursiveThermalFit:
             self.model = self._with_current_coefficients(lowest, highest)
 
     def _next_row(self, excess: float, ends: tuple[float, float] | None) -> tuple[Floats, Floats, Floats]:
-        """Return the next row with its derivatives, and the lags and initial-state responses after it."""
+        """Return the regressors of the next interval with their derivatives, the updated lags, and the updated
+        initial-state responses."""
         lags = self._decays * self._lags + (1.0 - self._decays) * excess
         left = self._initial_responses * self._decays
         shape = replace(self._model.shape, constants_s=())

@@ -1,12 +1,10 @@
-"""Dependence of the slow variation on temperature, and the coefficients K and R without the temperature part of the
-bias.
+"""Test for a dependence of the bias on temperature, and noise coefficients after removal of this dependence.
 
-The input is an analysis and the temperature on its grid. The bias of each axis is tested for a dependence on
-temperature against a null hypothesis of correlated noise (``temperature_dependence``), whatever the status of its
-coefficients. The bias of a dependent axis is fitted to temperature as in ``thermal fit``. The modelled bias is
-interpolated smoothly between the middles of the intervals, because steps and corners would add noise, and subtracted
-from the samples. The Allan deviation and the coefficients are then computed again. Axes without a significant
-dependence stay unchanged and are not reported.
+The input is the analysis of a recording and the temperature of each sample. ``temperature_dependence`` tests the bias
+of each axis for a dependence on temperature against a null hypothesis of correlated noise. If the dependence is
+significant, a model of ``thermal_fit`` is subtracted from the samples. The model is interpolated smoothly between the
+middles of the intervals, because steps and corners would add noise. The Allan deviation and the coefficients are then
+computed again. Axes without a significant dependence are not changed and not reported.
 
 A model can follow a part of a random walk by chance. A share of a few percent of K or R is therefore not significant.
 """
@@ -44,7 +42,7 @@ class TemperatureRemoval:
 
     @property
     def axes_of_temperature(self) -> tuple[str, ...]:
-        """Return the axes of which temperature explains most of the slow variance."""
+        """Return the axes on which temperature explains most of the slow variance."""
         return tuple(axis for axis, one in self.dependences.items() if one.explains_most)
 
     def variance_share(self, letter: str, axis: str) -> float | None:
@@ -62,7 +60,7 @@ class TemperatureRemoval:
         Returns
         -------
         float or None
-            The share, at least 0. None if the coefficient was not estimated before, or not determined after.
+            The share, at least 0. None if the coefficient was not estimated before the removal, or is unknown after it.
         """
         at = SYMBOLS.index(letter), AXES.index(axis)
         if self.before.status[at] != Status.ESTIMATED or self.coefficients.status[at] == Status.UNESTIMATED:
@@ -72,7 +70,8 @@ class TemperatureRemoval:
         return max(1.0 - (after / float(self.before.value[at])) ** 2, 0.0)
 
     def has_decreased_significantly(self, letter: str, axis: str) -> bool:
-        """Return True if the coefficient has changed significantly: its new upper limit lies below its old interval.
+        """Return True if the upper limit of the new coefficient lies below the confidence interval of the old
+        coefficient.
 
         Parameters
         ----------

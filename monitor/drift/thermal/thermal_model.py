@@ -46,8 +46,8 @@ class ThermalModel:
 
     @property
     def mean_slope(self) -> float:
-        """Return the mean slope of the bias in rad/s or m/s² per °C over the temperatures of the fit, with settled
-        lags."""
+        """Return the mean slope of the bias over the temperatures of the fit after all lags have settled, in rad/s or
+        m/s² per °C."""
         (lo, hi), powers = self.temperature_range_from_reference_c, np.arange(1, self.shape.powers + 1)
         chords = (hi**powers - lo**powers) / (hi - lo)
         return float(
@@ -83,8 +83,8 @@ def predict(
 ) -> Prediction:
     """Predict the interval means, multi-step or one-step.
 
-    Nothing is known beyond the temperatures of the fit. The model continues along its chord there, and the change along
-    the chord widens the prediction interval.
+    Outside the temperatures of the fit, each power continues with its mean slope between the lowest and the highest
+    temperature. The extrapolated change is added to the uncertainty.
 
     Parameters
     ----------
@@ -96,8 +96,9 @@ def predict(
         Measured bias of each interval, rad/s or m/s². Each value is used for the prediction of the next interval. None
         selects the multi-step prediction from temperature only.
     began : bool
-        True if the first interval is the first one of the fit, whose initial state is known. If False, temperature is
-        assumed to have been constant before, and the prediction intervals include the uncertainty of this assumption.
+        True if the first interval is also the first interval of the fit, so that the initial state is known. If False,
+        temperature is assumed to have been constant before the first interval, and the prediction intervals include the
+        uncertainty of this assumption.
     """
     excess = interpolate_gaps(temperature_c) - model.reference_c
     columns = regressors(
@@ -161,7 +162,7 @@ def predict_with_variance(
 
 
 def interpolate_gaps(temperature_c: Floats) -> Floats:
-    """Return the temperature [n] with gaps interpolated, because the lags depend on the temperature within the gaps."""
+    """Return the temperature [n] with interpolated gaps. The lags need the temperature within the gaps."""
     there = np.flatnonzero(np.isfinite(temperature_c))
     return np.interp(np.arange(temperature_c.size), there, temperature_c[there])
 
@@ -199,8 +200,8 @@ def time_constant_derivatives(model: ThermalModel, excess: Floats, sizes: Floats
 
 
 def regressor_derivatives(shape: ThermalModelForm, excess: Floats, interval_s: float) -> Floats:
-    """Return the derivatives [n, 2 k] of the lags and of their initial-state responses by the logarithm of their time
-    constants.
+    """Return the derivatives [n, 2 k] of the lags and their initial-state responses with respect to the logarithm of
+    each time constant.
 
     Parameters
     ----------
@@ -221,7 +222,7 @@ def regressor_derivatives(shape: ThermalModelForm, excess: Floats, interval_s: f
 
 
 def bias_derivatives_by_time_constant(shape: ThermalModelForm, column_derivatives: Floats, sizes: Floats) -> Floats:
-    """Return the derivatives [n, k] of the bias by the logarithms of the time constants, from those of the columns.
+    """Return the derivatives [n, k] of the bias with respect to the logarithm of each time constant.
 
     Parameters
     ----------

@@ -52,7 +52,7 @@ class ThermalFitReport:
 
 @dataclass(frozen=True, slots=True)
 class ComparisonWithMeans:
-    """Comparison of a model with the means of a recording."""
+    """Comparison of a thermal model with the interval means of a recording."""
 
     multi_step: Prediction
     one_step: Prediction
@@ -77,7 +77,7 @@ class ThermalPredictionReport:
 
 
 def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ComparisonWithMeans:
-    """Compare a model with means that were not used for its fit.
+    """Compare a model with interval means that were not used for the fit.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ComparisonW
 
 
 def choose_interval_s(seconds: float, rate_hz: float) -> float:
-    """Return a round interval length in seconds that divides a recording into about DEFAULT_INTERVALS intervals.
+    """Return a round interval length in seconds, such that a recording has about DEFAULT_INTERVALS intervals.
 
     Parameters
     ----------

@@ -109,7 +109,7 @@ def test_foreign_packages_come_first_on_the_module_path(form: str, run: Run, tmp
     path = foreign(tmp_path / "ros", form)
     done = run("check", DEMO, environment={"PYTHONPATH": f"{path}{os.pathsep}{ROOT}"})
     well(done)
-    assert "1 device, nothing wrong" in done.stdout
+    assert "1 device, no mistakes" in done.stdout
 
 
 @pytest.mark.parametrize(

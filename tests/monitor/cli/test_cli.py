@@ -285,7 +285,7 @@ def test_check_accepts_every_shipped_file(call: Call, recording: Path, name: str
     shutil.copy(recording, "recording.csv")  # the one that replay.toml names
     said = call("check", name)
     assert (said.status, said.err) == (0, "")
-    assert "nothing wrong" in said.out
+    assert "no mistakes" in said.out
 
 
 def test_check_accepts_the_defaults_that_it_prints(call: Call) -> None:
@@ -293,7 +293,7 @@ def test_check_accepts_the_defaults_that_it_prints(call: Call) -> None:
     assert (printed.status, printed.err) == (0, "")
     Path("defaults.toml").write_text(printed.out)
     said = call("check", "defaults.toml")
-    assert (said.status, said.out, said.err) == (0, "defaults.toml: 1 device, nothing wrong\n", "")
+    assert (said.status, said.out, said.err) == (0, "defaults.toml: 1 device, no mistakes\n", "")
 
 
 def test_check_prints_the_keys_of_one_link_and_one_decoder(call: Call) -> None:
@@ -470,7 +470,7 @@ WRONG_MODELS = {
     ),
     "unknown key": ("sample_rat = 100.0\n", 'unknown key "sample_rat"; did you mean "sample_rate"?'),
     "unknown table": ("[temprature]\nmean = 25.0\n", 'unknown axis "temprature"; did you mean "temperature"?'),
-    "no axis": ("", "names no axis"),
+    "no axis": ("", "the model has no axis"),
     "no TOML": ("[gz", "not TOML"),
 }
 
@@ -507,7 +507,7 @@ def test_a_model_without_a_rate_asks_for_one(call: Call) -> None:
     Path("m.toml").write_text("[gz.angle_random_walk]\nN = 1e-3\n")
     said = call("simulate", "m.toml", "--seconds", "1min", "--out", "x.csv")
     assert said.status == 2
-    assert "m.toml: has no sample_rate; give one with --rate HZ" in said.only_line()
+    assert "m.toml: the model has no sample_rate; set the rate with --rate HZ" in said.only_line()
     said = call(
         "simulate", "m.toml", "--seconds", "1min", "--out", "x.csv", "--rate", "20", "--seed", "5", "--json", "-"
     )
@@ -1285,8 +1285,8 @@ def test_history_of_a_span_and_a_step_by_its_configuration(call: Call, histories
 @pytest.mark.parametrize(
     ("arguments", "status", "line"),
     [
-        ((), 2, "CONFIG.toml or a folder is missing"),
-        (("{kept}",), 2, "choose with --device: bench-1, bench-2"),
+        ((), 2, "CONFIG.toml or a folder is needed"),
+        (("{kept}",), 2, "choose one with --device: bench-1, bench-2"),
         (("{kept}", "--device", "bench-3"), 2, 'did you mean "bench-'),
         (("{kept}", "--device", "bench-1", "--from", "-1h"), 3, "nothing in that time; kept are 2025-11-21 00:00:00"),
         (("{kept}", "--from", "soon"), 2, '--from: "soon" is no time'),
@@ -1312,7 +1312,7 @@ def test_a_view_of_what_is_not_kept_is_refused(call: Call, tmp_path: Path) -> No
     (tmp_path / "c.toml").write_text(VIRTUAL + QUIET)
     said = call("run", "c.toml", "--history", "1d")
     assert said.status == 2
-    assert said.only_line() == "imu-monitor: --history: there is no history to show; add folder to [storage]\n"
+    assert said.only_line() == "imu-monitor: --history: there is no history to show; set folder in [storage]\n"
     assert "no duration" in call("run", "c.toml", "--history", "long").only_line()
 
 
@@ -1320,7 +1320,7 @@ def test_history_without_storage_is_said(call: Call, tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text(VIRTUAL)
     said = call("history", "c.toml")
     assert said.status == 2
-    assert "[storage] folder is missing" in said.only_line()
+    assert "[storage] has no folder" in said.only_line()
 
 
 def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path) -> None:
@@ -1365,7 +1365,7 @@ def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path
         (ValueError("x" * 9000), 1, " …; please report it"),
         (RecursionError("too deep"), 1, "internal error: RecursionError: too deep"),
         (MemoryError("Unable to allocate 233. GiB"), 1, "not enough memory (Unable to allocate 233. GiB); read less"),
-        (MemoryError(), 1, "not enough memory; read less at once"),
+        (MemoryError(), 1, "not enough memory; read less data"),
         (PermissionError(13, "Permission denied", "a.csv"), 1, "Permission denied: 'a.csv'"),
     ],
     ids=lambda value: type(value).__name__,

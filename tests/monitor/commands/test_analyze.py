@@ -184,5 +184,5 @@ def test_an_analysis_beyond_the_memory_is_one_line(recording: Path, monkeypatch:
         raise MemoryError
 
     monkeypatch.setattr(analyze, "analyze", fail)
-    with pytest.raises(ConfigError, match=r"x\.npz: the analysis needs more memory than is free; take the end alone"):
+    with pytest.raises(ConfigError, match=r"x\.npz: the analysis needs more memory than is free; use only the end"):
         run_analysis(Request(recording))

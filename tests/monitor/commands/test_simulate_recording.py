@@ -82,7 +82,7 @@ def test_it_is_the_models_own_series_to_the_last_bit(path: Path) -> None:
 
 def test_the_rate_goes_before_the_models_and_one_must_be_known(tmp_path: Path) -> None:
     assert run_simulation(Request(MODEL, tmp_path / "a.npz", 2.0, seed=1, rate_hz=200.0)).samples == 400
-    with pytest.raises(ConfigError, match="no sample_rate; give one with --rate HZ"):
+    with pytest.raises(ConfigError, match="no sample_rate; set the rate with --rate HZ"):
         run_simulation(Request(NoiseModel(MODEL.effects), tmp_path / "b.npz", 2.0, seed=1))
     assert not (tmp_path / "b.npz").exists()
 
@@ -169,7 +169,7 @@ def test_progress_rises_to_the_whole(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("model", "seconds", "words"),
     [
-        (NoiseModel(sample_rate_hz=100.0), 1.0, "m: names no axis"),
+        (NoiseModel(sample_rate_hz=100.0), 1.0, "m: the model has no axis"),
         (MODEL, 1e-9, "1e-09 s at 50 Hz: 0 samples is outside the supported range"),
         (
             NoiseModel.from_toml("[gz.sinusoidal]\namplitude = 1.0\nfrequency = 30.0\n"),

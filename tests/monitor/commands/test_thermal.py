@@ -65,15 +65,15 @@ def test_hardly_moved_is_no_answer_and_says_so(tmp_path, capsys):
     np.savez(path, fs=1.0, gz=1e-5 * rng.standard_normal(n), temp=25.0 + 0.01 * rng.standard_normal(n))
     out = tmp_path / "out.json"
     assert exit_status("thermal", "fit", path, "--json", out) == 3
-    assert "temperature hardly moved" in capsys.readouterr().err
-    assert "temperature hardly moved" in json.loads(out.read_bytes())["refused"]["gz"]
+    assert "temperature hardly changed" in capsys.readouterr().err
+    assert "temperature hardly changed" in json.loads(out.read_bytes())["refused"]["gz"]
 
 
 def test_no_temperature_is_said(tmp_path, capsys):
     path = tmp_path / "none.npz"
     np.savez(path, fs=1.0, gz=np.arange(100.0))
     assert exit_status("thermal", "fit", path) == 2
-    assert "no temperature in it" in capsys.readouterr().err
+    assert "there is no temperature" in capsys.readouterr().err
 
 
 def good(tmp_path):
@@ -85,9 +85,9 @@ def good(tmp_path):
     [
         (lambda m: m.update(schema="imu-monitor/thermal-model/9"), 'schema "imu-monitor/thermal-model/9"'),
         (lambda m: m.update(interval=0.0), "interval: 0 s"),
-        (lambda m: m["axes"].clear(), "no axis in it"),
+        (lambda m: m["axes"].clear(), "there is no axis in the file"),
         (lambda m: m["axes"].update(gq=m["axes"].pop("gz")), "axes.gq: no such axis"),
-        (lambda m: m["axes"]["gz"].update(sizes=[1.0]), "axes.gz: sizes: 1 of them"),
+        (lambda m: m["axes"]["gz"].update(sizes=[1.0]), "axes.gz: sizes: 1 values"),
         (lambda m: m["axes"]["gz"].update(time_constants=[-1.0]), "axes.gz: time_constants"),
         (lambda m: m["axes"]["gz"].update(temperature=[25.0, 25.0]), "axes.gz: temperature"),
         (lambda m: m["axes"]["gz"].update(phi=1.0), "axes.gz: phi: 1"),

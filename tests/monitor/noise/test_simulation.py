@@ -121,7 +121,11 @@ def test_what_cannot_be_added_is_said_and_changes_nothing():
     for axis, effect, says in (
         ("gq", Bias(value=1.0), 'unknown axis "gq"'),
         ("gz", Sinusoidal(amplitude=1.0, frequency=60.0), "gz.sinusoidal: frequency must be below 50 Hz"),
-        ("gz", SampleRateError(ratio=2.0), "gz.sample_rate_error: the clock of a stream that runs cannot change"),
+        (
+            "gz",
+            SampleRateError(ratio=2.0),
+            "gz.sample_rate_error: the sample rate error of a running stream cannot change",
+        ),
         ("gz", NoiseStep(time=1.0, ratio=2.0), "gz.noise_step: gz has no angle_random_walk"),
         ("gz", CrossAxis(source="gx", coefficient=2.0), "gz.cross_axis: the model has no effect on its source gx"),
         ("gz", TemperatureBias(coefficient=1.0, reference=2.0), "gz.temperature_bias: no temperature"),

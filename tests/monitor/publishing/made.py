@@ -111,7 +111,7 @@ def thermal_look(t_ns: int = 0, bias: float = 3e-4) -> ThermalIntervalResult:
         2e-5,
         "",
     )
-    az = PredictedAxisInterval(9.81, np.nan, None, None, "", np.nan, "temperature hardly moved")
+    az = PredictedAxisInterval(9.81, np.nan, None, None, "", np.nan, "temperature hardly changed")
     return ThermalIntervalResult(t_ns, 600.0, 25.5, {"gz": gz, "az": az})
 
 

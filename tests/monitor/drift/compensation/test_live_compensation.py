@@ -47,7 +47,7 @@ def test_noise_that_grows_is_an_event_with_its_times():
     one = events[0]
     assert 200.0 < one.t_ns / 1e9 < 350.0
     assert one.since_ns is not None
-    assert "times as large as they should be" in one.text
+    assert "times as large as expected" in one.text
     assert one.values["innovation"]["mean_square"] == pytest.approx(one.sigma**2)
 
 

@@ -113,7 +113,7 @@ def test_a_choice_is_made_in_pieces_and_holds_nothing_up():
     means = hourly(7, 2, 0.05)
     run = Run(slow=True).give(means.bias[:40], means.temperature_c[:40])
     assert run.following.choosing
-    assert run.looks[-1].text == "the model is being chosen"
+    assert run.looks[-1].text == "the model is being selected"
     pieces = 0
     while run.following.step():
         pieces += 1
@@ -152,7 +152,7 @@ def test_what_is_missing_is_passed_over():
 def test_temperature_that_hardly_moves_says_so():
     rng = np.random.default_rng(10)
     run = Run().give(1e-6 * rng.standard_normal(30), 25.0 + 0.01 * rng.standard_normal(30))
-    assert "temperature hardly moved" in run.looks[-1].text
+    assert "temperature hardly changed" in run.looks[-1].text
     assert run.looks[-1].one_step is None
 
 

@@ -147,10 +147,10 @@ def test_a_bias_that_temperature_does_not_move_is_a_constant():
     ("means", "says"),
     [
         (hourly(1, 1, 0.05).first_intervals(11), "11 intervals of 3600 s"),
-        (replace(hourly(1, 1, 0.05), temperature_c=np.full(72, 25.0)), "temperature hardly moved"),
+        (replace(hourly(1, 1, 0.05), temperature_c=np.full(72, 25.0)), "temperature hardly changed"),
         (
             replace(hourly(1, 1, 0.05), temperature_c=25.0 + 0.1 * np.random.default_rng(2).standard_normal(72)),
-            "temperature hardly moved",
+            "temperature hardly changed",
         ),
         (replace(hourly(1, 1, 0.05), bias=np.zeros(72)), "the same in all intervals"),
         (replace(hourly(1, 1, 0.05), bias=np.full(72, np.nan)), "0 intervals"),

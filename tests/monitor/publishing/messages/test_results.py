@@ -128,7 +128,7 @@ def test_thermal() -> None:
             "one_step": None,
             "model": None,
             "slope": None,
-            "text": "temperature hardly moved",
+            "text": "temperature hardly changed",
         },
     }
 
