@@ -231,7 +231,7 @@ def test_no_key_expression(keyexpr: str) -> None:
 
 
 def test_a_topic_that_is_not_shown() -> None:
-    with pytest.raises(ConfigError, match="nothing to show of it; shown are status, coefficients, event, alive"):
+    with pytest.raises(ConfigError, match="no topic to show; possible topics are status, coefficients, event, alive"):
         ZenohSubscriber("imu/a/samples")
 
 
