@@ -236,7 +236,7 @@ def test_a_topic_that_is_not_shown() -> None:
 
 
 def test_no_endpoint() -> None:
-    with pytest.raises(ConfigError, match='connect "localhost:7450": no endpoint'):
+    with pytest.raises(ConfigError, match='connect "localhost:7450": not a valid endpoint'):
         ZenohSubscriber("imu/**", ["tcp/127.0.0.1:1", "localhost:7450"])
 
 
