@@ -71,7 +71,7 @@ def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[Te
     known = noise.coefficients(kind, letter)
     if not known:
         raise missing_coefficient_error(
-            noise, f"kalibr needs {letter} ({COEFFICIENT_EFFECTS[letter].name}) above 0 on one {kind} axis at least"
+            noise, f"kalibr needs {letter} ({COEFFICIENT_EFFECTS[letter].name}) above 0 on the {kind} axes"
         )
     rank = {axis: (not term.bound, term.value) for axis, term in known.items()}
     axis = max(rank, key=lambda one: rank[one])
