@@ -1,4 +1,4 @@
-"""Output of ``analyze --json``: the estimate of a recording, with the optional curves that were computed."""
+"""Output of ``analyze --json``: coefficients and deviations of a recording."""
 
 from typing import Final, Self
 
@@ -43,7 +43,7 @@ class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
 
 
 class TemperatureDependenceValues(msgspec.Struct, frozen=True, rename={"interval_s": "interval"}):
-    """Measures of how strongly the bias of an axis depends on temperature."""
+    """Measures of the dependence of the bias of an axis on temperature."""
 
     share: float
     p_value: float
@@ -72,7 +72,7 @@ class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
 
 
 class AxisAnalysis(msgspec.Struct, frozen=True, kw_only=True):
-    """Results of one axis; curves that were not computed are absent."""
+    """Results of one axis. Deviations that were not computed are absent."""
 
     allan: AxisDeviations
     total: AxisDeviations | UnsetType = UNSET
@@ -84,7 +84,7 @@ class AxisAnalysis(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class MotionValues(msgspec.Struct, frozen=True):
-    """Detected motion; ``t`` is its start after the first sample [s]."""
+    """Detected motion. ``t`` is the time from the first sample to the start of the motion [s]."""
 
     kind: str
     axis: str
@@ -100,7 +100,7 @@ class MotionValues(msgspec.Struct, frozen=True):
 
 
 class ChangeValues(msgspec.Struct, frozen=True):
-    """Detected change; ``t`` is its start after the first sample [s]."""
+    """Detected change. ``t`` is the time from the first sample to the start of the change [s]."""
 
     kind: str
     axis: str
@@ -117,7 +117,7 @@ class ChangeValues(msgspec.Struct, frozen=True):
 
 
 class CoefficientSeries(msgspec.Struct, frozen=True, eq=False):
-    """Coefficient of one axis, one value for each time step."""
+    """Coefficient of one axis at each time step."""
 
     value: Floats
     lo: Floats
@@ -149,7 +149,7 @@ class DynamicAxis(msgspec.Struct, frozen=True, eq=False):
 
 
 class DynamicValues(msgspec.Struct, frozen=True, eq=False):
-    """Dynamic Allan deviations; ``t`` is the end of each window after the first sample [s]."""
+    """Dynamic Allan deviations. ``t`` is the time from the first sample to the end of each window [s]."""
 
     window: float
     t: Floats
@@ -233,7 +233,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
 
 
 class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag=SCHEMA):
-    """Output of ``analyze --json`` if the data do not support an estimate; ``notes`` holds the reason."""
+    """Output of ``analyze --json`` if no estimate is possible. ``notes`` contains the reason."""
 
     samples: int
     notes: list[str]
@@ -247,7 +247,7 @@ class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag
 def _temperature_values(
     result: Analysis, temperature: TemperatureRemoval | None, axis: str
 ) -> TemperatureDependenceValues | UnsetType:
-    """Return the dependence of an axis on temperature, if temperature explains most of its slow variance."""
+    """Return the measures of an axis if temperature explains most of its slow variance."""
     if temperature is None or axis not in result.axes_of_temperature:
         return UNSET
     return TemperatureDependenceValues(**shared_fields(TemperatureDependenceValues, temperature.dependences[axis]))

@@ -1,9 +1,9 @@
 """Past results: the reply to ``imu/<device>/history`` and the output of ``history --json``.
 
 All lists are indexed by bucket. For each number, ``value`` is the last value of its bucket, and ``low`` and ``high``
-are the extremes. A coefficient also has the interval of its last value and its status. The status is ``upper_bound``
-if the value was bounded and never estimated within the bucket. Stored values have seven digits. Nine are written, so
-that the decoded float32 values equal the stored ones exactly.
+are the extremes. A coefficient also has a status and the interval of its last value. The status is ``upper_bound`` if
+the coefficient was bounded but never estimated within the bucket. Numbers are written with nine digits, so that the
+decoded float32 values equal the stored values exactly.
 """
 
 from typing import Any, Final, Literal, Self
@@ -27,13 +27,12 @@ from monitor.publishing.messages.message import Message, decode_message, remove_
 MAX_BUCKETS: Final = 1_000_000
 """Largest number of buckets accepted in a message."""
 MAX_HISTORY_BYTES: Final = 1 << 30
-"""Largest accepted payload."""
 STATUS_COLUMNS: Final = (*HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
 _STATUS_NAMES: Final = {status.value: status.name.lower() for status in Status}
 
 
 class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Number over time: last value, minimum and maximum of each bucket."""
+    """Last value, minimum and maximum of a number in each bucket."""
 
     value: Floats
     low: Floats
@@ -51,7 +50,7 @@ class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
-    """Coefficient of one axis over time, with interval, count and status."""
+    """Coefficient of one axis over time, with intervals, numbers of estimates and statuses."""
 
     lo: Floats
     hi: Floats
@@ -60,7 +59,7 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
 
     @classmethod
     def coefficient_from_history(cls, past: HistoryTable, value_column: str) -> Self:
-        """Return the history of a coefficient, given the name of its column, such as gz.N."""
+        """Return the history of a coefficient, given the column of its value, such as gz.N."""
         value, bound = past.column(value_column), past.column(f"{value_column}.bound")
         lo, hi = (past.column(f"{value_column}.{end}") for end in ("lo", "hi"))
         estimated, bounded = value.n > 0, bound.n > 0
@@ -132,7 +131,7 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """State and counters of the device over time."""
+    """State and sample counters of the device over time."""
 
     state: list[Literal["ended", "running", "waiting", "lost"]]
     received: Ints
@@ -165,7 +164,10 @@ class PastEvent(
     kw_only=True,
     rename={"t_s": "t", "since_s": "since", "represented_events": "stands_for"},
 ):
-    """Stored event of the device; ``stands_for`` counts the event and the deleted earlier ones of its kind."""
+    """Stored event of the device.
+
+    ``stands_for`` is the number of events that the entry represents, because older events of the same kind are deleted.
+    """
 
     t_s: float
     kind: str
@@ -197,7 +199,7 @@ class PastEvent(
 
 
 class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.schema()):
-    """Message ``imu/<device>/history``; parts that were not requested are absent."""
+    """Message ``imu/<device>/history``. Parts that were not requested are absent."""
 
     topic = topics.HISTORY
     from_: float = msgspec.field(name="from")
@@ -262,7 +264,7 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
         """
         buckets = self.start.size
         if self.width.shape != (buckets,) or buckets > MAX_BUCKETS:
-            raise ValueError("not the reply of a history")
+            raise ValueError(f"the lists do not have one length of at most {MAX_BUCKETS:,} buckets")
         columns: dict[str, ColumnStatistics] = {}
         for axis, coefficients in (self.axes or {}).items():
             for symbol, one in coefficients.items():
@@ -275,7 +277,7 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
             columns |= self.status.status_columns(buckets)
             counts = np.column_stack([_checked(getattr(self.status, name), (buckets,)) for name in COUNTS])
             state = _checked(np.array([STATES.index(one) for one in self.status.state], np.int64), (buckets,))
-        with np.errstate(over="ignore"):  # a value beyond the range of float32, which no sensor produces, is infinite
+        with np.errstate(over="ignore"):  # a value beyond the range of float32 becomes infinite
             low, high, last = (
                 np.array([getattr(one, part) for one in columns.values()]).reshape(-1, buckets).T.astype(np.float32)
                 for part in ("low", "high", "last")
@@ -310,17 +312,17 @@ def decode_history(payload: bytes) -> HistoryTable:
 
 
 def _column_without_extremes(last: Floats) -> ColumnStatistics:
-    """Return a column whose extremes equal its last values."""
+    """Return a column for which only last values are stored; they also serve as extremes."""
     return ColumnStatistics((~np.isnan(last)).astype(np.int64), last, last, last)
 
 
 def _nine_digits(column: Floats) -> Floats:
-    """Return values rounded to nine digits, which represent every float32 exactly."""
+    """Return values rounded to nine digits, which identify every float32."""
     return np.array([float(f"{one:.9g}") for one in column.tolist()])
 
 
 def _checked(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return an array of the expected shape; any empty array stands for one without buckets."""
+    """Return the array in the expected shape. An empty array is accepted if there are no buckets."""
     if array.shape != shape and (array.size or 0 not in shape):
         raise ValueError("lists of different lengths")
     return array.reshape(shape)

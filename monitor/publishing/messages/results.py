@@ -26,13 +26,13 @@ from monitor.publishing.messages.message import Count, Message, decode_message, 
 MAX_AVERAGING_TIMES: Final = 1000
 """Largest accepted number of averaging times."""
 MAX_TEXT_LENGTH: Final = 400
-"""Length to which received texts are cut, so that no device can exhaust the memory of the receiver."""
+"""Length to which received texts are cut, because a device must not exhaust the memory of the receiver."""
 MAX_OUTPUTS: Final = 16
 STATUSES: Final = {status.name.lower(): status for status in Status}
 
 
 class SlowStatistics(NamedTuple):
-    """Statistics of the window that are computed step by step."""
+    """Total and Hadamard deviations of the window, which are computed in small steps."""
 
     total: TotalCurve
     hadamard: HadamardCurve
@@ -47,7 +47,7 @@ class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
 
 
 class AllanAxis(DeviationCurve, frozen=True):
-    """Allan deviations of one axis; ``recent`` covers a shorter time, max(10 s, 16 τ) at each τ."""
+    """Allan deviations of one axis. ``recent`` uses only the last max(10 s, 16 τ) at each averaging time τ."""
 
     recent: DeviationCurve | UnsetType = UNSET
 
@@ -60,7 +60,7 @@ class CoefficientValue(msgspec.Struct, frozen=True):
     hi: float | None = None
     status: str = ""
     other: str | UnsetType | None = msgspec.field(name="or", default=UNSET)
-    """The other symbol of K and R, if the data do not show which of the two is present."""
+    """K for R, and R for K, if the data do not show which of the two is present."""
 
 
 class WindowResultMessage(
@@ -69,7 +69,7 @@ class WindowResultMessage(
     kw_only=True,
     rename={"rate_hz": "rate", "window_s": "window", "filled_s": "filled", "tau_s": "tau"},
 ):
-    """Message with results of the window."""
+    """Base class of messages with results of the window."""
 
     rate_hz: float | None = None
     window_s: float | None = None
@@ -100,7 +100,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
         return cls(device=device, t=t, filled_s=filled_s, tau_s=result.curve.tau_s, axes=axes, **shared)
 
     def to_estimate(self, coefficients: Coefficients, k_or_r: frozenset[str]) -> Estimate:
-        """Build an estimate. Degrees of freedom and numbers of terms are not part of the message and are unknown.
+        """Build an estimate. Its degrees of freedom and numbers of terms are unknown, because the message lacks them.
 
         Parameters
         ----------
@@ -112,13 +112,13 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
         Raises
         ------
         ValueError
-            If the averaging times do not increase from above zero, or if a curve has another length.
+            If the averaging times are not positive and increasing, or if a list has another length.
         """
         tau_s, m = self.tau_s, self.tau_s.size
         rate_hz, window_s, filled_s = self.rate_hz or 0.0, self.window_s or 0.0, self.filled_s or 0.0
         rising = tau_s.ndim == 1 and bool(np.all(tau_s > 0.0) and np.all(np.diff(tau_s) > 0.0))
         if not 0 < m <= MAX_AVERAGING_TIMES or not rising or not rate_hz > 0.0 or self.t is None:
-            raise ValueError("the averaging times must increase from above zero")
+            raise ValueError("the averaging times must be positive and increasing")
         deviation, lo, hi = (np.full((m, len(AXES)), np.nan) for _ in range(3))
         for i, axis in enumerate(AXES):
             if curve := self.axes.get(axis):
@@ -186,7 +186,7 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Comparison of one axis with its model."""
 
     agrees: bool | None = None
-    """Current decision, with hysteresis: it changes later than ``gap`` crosses ``threshold``. None: not decided yet."""
+    """Decision with hysteresis. It changes later than ``gap`` crosses ``threshold``. None before the first decision."""
     gap: float
     where: TauRange
     ratio: float | None = None
@@ -198,7 +198,7 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 
 class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
-    """Message ``imu/<device>/gap``: comparison of the measured deviations with the model in force."""
+    """Message ``imu/<device>/gap``: comparison of the measured Allan deviations with the noise model of the device."""
 
     topic = topics.GAP
     tau_s: Floats | None = None
@@ -231,7 +231,7 @@ class PredictedBias(msgspec.Struct, frozen=True):
 
 
 class AxisThermalValues(msgspec.Struct, frozen=True):
-    """Mean bias of one axis in an interval, and its predictions; ``text`` says why there is none."""
+    """Mean bias of one axis in an interval, and its predictions. ``text`` states why a prediction is missing."""
 
     bias: float | None
     error: float | None
@@ -251,7 +251,7 @@ class ThermalMessage(
     tag=topics.THERMAL.schema(),
     rename={"interval_s": "interval", "temperature_c": "temperature"},
 ):
-    """Message ``imu/<device>/thermal``: mean biases of an interval, which ends at ``t``, and their predictions."""
+    """Message ``imu/<device>/thermal``: mean biases of the interval that ends at ``t``, and their predictions."""
 
     topic = topics.THERMAL
     interval_s: float
@@ -284,7 +284,7 @@ class DeviationTable(msgspec.Struct, frozen=True, eq=False):
 
     @classmethod
     def of(cls, curve: TotalCurve | HadamardCurve) -> Self:
-        """Return the deviations of the axes that have at least one."""
+        """Return the deviations of all axes that have at least one deviation."""
         curves = {axis: DeviationCurve(*deviations_with_interval_ends(curve, i)) for i, axis in enumerate(AXES)}
         return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
 
@@ -310,7 +310,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
     kind: str
     axis: str | None = None
     what: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
-    """Values by coefficient, for example before and after a change."""
+    """Values by coefficient, such as the values before and after a change."""
     since: float | None = None
     """Unix time at which the reported condition began [s]."""
     sigma: float | None = None
@@ -333,7 +333,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode a message of another process; its texts are cleaned.
+        """Decode a message of another process. Control characters are removed from all texts.
 
         Raises
         ------
@@ -342,11 +342,11 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
         """
         found = decode_message(cls, payload)
         if found.t is None:
-            raise ValueError("an event without a time")
+            raise ValueError("the event has no time")
         return msgspec.structs.replace(found, kind=_clean(found.kind), text=_clean(found.text))
 
     def to_event(self) -> Event:
-        """Build an event with the changed coefficients, which are marked in plots."""
+        """Build an event with the changed coefficients."""
         values: dict[str, dict[str, float]] = {
             symbol: {side: value for side, value in self.what[symbol].items() if isinstance(value, float | int)}
             for symbol in SYMBOLS
@@ -402,7 +402,7 @@ class StatusMessage(
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode a message of another process; its texts are cleaned.
+        """Decode a message of another process. Control characters are removed from all texts.
 
         Raises
         ------
@@ -423,7 +423,7 @@ class StatusMessage(
 
 
 class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
-    """Reply to ``imu/<device>/command/reset``; the result is a text for the user."""
+    """Reply to ``imu/<device>/command/reset`` with a text for the user."""
 
     topic = topics.RESET
     text: str
@@ -435,7 +435,7 @@ class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
 
 
 class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
-    """Head of the reply to ``imu/<device>/command/reconcile``; the keys of the report follow."""
+    """First keys of the reply to ``imu/<device>/command/reconcile``. The keys of the report follow."""
 
     topic = topics.RECONCILE
 
@@ -449,7 +449,7 @@ class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.sc
         status
             Exit status of the command.
         folder
-            Folder that contains the complete report; None if the report was not saved.
+            Folder that contains the complete report. None if the report was not saved.
         """
         head = msgspec.to_builtins(self)
         keys = {key: value for key, value in report.items() if key not in head}
@@ -497,7 +497,7 @@ def event_start_s(unix_s: float, event: Event) -> float | None:
 
 
 def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -> Floats:
-    """Return the Allan variance of the estimated terms, shape [m, 6]; NaN on axes without estimated terms.
+    """Return the Allan variance of the estimated terms, shape [m, 6]. It is NaN on axes without estimated terms.
 
     Parameters
     ----------
@@ -537,7 +537,7 @@ def deviations_with_interval_ends(
 
 
 def measured_axes(curve: AllanCurve) -> list[tuple[int, str]]:
-    """Return the column and name of each axis that has a curve."""
+    """Return the column and name of each axis with Allan variances."""
     return [(i, axis) for i, axis in enumerate(AXES) if not np.isnan(curve.avar[:, i]).all()]
 
 

@@ -1,7 +1,7 @@
-"""Query of the histories of other daemons over zenoh, as ``imu-monitor history --connect`` does.
+"""Client that queries other daemons for their stored histories over zenoh, for ``imu-monitor history --connect``.
 
-Each query uses a session of its own: a client that connects only to the given endpoint. Replies that are not history
-messages are ignored. If there is no valid reply, the reason is raised as an error.
+Each query opens a separate session that connects only to the given endpoint. Replies that are not history messages are
+ignored. If there is no valid reply, the reason is raised as an error.
 """
 
 import json
@@ -21,7 +21,7 @@ from monitor.publishing.zenoh.subscriber import client_configurations
 PATIENCE_S: Final = 20.0
 """Timeout of the query."""
 ERRORS: Final = {2: ConfigError, 3: NotReady}
-"""Exception by the exit status in an error reply."""
+"""Exception for each exit status in an error reply."""
 
 
 def query_histories(
@@ -32,7 +32,7 @@ def query_histories(
     Parameters
     ----------
     endpoint
-        Endpoint of a daemon or router. None: the first endpoint in the file, or the default.
+        Endpoint of a daemon or router. By default, the first endpoint in the file, or else the default endpoint.
     device
         Name of the device; ``*`` for all devices.
     parameters
@@ -63,15 +63,19 @@ def query_histories(
             explain_refusals([endpoint], config) or f"{mask_secrets(endpoint)}: {format_zenoh_error(error)}"
         ) from error
     endpoint = mask_secrets(endpoint)
-    found, wrong = [], [_error_of_reply(reply.err) for reply in replies if reply.ok is None]
+    found, errors = [], [_error_of_reply(reply.err) for reply in replies if reply.ok is None]
     for reply in replies:
         if reply.ok is not None:
             try:
                 found.append(decode_history(bytes(reply.ok.payload)))
             except ValueError as error:
-                wrong.append(LinkUnavailable(f"{reply.ok.key_expr}: not an answer of a history: {error}"))
+                errors.append(LinkUnavailable(f"{reply.ok.key_expr}: not a history message: {error}"))
     if not found:
-        raise wrong[0] if wrong else LinkUnavailable(f"{endpoint}: nobody answers for {device}; is history kept there?")
+        raise (
+            errors[0]
+            if errors
+            else LinkUnavailable(f"{endpoint}: no answer for {device}; check that the daemon stores a history")
+        )
     return sorted(found, key=lambda one: one.device)
 
 
@@ -81,5 +85,5 @@ def _error_of_reply(error: Any) -> Exception:
         reply = json.loads(bytes(error.payload))
         text, status = remove_control_characters(str(reply["error"])[:500]), reply.get("exit")
     except (ValueError, KeyError, TypeError, AttributeError):
-        return LinkUnavailable("the daemon gave no answer, and no reason that can be read")
+        return LinkUnavailable("the daemon sent an error without a readable reason")
     return ERRORS.get(status, LinkUnavailable)(text)

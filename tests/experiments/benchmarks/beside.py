@@ -112,7 +112,7 @@ def panel(axes: "Axes", recorded: Side, simulated: Side, kind: Kind) -> None:
     shown = []
     for number, (axis, colour) in enumerate(zip(axes_of(kind), COLOURS, strict=True)):
         for side, style in (
-            (recorded, {"linestyle": "", "marker": MARKERS[number], "mec": "white", "mew": 0.4, "label": axis}),
+            (recorded, {"linestyle": "", "marker": MARKERS[number], "mfc": "none", "mew": 1.1, "label": axis}),
             (simulated, {"linestyle": FIT_DASHES[number], "linewidth": 1.8}),
         ):
             tau_s, deviation, lo, hi = curve(side, axis)

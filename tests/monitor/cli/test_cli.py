@@ -339,7 +339,10 @@ WRONG_ARGUMENTS = {
     "bad viewer": (("demo", "--viewer", "nativ"), '--viewer: "nativ"; possible are native, auto, '),
     "bad seconds": (("demo", "--seconds", "soon"), "Invalid value for '--seconds'"),
     "no seconds": (("demo", "--seconds", "0"), "--seconds: 0 s is outside the supported range"),
-    "bad endpoint": (("watch", "--connect", "7450"), 'connect "7450": no endpoint; write e.g. tcp/127.0.0.1:7450'),
+    "bad endpoint": (
+        ("watch", "--connect", "7450"),
+        'connect "7450": not a valid endpoint; an example is tcp/127.0.0.1:7450',
+    ),
     "bad key": (("watch", "##", "--connect", "tcp/127.0.0.1:9"), 'key expression "##"'),
     "bad rate": (("analyze", "x.csv", "--rate", "-1"), "--rate: -1 Hz is outside the supported range"),
     "no rate": (("analyze", "x.csv", "--rate", "nan"), "--rate"),

@@ -129,7 +129,7 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
         page = (tmp_path / "x.html").read_text("utf-8")
         assert "gy †" in page
         assert "gx †" not in page
-        assert "† its slow part is temperature" in page
+        assert "† slow variance due to temperature" in page
 
 
 @pytest.mark.long
