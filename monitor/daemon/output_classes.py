@@ -1,7 +1,7 @@
-"""Outputs of the daemon: zenoh messages, viewer, history file, log lines and the table in the terminal. None blocks.
+"""Classes of the outputs of the daemon: zenoh messages, viewer, log lines, and the table in the terminal.
 
-The parameters of all methods are described in ``monitor.daemon.output.Output``. The messages and drawings of each kind
-of result are listed in ``monitor.publishing.result_kinds``.
+``monitor.daemon.output.Output`` describes the parameters of the methods. ``monitor.publishing.result_kinds`` lists the
+messages and drawings of each kind of result.
 """
 
 from collections.abc import Callable
@@ -16,16 +16,12 @@ from monitor.common.health import Health
 from monitor.daemon.output import Output
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.history.minute_aggregation import MinuteAggregator
-from monitor.history.stored_events import StoredEvent
-from monitor.history.writer import HistoryWriter
 from monitor.publishing.messages.message import Message
 from monitor.publishing.messages.results import (
     CoefficientsMessage,
     EventMessage,
     GapMessage,
     StatusMessage,
-    event_start_s,
 )
 from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.result_kinds import CompensatedRows, SampleRows, kind_of
@@ -46,30 +42,30 @@ class ZenohOutput(Output):
         self._zenoh = zenoh
 
     def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
-        """Publish a block as one msgpack batch."""
+        """Publish a block of samples as one msgpack message."""
         self._zenoh.put(topics.SAMPLES, device, encode_samples(device, received, samples, offset_ns))
 
     def publish_compensated_samples(
         self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int
     ) -> None:
-        """Publish a block of compensated samples as one msgpack batch."""
+        """Publish a block of compensated samples as one msgpack message."""
         schema = topics.COMPENSATED.schema()
         self._zenoh.put(topics.COMPENSATED, device, encode_samples(device, received, samples, offset_ns, schema))
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        """Publish the messages of a result."""
-        self._publish(device, unix_s, received, result)
+        """Publish a result as JSON messages."""
+        self._publish_messages(device, unix_s, received, result)
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Publish an event."""
-        self._publish(device, unix_s, received, event)
+        """Publish an event as a JSON message."""
+        self._publish_messages(device, unix_s, received, event)
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Publish the status."""
-        self._publish(device, unix_s, health.received, health)
+        """Publish the status as a JSON message."""
+        self._publish_messages(device, unix_s, health.received, health)
 
-    def _publish(self, device: str, unix_s: float | None, received: int, result: Any) -> None:
-        """Publish the messages of a result."""
+    def _publish_messages(self, device: str, unix_s: float | None, received: int, result: Any) -> None:
+        """Publish the messages that belong to the kind of a result."""
         for message in kind_of(result).messages:
             self._zenoh.put(message.topic, device, message.of(device, unix_s, received, result).encode())
 
@@ -81,83 +77,29 @@ class ViewerOutput(Output):
         self._view = view
 
     def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
-        """Show samples."""
+        """Show the measured samples."""
         unix_s = (samples.t_ns + offset_ns) / 1e9
         self._view.put(device, float(unix_s[-1]), SampleRows(unix_s, samples.values, samples.temperature_c))
 
     def publish_compensated_samples(
         self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int
     ) -> None:
-        """Show compensated rates together with the measured rates."""
+        """Show the compensated angular rates together with the measured rates."""
         unix_s = (samples.t_ns + offset_ns) / 1e9
         self._view.put(device, float(unix_s[-1]), CompensatedRows(unix_s, samples.values[:, :3]))
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        """Show a result in the panels of its kind."""
+        """Show a result in the panels that draw this kind of result."""
         self._view.put(device, unix_s, result)
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Show an event as one line of the log."""
+        """Show an event as one line of the event log."""
         self._view.put(device, unix_s, event)
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Show the status, once the time of the first sample is known, because the viewer has a single time axis."""
         if unix_s is not None:
             self._view.put(device, unix_s, health)
-
-
-class HistoryOutput(Output):
-    """Output that aggregates the results by the minute, and passes them with the events to the history file.
-
-    Parameters
-    ----------
-    writer : HistoryWriter
-        Writer of the history file.
-    """
-
-    def __init__(self, writer: HistoryWriter) -> None:
-        self.received: dict[str, int] = {}  # number of samples of each device since the start
-        self._writer = writer
-        self._minutes: dict[str, MinuteAggregator] = {}
-
-    def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
-        """Aggregate the temperature of the samples."""
-        unix_s = float((samples.t_ns + offset_ns)[-1]) / 1e9
-        self._writer.put_row(device, self._minutes_of(device).add_temperature(unix_s, samples.temperature_c))
-
-    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        """Aggregate the coefficients of an estimate, and its deviations on a coarse grid."""
-        if isinstance(result, Estimate):
-            self._writer.put_row(device, self._minutes_of(device).add_estimate(unix_s, result))
-
-    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Store an event."""
-        # SQLite does not accept NumPy scalars, so they are converted to plain numbers
-        what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.values.items()}
-        sigma, since_s = None if event.sigma is None else float(event.sigma), event_start_s(unix_s, event)
-        self._writer.put_event(device, StoredEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma))
-
-    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Aggregate counts and state, once the time of the first sample is known."""
-        self.received[device] = health.received
-        if unix_s is not None:
-            self._writer.put_row(device, self._minutes_of(device).add_health(unix_s, health))
-
-    def remove_device(self, device: str) -> None:
-        """Store the last minute of a device that was removed."""
-        self.received.pop(device, None)
-        minutes = self._minutes.pop(device, None)
-        if minutes is not None:
-            self._writer.put_row(device, minutes.flush())
-
-    def store_incomplete_minutes(self) -> None:
-        """Store the present, incomplete minutes of all devices."""
-        for device, minutes in self._minutes.items():
-            self._writer.put_row(device, minutes.flush())
-
-    def _minutes_of(self, device: str) -> MinuteAggregator:
-        """Return the aggregation of a device."""
-        return self._minutes.setdefault(device, MinuteAggregator())
 
 
 class LogOutput(Output):
@@ -167,11 +109,11 @@ class LogOutput(Output):
         self._last_status: dict[str, tuple[str, str]] = {}
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Write one line for an event."""
+        """Write one log line for an event."""
         _log.info(event.kind, device=device, axis=event.axis, text=event.text)
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Write a line if the state or its message has changed."""
+        """Write a log line if the state of the device or the status message has changed."""
         now = (health.state, health.text)
         if self._last_status.get(device) != now:
             self._last_status[device] = now
@@ -179,19 +121,19 @@ class LogOutput(Output):
             write("status", device=device, state=health.state, text=health.text, received=health.received)
 
     def remove_device(self, device: str) -> None:
-        """Forget the state of a removed device, so that it is logged if the device is added again."""
+        """Forget the state of a removed device, so that a new device with the same name is logged again."""
         self._last_status.pop(device, None)
 
 
 class TableOutput(Output):
-    """Output for the table in the terminal. ``watch`` shows the same table for other processes.
+    """Output for the table in the terminal.
 
     Parameters
     ----------
     states : DeviceStates
         Content of the table.
     redraw : callable, optional
-        Called once a second for each device; asks another thread to draw the table.
+        Asks another thread to draw the table. Called once a second for each device.
     """
 
     def __init__(self, states: DeviceStates, redraw: Callable[[], None] | None = None) -> None:
@@ -200,11 +142,11 @@ class TableOutput(Output):
         self._newest: dict[str, dict[type[Message], tuple[float, int, Any]]] = {}  # results since the last status
 
     def set_viewer_url(self, url: str) -> None:
-        """Set the line above the table, which shows the address of the viewer's web page; "" removes it."""
+        """Show the address of the viewer's web page above the table; "" removes the line."""
         self.states.note = f"viewer: {url}" if url else ""
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        """Keep the newest estimate and the newest comparison with the model until the next status."""
+        """Keep the newest estimate and the newest comparison with the noise model until the next status."""
         if isinstance(result, Estimate | ModelGap):
             message: type[Message] = CoefficientsMessage if isinstance(result, Estimate) else GapMessage
             self._newest.setdefault(device, {})[message] = (unix_s, received, result)
@@ -214,7 +156,7 @@ class TableOutput(Output):
         self._process(EventMessage.of(device, unix_s, received, event))
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Update the row of a device."""
+        """Update the row of a device in the table."""
         self._process(StatusMessage.of(device, unix_s, health.received, health))
         for message, newest in self._newest.pop(device, {}).items():
             self._process(message.of(device, *newest))
@@ -222,7 +164,7 @@ class TableOutput(Output):
             self._redraw()
 
     def remove_device(self, device: str) -> None:
-        """Remove the row of a device."""
+        """Remove the row of a device from the table."""
         self._newest.pop(device, None)
         self.states.remove(topics.STATUS.key(PREFIX, device))
 

@@ -1,4 +1,4 @@
-"""Simulated IMU that sends a real wire format over a real link: noise model, encoder, faults and link endpoint."""
+"""Simulated IMU that sends a real wire format over a real link, with a noise model and with faults."""
 
 from monitor.simulator.scheduled_effect_parser import parse_effects
 from monitor.simulator.sensor import AMBIENT_C, DEFAULT_RATE_HZ, WARM_UP_C, WARM_UP_S, SimulatedSensor

@@ -16,14 +16,14 @@ EXAMPLE: Final = "gz.sinusoidal:amplitude=1e-3,frequency=17"
 
 
 def parse_effects(text: str) -> list[tuple[str, Effect]]:
-    """Parse an effect, and return it with its axis, or with each axis of a kind (``g*``).
+    """Parse an effect; return one pair of axis and effect for each axis that the text selects (``gz``, ``g*``).
 
-    The effect is read like a table of a model file, so that mistakes give the same messages.
+    The effect is read as a table of a model file, so that mistakes give the same messages.
 
     Raises
     ------
     ConfigError
-        The text is not a valid effect. The message of one line names the nearest known name.
+        If the text is not a valid effect. For an unknown name, the message suggests the most similar known name.
 
     Examples
     --------

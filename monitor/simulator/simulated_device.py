@@ -1,8 +1,7 @@
-"""Virtual IMU: a simulated sensor that sends its samples over a real link, in real time or faster, with faults.
+"""Simulated device: sends the samples of a simulated sensor over a real link, in real time or faster, with faults.
 
-An ordinary link reads the other end of ``port``, as for a real sensor. The sensor does not wait for its reader. Samples
-that cannot be sent are dropped, and the counter shows the gap. ``unplug`` and ``plug`` disconnect and connect the
-cable. ``fault_counts`` counts the samples and their faults.
+An ordinary link reads the samples, as for a real sensor. The device does not wait for the reader. Samples that cannot
+be sent are dropped, and the counter of the sensor shows the gap.
 """
 
 import threading
@@ -45,20 +44,20 @@ class SimulatedDevice:
     Raises
     ------
     ConfigError
-        The model or an effect cannot be used.
+        If the noise model or an effect cannot be used.
     """
 
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str = "virtual") -> None:
         self.name = name
-        self.fault_counts = FaultCounts()
+        self.fault_counts = FaultCounts()  # number of samples with each fault
         self.now_s: Callable[[], float] = time.monotonic
-        """Clock of the simulation, in seconds. It may be replaced before ``start``."""
+        """Clock of the simulation, in seconds. Tests may replace the clock before ``start``."""
         self._sensor = SimulatedSensor(table, decoder, name)
         self.rate_hz = self._sensor.rate_hz * table.speed
         """Nominal sample rate. The clock of the sensor may deviate from it."""
         self._pace_hz = self.rate_hz * table.faults.clock
         self._faults = Faults(table.faults, table.seed, decoder.carrier)
-        self._unplugged_samples = max(1, round(table.faults.unplugged_for * self._sensor.rate_hz))  # samples
+        self._unplugged_samples = max(1, round(table.faults.unplugged_for * self._sensor.rate_hz))
         self._back_at: int | None = None  # number of the sample before which the cable is connected again
         self.port = create_port(decoder.carrier, table.silence)
         self._stop = threading.Event()
@@ -70,12 +69,12 @@ class SimulatedDevice:
         return self.port.link
 
     def start(self) -> None:
-        """Connect the cable and start to send."""
+        """Connect the cable and start to send samples."""
         self.plug()
         self._thread.start()
 
     def stop(self) -> None:
-        """Stop sending and remove the port."""
+        """Stop to send samples, and remove the port."""
         self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
@@ -95,11 +94,11 @@ class SimulatedDevice:
         """Send samples in bursts until the sensor is stopped."""
         self._sensor.start_clock()
         begun_s, made = self.now_s(), 0
-        step_s = max(BURST_S, 0.5 / self._pace_hz)  # for a slow sensor, two steps per sample are enough
+        step_s = max(BURST_S, 0.5 / self._pace_hz)  # a sensor with a low rate needs two steps per sample
         while not self._stop.wait(step_s + self._burst_delay_s()):
             due = int((self.now_s() - begun_s) * self._pace_hz)
             late = due - made - int(MAX_DELAY_S * self._pace_hz)
-            if late > 0:  # the machine was suspended while the sensor would have continued
+            if late > 0:  # a real sensor would have continued while the machine was suspended
                 made += late
                 self._sensor.skip_samples(late)
                 self._faults.draw_faults(late)
@@ -127,15 +126,15 @@ class SimulatedDevice:
             at = stop
 
     def _send(self, frames: list[list[Chunk]], draws: DrawnFaults) -> None:
-        """Apply the faults to samples, send them and count the results."""
-        hurt = [
+        """Apply the faults to samples, send the samples, and count the faults."""
+        faulty = [
             (kind, self._faults.apply_fault(kind, where, chunks))
             for kind, where, chunks in zip(draws.kind_per_sample(), draws.where.tolist(), frames, strict=True)
         ]
-        gone = self.port.send_chunks([chunk for _, chunks in hurt for chunk in chunks])
-        for kind, chunks in hurt:
-            gone -= len(chunks)
-            self.fault_counts.count_sample(kind, all_sent=gone >= 0)
+        sent = self.port.send_chunks([chunk for _, chunks in faulty for chunk in chunks])
+        for kind, chunks in faulty:
+            sent -= len(chunks)
+            self.fault_counts.count_sample(kind, all_sent=sent >= 0)
 
     def _unplug_by_fault(self, index: int) -> None:
         """Disconnect the cable because of a fault."""
@@ -149,7 +148,9 @@ class SimulatedDevice:
         try:
             self.plug()
         except LinkUnavailable as error:
-            _log.warning("the simulated sensor cannot be plugged in again", device=self.name, error=str(error))
+            _log.warning(
+                "the cable of the simulated sensor cannot be connected again", device=self.name, error=str(error)
+            )
 
     def _burst_delay_s(self) -> float:
         """Return the delay of the next burst, in seconds."""

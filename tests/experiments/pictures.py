@@ -255,7 +255,8 @@ def fleet(out: Path, folder: Path) -> Path:
     """Show the overview of three devices."""
     path = out / "viewer-fleet.png"
     with window() as (port, shoot), serving(folder, FLEET, port) as service:
-        tail, wing = service.virtual["tail"], service.virtual["wing"]
+        simulated = {worker.name: worker.simulated for worker in service.workers}
+        tail, wing = simulated["tail"], simulated["wing"]
         wait_until(lambda: all(station.publisher.latest is not None for station in service.workers), 120.0)
         begun_s = time.monotonic()
         for at_s, act in (
@@ -299,8 +300,8 @@ def view(out: Path, folder: Path) -> Path:
                 lambda: all(station.publisher.latest is not None for one in daemons for station in one.workers), 120.0
             )
             time.sleep(PULLED_AGAIN_S)
-            daemons[0].virtual[MEMBERS[3]].unplug()
-            daemons[1].virtual[MEMBERS[4]].unplug()
+            daemons[0].workers[1].simulated.unplug()  # MEMBERS[3]
+            daemons[1].workers[1].simulated.unplug()  # MEMBERS[4]
             daemons[2].request_stop()
             time.sleep(SETTLE_S)
             shoot(path)

@@ -39,7 +39,7 @@ mode = "none"
 
 def pull_and_put_back(run: Running) -> None:
     """A few samples are sent into the air, and some come after it."""
-    imu, station = run.service.virtual["loose"], run.station("loose")
+    imu, station = run.station("loose").simulated, run.station("loose")
     imu.unplug()
     wait_for(lambda: station.driver.state == "lost", "the loss")
     before = imu.fault_counts.dropped
@@ -97,4 +97,4 @@ def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: p
     loose, firm = (run.station(name).driver.counts for name in ("loose", "firm"))
     assert loose.lost >= 3 * (WARM_UP + CYCLES)
     # the simulated sensor drops what a reader does not fetch in time on a loaded machine; nothing else may be missing
-    assert firm.lost + firm.bad <= run.service.virtual["firm"].fault_counts.dropped
+    assert firm.lost + firm.bad <= run.station("firm").simulated.fault_counts.dropped

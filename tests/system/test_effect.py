@@ -43,7 +43,7 @@ def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
     caught = Watching()
     caught.service = service
     service.outputs.append(caught)
-    follow_reader(service.virtual["demo"], service.workers[0].driver)
+    follow_reader(service.workers[0].simulated, service.workers[0].driver)
     with capture_logs() as lines:
         service.run(PATIENCE_S)
     added = [line for line in lines if line["event"] == "effect added"]

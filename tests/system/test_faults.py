@@ -70,7 +70,7 @@ def healthy(folder: Path, text: str) -> Iterator[Running]:
     assert counts.received == number.size
     missing = number[-1] - number[0] + 1 - number.size
     # the simulated sensor drops what a reader does not fetch in time on a loaded machine; nothing else may be missing
-    assert missing <= run.service.virtual["healthy"].fault_counts.dropped
+    assert missing <= run.station("healthy").simulated.fault_counts.dropped
     assert counts.lost + counts.bad == missing
     assert not any(event.kind == "clock_jumped" for device, event in run.caught.events if device == "healthy")
     assert run.station("healthy").ring.overflowed == 0

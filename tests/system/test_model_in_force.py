@@ -74,7 +74,7 @@ def test_the_moment_a_sensor_stops_agreeing_with_its_model_is_an_event() -> None
     caught = Watching()
     caught.service = service
     service.outputs.append(caught)
-    follow_reader(service.virtual["demo"], service.workers[0].driver, lambda: caught.looked + LOOK_SAMPLES)
+    follow_reader(service.workers[0].simulated, service.workers[0].driver, lambda: caught.looked + LOOK_SAMPLES)
     service.run(PATIENCE_S)
     assert caught.before is not None
     assert caught.before.agrees == dict.fromkeys(AXES, True)
@@ -112,7 +112,7 @@ def test_reconcile_is_asked_for_over_zenoh_and_holds_nothing_up(tmp_path: Path) 
     service = Service(watched(table), reconciler=Reconciler(stand_in(go, kept)))
     caught = Caught()
     service.outputs.append(caught)
-    follow_reader(service.virtual["demo"], service.workers[0].driver)
+    follow_reader(service.workers[0].simulated, service.workers[0].driver)
     thread = threading.Thread(target=service.run)
     thread.start()
     try:

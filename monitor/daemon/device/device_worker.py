@@ -8,7 +8,7 @@ the times of the samples, ``DeviceStatus`` reports the status, and ``WindowResto
 import threading
 import time
 from collections.abc import Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from drivers.driver import Driver
 from drivers.links.base import Link
@@ -27,6 +27,9 @@ from monitor.daemon.result_publisher import ResultPublisher
 from monitor.daemon.storage.recorder import Recorder
 from monitor.estimation.window_snapshot import WindowSnapshot
 from monitor.settings.loading import Device, VirtualTable
+
+if TYPE_CHECKING:
+    from monitor.simulator import SimulatedDevice
 
 RING_S: Final = 10.0
 """Capacity of the ring buffer, in seconds of samples, within the bounds of RING_SAMPLES_RANGE."""
@@ -61,6 +64,8 @@ class DeviceWorker:
         Flags of the compiled kernels. Samples wait in order until the kernels that the device needs are compiled.
     recorder : Recorder, optional
         Records samples and raw bytes, and provides the samples from before a restart.
+    simulated : SimulatedDevice, optional
+        Simulated sensor that sends to the link. It is started and stopped with the reader thread.
 
     Raises
     ------
@@ -76,6 +81,7 @@ class DeviceWorker:
         wake: threading.Event,
         ready: KernelReadiness,
         recorder: Recorder | None = None,
+        simulated: "SimulatedDevice | None" = None,
     ) -> None:
         self.device = device
         self.name = device.name
@@ -98,6 +104,7 @@ class DeviceWorker:
         self.timeline = self.publisher.timeline
         self.restore = WindowRestore(device, self.pipeline, self.clock, self.timeline)
         self.status = DeviceStatus(self.publisher, self.ring, self.restore)
+        self.simulated = simulated
         self._recorder = recorder
         self._wake = wake
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
@@ -107,6 +114,8 @@ class DeviceWorker:
 
     def start(self) -> None:
         """Start the reader thread; if the recording ended less than a window ago, resume from its end."""
+        if self.simulated is not None:
+            self.simulated.start()
         if self._recorder is not None and not self._replayed:
             self.restore.resume_from(self._recorder.find_recording_tail(self.name))
             if self.restore.active:  # the next restart may come before a new estimate exists
@@ -121,6 +130,8 @@ class DeviceWorker:
     def stop(self) -> None:
         """Stop the reader thread. The samples in the ring buffer stay there until the next ``process_new_samples``."""
         self.driver.stop()
+        if self.simulated is not None:
+            self.simulated.stop()
 
     def join(self, timeout_s: float) -> bool:
         """Wait for the reader thread; return False if it does not end within ``timeout_s`` seconds."""

@@ -1117,7 +1117,7 @@ def counted(self, *arguments):
     caught = Caught()
     self.outputs.append(caught)
     run(self, *arguments)
-    truth = self.virtual["demo"].fault_counts
+    truth = self.workers[0].simulated.fault_counts
     if "demo" in caught.blocks:
         numbers = (concatenate_blocks(caught.blocks["demo"]).ticks // 10_000_000).tolist()
         print(json.dumps([numbers, truth.sample_count, truth.dropped]), file=sys.stderr)
