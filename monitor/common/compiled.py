@@ -9,8 +9,8 @@ functions and constants from other files. The version of the cache therefore cov
 By default, Numba generates machine code for each kernel, and again for the copy of the kernel inside every calling
 kernel. LLVM would compile a function at the fifth level of calls five times. ``Kernel`` therefore keeps a function that
 other kernels call as intermediate code. This code is optimised once, as a part of the kernel that Python calls. The
-first start takes more than a quarter less time (``docs/benchmarks-service.md``). The machine code of the outer kernels does not
-change.
+first start takes more than a quarter less time (``docs/benchmarks-service.md``). The machine code of the outer kernels
+does not change.
 
 Kernels receive and return NamedTuples of arrays. In a loop, array fields are first copied to local names, because Numba
 counts a reference at each access to a field.
