@@ -161,7 +161,7 @@ def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None
     assert duration.start_s.tolist() == minutes[1:2]
     assert "did you mean" in answer("axes=gz")
     assert "no brackets" in answer("_time=yesterday")
-    assert "nothing in that time; kept are 2020-09-13" in answer("_time=[now(-1h)..]")
+    assert "no results in this time range; stored are 2020-09-13" in answer("_time=[now(-1h)..]")
 
 
 @pytest.mark.long

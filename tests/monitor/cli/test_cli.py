@@ -1288,7 +1288,11 @@ def test_history_of_a_span_and_a_step_by_its_configuration(call: Call, histories
         ((), 2, "CONFIG.toml or a folder is missing"),
         (("{kept}",), 2, "choose with --device: bench-1, bench-2"),
         (("{kept}", "--device", "bench-3"), 2, 'did you mean "bench-'),
-        (("{kept}", "--device", "bench-1", "--from", "-1h"), 3, "nothing in that time; kept are 2025-11-21 00:00:00"),
+        (
+            ("{kept}", "--device", "bench-1", "--from", "-1h"),
+            3,
+            "no results in this time range; stored are 2025-11-21 00:00:00",
+        ),
         (("{kept}", "--from", "soon"), 2, '--from: "soon" is no time'),
         (("{kept}", "--from", "2025-11-22", "--to", "2025-11-21"), 2, "is not after --from"),
         (("{kept}", "--axis", "g"), 2, "possible are gx, gy"),
@@ -1347,7 +1351,7 @@ def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path
     told, kept = json.loads(said.out), json.loads(there.out)
     assert (told["axes"], told["start"]) == (kept["axes"], kept["start"])
     assert nothing.status == 3
-    assert "nothing in that time" in nothing.only_line()
+    assert "no results in this time range" in nothing.only_line()
 
 
 # --- errors that nobody foresaw

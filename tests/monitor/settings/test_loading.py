@@ -99,7 +99,7 @@ CASES = {
     "hook that does nothing": (device() + HOOK + 'on = ["*"]', ["hook[0]: nothing to do; add command or key"]),
     "hook by a name": (
         device() + HOOK + 'on = ["*"]\ncommand = ["mail"]',
-        ['hook[0].command: "mail" is no path; write where the program is, e.g. "/usr/bin/mail"'],
+        ['hook[0].command: "mail" is no path; write the path of the program, e.g. "/usr/bin/mail"'],
     ),
     "hook that is not there": (device() + HOOK + 'on = ["*"]\ncommand = ["/none/x"]', ["/none/x: no such file"]),
     "hook that is no program": (
