@@ -28,13 +28,7 @@ class CommandHandler:
         self._reconciler = reconciler
 
     def handle_commands(self, workers: Mapping[str, DeviceWorker]) -> None:
-        """Execute the commands that arrived since the last call.
-
-        Parameters
-        ----------
-        workers : mapping of str to DeviceWorker
-            Worker of each device by its name.
-        """
+        """Execute the commands that arrived since the last call, for the workers by device name."""
         while not self._zenoh.commands.empty():
             command = self._zenoh.commands.get_nowait()
             if command.device in workers:
@@ -43,13 +37,7 @@ class CommandHandler:
                 command.refuse("the device was removed from the configuration")
 
     def publish_reconciled(self, workers: Mapping[str, DeviceWorker]) -> None:
-        """Publish an event for each reconciliation that has finished since the last call.
-
-        Parameters
-        ----------
-        workers : mapping of str to DeviceWorker
-            Worker of each device by its name.
-        """
+        """Publish an event for each reconciliation that has finished since the last call."""
         for finished in self._reconciler.take_finished():
             if finished.device in workers:
                 workers[finished.device].publish_event("reconciled", finished.text)

@@ -249,14 +249,8 @@ class HistoryStore:
         self._db.execute(
             f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
-                device,
-                row.start_s,
-                row.width_s,
-                row.newest_s,
-                self._layouts.id(row.names),
-                *row.counts,
-                row.state,
-                pack_count_min_max_last(row),
+                *(device, row.start_s, row.width_s, row.newest_s, self._layouts.id(row.names)),
+                *(*row.counts, row.state, pack_count_min_max_last(row)),
             ),
         )
 
@@ -299,9 +293,7 @@ class HistoryStore:
     def _device_id(self, name: str) -> int:
         """Return the identifier of a device. A new device gets a new identifier."""
         if name not in self._devices:
-            self._db.execute("INSERT OR IGNORE INTO device (name) VALUES (?)", (name,))
-            (found,) = self._db.execute("SELECT id FROM device WHERE name = ?", (name,)).fetchone()
-            self._devices[name] = int(found)
+            self._devices[name] = _identifier(self._db, "device", "name", name)
         return self._devices[name]
 
     def _refresh_identifiers(self) -> None:
@@ -474,10 +466,7 @@ class _LayoutCache:
     def id(self, names: tuple[str, ...]) -> int:
         """Return the identifier of a layout. A new layout gets a new identifier."""
         if names not in self._ids:
-            text = " ".join(names)
-            self._db.execute("INSERT OR IGNORE INTO layout (names) VALUES (?)", (text,))
-            (found,) = self._db.execute("SELECT id FROM layout WHERE names = ?", (text,)).fetchone()
-            self._ids[names] = int(found)
+            self._ids[names] = _identifier(self._db, "layout", "names", " ".join(names))
         return self._ids[names]
 
     def row(self, found: Sequence[Any]) -> HistoryRow:
@@ -498,24 +487,24 @@ class _LayoutCache:
         return HistoryRow(start, width, newest, names, *unpack_count_min_max_last(data, len(names)), counts, state)
 
 
+def _identifier(db: sqlite3.Connection, table: str, column: str, text: str) -> int:
+    """Return the identifier of a text in a table. A new text is inserted."""
+    db.execute(f"INSERT OR IGNORE INTO {table} ({column}) VALUES (?)", (text,))
+    return int(db.execute(f"SELECT id FROM {table} WHERE {column} = ?", (text,)).fetchone()[0])
+
+
 def _open_read_only(path: Path) -> sqlite3.Connection:
     """Open a file for reading. Without a log and without write access to the folder, open it as immutable."""
-    options = ["mode=ro"]
-    if not Path(f"{path}-wal").exists():
-        options.append("mode=ro&immutable=1")
-    for option in options:
-        db = sqlite3.connect(
-            f"{path.resolve().as_uri()}?{option}", uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None
-        )
-        try:
-            db.execute("SELECT count(*) FROM sqlite_master").fetchone()
-        except sqlite3.OperationalError:
-            db.close()
-            if option == options[-1]:
-                raise
-        else:
-            return db
-    raise AssertionError("the loop ends with return or raise")
+    uri = f"{path.resolve().as_uri()}?mode=ro"
+    db = sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
+    try:
+        db.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    except sqlite3.OperationalError:
+        db.close()
+        if Path(f"{path}-wal").exists():
+            raise
+        db = sqlite3.connect(f"{uri}&immutable=1", uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
+    return db
 
 
 def _file_states(path: Path) -> tuple[_FileState | None, _FileState | None]:

@@ -109,13 +109,7 @@ class DevicePipeline:
         return self._interprets or self.ready.all.is_set()
 
     def kernel_context(self, rate_hz: float | None) -> AbstractContextManager[None]:
-        """Return the context manager for calls of the kernels, which interprets kernels if necessary.
-
-        Parameters
-        ----------
-        rate_hz : float or None
-            Sample rate; None if it is unknown. No kernel is called while the rate is unknown.
-        """
+        """Return the context manager for calls of the kernels, which interprets kernels if necessary."""
         if rate_hz is not None and self.estimator is None:
             self.required_kernels_ready(rate_hz)
         return interpreted() if self._interprets and not self.ready.all.is_set() else nullcontext()

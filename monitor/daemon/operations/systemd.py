@@ -40,7 +40,7 @@ class SystemdNotifier:
 
     def __init__(self, address: str = "", watchdog_s: float | None = None, stuck_s: float | None = None) -> None:
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
-        self._watchdog_s = watchdog_s
+        self.watchdog_s = watchdog_s
         self._stuck_s = stuck_s or max(MIN_STUCK_S, 0.5 * (watchdog_s or 0.0))
         self._said = ""
         self.ready_sent = False
@@ -54,18 +54,13 @@ class SystemdNotifier:
         Examples
         --------
         >>> environment = {"NOTIFY_SOCKET": "/run/notify", "WATCHDOG_USEC": "60000000", "HOME": "/"}
-        >>> SystemdNotifier.from_environment(environment).watched, environment
-        (True, {'HOME': '/'})
+        >>> SystemdNotifier.from_environment(environment).watchdog_s, environment
+        (60.0, {'HOME': '/'})
         """
         address, usec, pid = (environment.pop(name, "") for name in VARIABLES)
         watched = usec.isdecimal() and int(usec) > 0 and pid in ("", str(os.getpid()))
         known = address.startswith(("/", "@"))
         return cls(address if known else "", int(usec) / 1e6 if known and watched else None)
-
-    @property
-    def watched(self) -> bool:
-        """True if the watchdog of systemd is on."""
-        return self._watchdog_s is not None
 
     def ready(self) -> None:
         """Send the message that the service has started or has finished a reload."""
@@ -107,8 +102,8 @@ class SystemdNotifier:
             for name, count in turns.items()
         }
         stuck = [name for name, (_, since_s) in self._turns.items() if now_s - since_s > self._stuck_s]
-        if self._watchdog_s is not None and not stuck and now_s >= self._next_beat_s:
-            self._next_beat_s = now_s + self._watchdog_s / BEATS_PER_TIMEOUT
+        if self.watchdog_s is not None and not stuck and now_s >= self._next_beat_s:
+            self._next_beat_s = now_s + self.watchdog_s / BEATS_PER_TIMEOUT
             self._send("WATCHDOG=1")
         return stuck
 

@@ -113,11 +113,6 @@ class RecordingTrack:
     # --- queue
 
     @property
-    def has_unwritten_rows(self) -> bool:
-        """True if the queue has rows that are not written yet."""
-        return bool(self._queue or self._taken)
-
-    @property
     def is_queue_filling_up(self) -> bool:
         """True if more than a quarter of the queue is in use."""
         return self._queue_bytes > MAX_QUEUE_BYTES // 4
