@@ -81,45 +81,6 @@ class RunningStatistics:
         np.copyto(self.last, single, where=there)
 
 
-def combine_sources(
-    start_s: int,
-    width_s: int,
-    newest_s: float,
-    parts: Sequence[RunningStatistics],
-    counts: tuple[int, int, int, int],
-    state: int,
-) -> HistoryRow:
-    """Combine the statistics of several sources with different columns into one row.
-
-    Parameters
-    ----------
-    start_s
-        Unix time at which the bucket begins [s], a multiple of ``width_s``.
-    width_s
-        Width of the bucket [s].
-    newest_s
-        Unix time of the newest result in the bucket [s].
-    parts
-        Statistics of each source. A column name occurs in one source only.
-    counts
-        Increments of COUNTS within the bucket.
-    state
-        Index of the worst state in STATES.
-    """
-    return HistoryRow(
-        start_s,
-        width_s,
-        newest_s,
-        tuple(name for part in parts for name in part.names),
-        np.concatenate([part.count for part in parts]),
-        np.concatenate([part.minimum for part in parts]),
-        np.concatenate([part.maximum for part in parts]),
-        np.concatenate([part.last for part in parts]),
-        counts,
-        state,
-    )
-
-
 def select_columns(row: HistoryRow, names: tuple[str, ...]) -> HistoryRow:
     """Return a row with selected columns.
 

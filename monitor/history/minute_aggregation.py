@@ -13,7 +13,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.health import Health
 from monitor.estimation.estimate import Estimate
-from monitor.history.bucket import STATES, HistoryRow, RunningStatistics, combine_sources
+from monitor.history.bucket import STATES, HistoryRow, RunningStatistics
 from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
 
 MINUTE_S: Final = 60
@@ -114,16 +114,22 @@ class MinuteAggregator:
 
     def _close_row(self) -> HistoryRow:
         """Close the current row and return it."""
-        parts = [part for part in (self._estimates, self._health, self._temperature) if part is not None]
-        parts = [part for part in parts if part.count.any()]
+        sources = (self._estimates, self._health, self._temperature)
+        parts = [one for one in sources if one is not None and one.count.any()] or [self._health]
         assert self._start_s is not None
-        row = combine_sources(
-            self._start_s, MINUTE_S, self._newest_s, parts or [self._health], self._counts, self._state
+        row = HistoryRow(
+            self._start_s,
+            MINUTE_S,
+            self._newest_s,
+            tuple(name for part in parts for name in part.names),
+            np.concatenate([part.count for part in parts]),
+            np.concatenate([part.minimum for part in parts]),
+            np.concatenate([part.maximum for part in parts]),
+            np.concatenate([part.last for part in parts]),
+            self._counts,
+            self._state,
         )
-        self._estimates, self._health, self._temperature = (
-            None,
-            RunningStatistics(HEALTH_COLUMNS),
-            RunningStatistics(TEMPERATURE_COLUMNS),
-        )
+        self._estimates, self._health = None, RunningStatistics(HEALTH_COLUMNS)
+        self._temperature = RunningStatistics(TEMPERATURE_COLUMNS)
         self._counts, self._state, self._start_s = (0, 0, 0, 0), 0, None
         return row

@@ -1,6 +1,6 @@
 """Background writer of the history: rows and events are queued, and a thread writes the queue to a file.
 
-``put_row`` and ``put_event`` add to a bounded queue and return at once. The thread writes the queue in one transaction
+``HistoryWriter.queue_item`` adds to a bounded queue and returns at once. The thread writes the queue in one transaction
 and then merges a few old rows. If a write fails (disk full, read-only or busy), the data remain in the queue and the
 write is repeated. If the queue is full, new data are dropped and counted. ``close`` makes one attempt to write the
 remaining data. ``state`` reports errors and changes of the file.
@@ -100,30 +100,24 @@ class HistoryWriter:
         """Start the thread."""
         self._thread.start()
 
-    def put_row(self, device: str, row: HistoryRow | None) -> None:
-        """Queue a row for writing.
+    def queue_item(self, device: str, item: HistoryRow | StoredEvent | None) -> None:
+        """Queue a row or an event for writing. If the queue is full, drop and count the item.
 
         Parameters
         ----------
         device
             Name of the device.
-        row
-            Row to write. None is ignored.
+        item
+            Row or event to write. None is ignored.
         """
-        if row is not None:
-            self._push(device, row)
-
-    def put_event(self, device: str, event: StoredEvent) -> None:
-        """Queue an event for writing.
-
-        Parameters
-        ----------
-        device
-            Name of the device.
-        event
-            Event to write.
-        """
-        self._push(device, event)
+        with self._lock:
+            if item is None or self._discards(device, item):
+                return
+            if len(self._waiting) >= QUEUE_CAPACITY:
+                self.dropped += 1
+            else:
+                self._waiting.append((device, item))
+        self._wake.set()
 
     def close(self) -> None:
         """Write the remaining data and stop the thread. After CLOSE_TIMEOUT_S, log a warning and return."""
@@ -133,17 +127,6 @@ class HistoryWriter:
             self._thread.join(CLOSE_TIMEOUT_S)
             if self._thread.is_alive():
                 _log.warning("history writer did not end in time", path=str(self.path))
-
-    def _push(self, device: str, what: HistoryRow | StoredEvent) -> None:
-        """Add an item to the queue. If the queue is full, drop and count the item."""
-        with self._lock:
-            if self._discards(device, what):
-                return
-            if len(self._waiting) >= QUEUE_CAPACITY:
-                self.dropped += 1
-            else:
-                self._waiting.append((device, what))
-        self._wake.set()
 
     def _discards(self, device: str, what: HistoryRow | StoredEvent) -> bool:
         """Return True if another process stores the item."""

@@ -44,9 +44,9 @@ __all__ = [
     "VirtualTable",
     "ZenohTable",
     "check_viewer_mode",
+    "examine",
     "load",
     "parse_rate_as_period",
-    "read",
     "seconds",
 ]
 
@@ -105,25 +105,11 @@ def load(path: Path, *, pipe: bool = False) -> Config:
     ConfigError
         If the file has mistakes. The message describes the first mistake and states the number of further mistakes.
     """
-    config, wrong = read(path, pipe=pipe)
-    if config is None:
-        more = f" (and {len(wrong) - 1} more: imu-monitor check {path})" if len(wrong) > 1 else ""
-        raise ConfigError(wrong[0] + more)
-    return config
-
-
-def read(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
-    """Return the configuration in a file, or None, and one line for each mistake.
-
-    Parameters
-    ----------
-    path
-        Configuration file.
-    pipe
-        True if a pipe may be read as well.
-    """
     reading = examine(path, pipe=pipe)
-    return reading.config, reading.wrong
+    if reading.config is None:
+        count = len(reading.wrong) - 1
+        raise ConfigError(reading.wrong[0] + (f" (and {count} more: imu-monitor check {path})" if count else ""))
+    return reading.config
 
 
 def examine(path: Path, *, pipe: bool = False) -> Reading:

@@ -173,7 +173,7 @@ def test_a_damaged_history_is_said_in_the_status_and_to_who_asks(asked: tuple[Se
     path.write_bytes(b"no more" * 1000)
     (reply,) = client.get("imu/bench-1/history", timeout=PATIENCE_S)
     assert "damaged" in json.loads(bytes(reply.err.payload))["error"]
-    service.history.writer.put_event("bench-1", StoredEvent(T0, "moved", "once more"))
+    service.history.writer.queue_item("bench-1", StoredEvent(T0, "moved", "once more"))
     wait_for(lambda: "damaged" in service.output_states()["history"])
     (aside,) = path.parent.glob(f"{FILE_NAME}.aside-*Z")
     assert aside.read_bytes() == b"no more" * 1000

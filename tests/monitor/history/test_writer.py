@@ -43,15 +43,15 @@ def count(path: Path) -> tuple[int, int]:
 
 def fill(writer: HistoryWriter, n: int, first: int = 0) -> None:
     for i in range(first, first + n):
-        writer.put_row("a", row(T0 + 60 * i, RNG))
-        writer.put_event("a", StoredEvent(T0 + 60.0 * i, "moved", "x"))
+        writer.queue_item("a", row(T0 + 60 * i, RNG))
+        writer.queue_item("a", StoredEvent(T0 + 60.0 * i, "moved", "x"))
 
 
 def test_what_is_handed_over_is_in_the_file_at_the_end(tmp_path: Path) -> None:
     path = tmp_path / "h.sqlite"
     with started(path) as writer:
         fill(writer, 100)
-        writer.put_row("a", None)
+        writer.queue_item("a", None)
     assert (writer.state, writer.written) == ("ok", 200)
     assert not path.with_name("h.sqlite-wal").exists()
     assert count(path) == (100, 100)

@@ -17,9 +17,9 @@ from monitor.settings.loading import (
     WINDOW_SAMPLES,
     VirtualTable,
     check_viewer_mode,
+    examine,
     load,
     parse_rate_as_period,
-    read,
     seconds,
 )
 
@@ -29,7 +29,8 @@ DRIVER = 'driver = { link = "serial", port = "/dev/null", decoder = "vectornav_a
 def wrong(tmp_path, text):
     path = tmp_path / "my.toml"
     path.write_text(text, "utf-8")
-    config, lines = read(path)
+    reading = examine(path)
+    config, lines = reading.config, reading.wrong
     assert (config is None) == bool(lines)
     assert all(line.startswith(f"{path}: ") and "\n" not in line for line in lines)
     return [line.removeprefix(f"{path}: ") for line in lines]
@@ -530,7 +531,8 @@ def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("path", sorted(CONFIG_FOLDER.glob("*.toml")), ids=lambda path: path.name)
 def test_examples_are_right(path):
-    config, lines = read(path)
+    reading = examine(path)
+    config, lines = reading.config, reading.wrong
     assert [line for line in lines if "no such file" not in line] == []
     assert config is not None or lines
 
@@ -620,7 +622,7 @@ def test_the_model_in_force_is_a_file_beside_the_configuration_or_a_name_of_the_
     (one,) = load(path).devices
     assert (one.model, one.reconcile_folder) == (None, None)
     path.write_text(device('model = "bmi08"'))
-    assert read(path)[1][0].endswith('did you mean "bmi088"?')
+    assert examine(path).wrong[0].endswith('did you mean "bmi088"?')
 
 
 @pytest.mark.parametrize(
@@ -653,7 +655,7 @@ def test_the_interval_that_is_held_against_temperature(tmp_path, text, found):
 def test_an_interval_that_cannot_be_says_why(tmp_path, text, says):
     path = tmp_path / "my.toml"
     path.write_text(device(text))
-    (line,) = read(path)[1]
+    (line,) = examine(path).wrong
     assert says in line
 
 
