@@ -181,7 +181,7 @@ def _instant(text: str) -> float:
         return found.timestamp()
     except (ValueError, OverflowError):
         raise ConfigError(
-            f'"{_short(text)}" is no time; write 2026-11-20, 2026-11-20T14:30:00Z, -1d, or now(-1h) in _time'
+            f'"{_short(text)}" is not a time; write 2026-11-20, 2026-11-20T14:30:00Z, -1d, or now(-1h) in _time'
         ) from None
 
 
@@ -189,7 +189,7 @@ def _duration_s(text: str) -> float:
     """Parse a duration of zero or more, and return the seconds."""
     match = _DURATION.fullmatch(text)
     if match is None or match[2] not in UNITS_S:
-        raise ConfigError(f'"{_short(text)}" is no duration; write 90s, 30m, 1h, 2d, 1w')
+        raise ConfigError(f'"{_short(text)}" is not a duration; write 90s, 30m, 1h, 2d, 1w')
     seconds = float(match[1]) * UNITS_S[match[2]]
     if seconds > MAX_DURATION_S:
         raise ConfigError(f'"{_short(text)}" is too long; at most about three thousand years')

@@ -266,7 +266,7 @@ class HistoryWriter:
         if wrong:
             _log.warning("history", text=wrong)
         else:
-            _log.info("history", text="written again")
+            _log.info("history", text="writing continues")
 
     def _close_store(self) -> None:
         """Close the store."""

@@ -58,7 +58,7 @@ def parse_rate_as_period(value: str, always: str) -> float:
     match = RATE_TEXT.fullmatch(value)
     rate_hz = _positive_number(match[1]) if match else 0.0
     if not rate_hz > 0.0:
-        raise ConfigError(f'{format_value(value)} is no rate; write "10 Hz" or "{always}"')
+        raise ConfigError(f'{format_value(value)} is not a rate; write "10 Hz" or "{always}"')
     return 1.0 / UPDATE_RATE_HZ.check(rate_hz)
 
 
@@ -75,7 +75,7 @@ def check_memory(size: str) -> None:
     """
     match = SIZE_TEXT.fullmatch(size)
     if match is None:
-        raise ConfigError(f'{format_value(size)} is no size; write "256MiB", "1GB" or "25%"')
+        raise ConfigError(f'{format_value(size)} is not a size; write "256MiB", "1GB" or "25%"')
     number, prefix, binary = match.groups()
     if size.endswith("%"):
         PERCENT.check(float(number))
@@ -96,7 +96,7 @@ def _seconds(value: Any) -> Any:
     match = DURATION_TEXT.fullmatch(value)
     duration_s = _positive_number(match[1]) * UNITS_S.get(match[2], 0.0) if match else 0.0
     if not duration_s > 0.0:
-        raise ConfigError(f'{format_value(value)} is no duration; write seconds, or "90s", "30min", "1h", "2d"')
+        raise ConfigError(f'{format_value(value)} is not a duration; write seconds, or "90s", "30min", "1h", "2d"')
     return duration_s
 
 
@@ -115,7 +115,7 @@ def _path(name: str, folder: Path | None) -> Path:
 
 def _check_endpoint(endpoint: str) -> None:
     if not ENDPOINT_TEXT.fullmatch(endpoint):
-        raise ConfigError(f'{format_value(endpoint)} is no endpoint; write "{ENDPOINT}"')
+        raise ConfigError(f'{format_value(endpoint)} is not an endpoint; write "{ENDPOINT}"')
 
 
 def _check_zenoh_key(key: str) -> None:
@@ -128,7 +128,7 @@ def _address(text: str, _: Path | None) -> Metrics:
     """Return host and port of an address such as "127.0.0.1:9464"."""
     match = ADDRESS_TEXT.fullmatch(text)
     if match is None or int(match[2]) == 0 or not PORT.supports(int(match[2])):
-        raise ConfigError(f'{format_value(text)} is no host and port; write "127.0.0.1:9464"')
+        raise ConfigError(f'{format_value(text)} is not a host and port; write "127.0.0.1:9464"')
     return Metrics(match[1].strip("[]"), int(match[2]))
 
 

@@ -305,7 +305,7 @@ def _program(words: tuple[str, ...], folder: Path | None) -> tuple[str, ...]:
     if not words:
         return ()
     if "/" not in words[0]:
-        raise ConfigError(f'"{words[0]}" is no path; write the path of the program, e.g. "/usr/bin/{words[0]}"')
+        raise ConfigError(f'"{words[0]}" is not a path; write the path of the program, e.g. "/usr/bin/{words[0]}"')
     if any("\0" in word for word in words):
         raise ConfigError("a word with a NUL character cannot be passed to a program")
     path = (folder or Path()) / file_access.expand_user(words[0])

@@ -47,7 +47,7 @@ class KernelReadiness:
 
         def show(progress: kernel_compilation.Progress) -> None:
             if not self.progress:
-                _log.info("compiling kernels, because none are kept for this version on this machine")
+                _log.info("compiling kernels, because this version has not run on this machine before")
             self.progress = f"{progress} {progress.bar}"
             wake.set()
 
@@ -58,9 +58,11 @@ class KernelReadiness:
                     flag.set()
                     wake.set()
             if self.progress:
-                _log.info("kernels are compiled and kept for the next start", seconds=round(time.monotonic() - begin_s))
+                _log.info(
+                    "kernels are compiled and stored for the next start", seconds=round(time.monotonic() - begin_s)
+                )
         except OSError as error:
-            _log.warning("compiled kernels cannot be kept, the next start will be slow again", error=str(error))
+            _log.warning("compiled kernels cannot be stored; the next start will be slow again", error=str(error))
         finally:
             self.progress = ""
             for flag in (self.window, self.fit, self.all):
