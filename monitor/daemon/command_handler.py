@@ -1,4 +1,4 @@
-"""Execution of the commands that arrive over zenoh: ``reset`` and ``reconcile``."""
+"""Execution of the zenoh commands ``reset`` and ``reconcile``."""
 
 from collections.abc import Mapping
 
@@ -13,14 +13,14 @@ _log = structlog.get_logger("imu-monitor")
 
 
 class CommandHandler:
-    """Executor of the commands for all devices.
+    """Executor of the zenoh commands for all devices.
 
     Parameters
     ----------
     zenoh : ZenohPublisher
         Publisher with the queue of commands.
     reconciler : Reconciler
-        Executes ``command/reconcile``.
+        Runner of the reconciliations.
     """
 
     def __init__(self, zenoh: ZenohPublisher, reconciler: Reconciler) -> None:
@@ -28,13 +28,7 @@ class CommandHandler:
         self._reconciler = reconciler
 
     def handle_commands(self, workers: Mapping[str, DeviceWorker]) -> None:
-        """Execute the commands that arrived since the last call.
-
-        Parameters
-        ----------
-        workers : mapping of str to DeviceWorker
-            Worker of each device by its name.
-        """
+        """Execute the commands that arrived since the last call, for the workers by device name."""
         while not self._zenoh.commands.empty():
             command = self._zenoh.commands.get_nowait()
             if command.device in workers:
@@ -43,23 +37,17 @@ class CommandHandler:
                 command.reply_refusal("the device was removed from the configuration")
 
     def publish_reconciled(self, workers: Mapping[str, DeviceWorker]) -> None:
-        """Publish an event for each reconciliation that has finished since the last call.
-
-        Parameters
-        ----------
-        workers : mapping of str to DeviceWorker
-            Worker of each device by its name.
-        """
+        """Publish an event for each reconciliation that has finished since the last call."""
         for finished in self._reconciler.take_finished():
             if finished.device in workers:
                 workers[finished.device].publish_event("reconciled", finished.text)
 
     def close(self) -> None:
-        """Kill the running reconciliations and refuse their queries."""
+        """Kill the running reconciliations, and refuse their queries."""
         self._reconciler.close()
 
     def _execute(self, command: Command, worker: DeviceWorker) -> None:
-        """Execute one command for a device, and answer it."""
+        """Execute and answer one command for a device."""
         match command.verb:
             case "reset":
                 worker.empty_window()
@@ -72,7 +60,7 @@ class CommandHandler:
                 command.reply_refusal(f'unknown command "{other}"; known commands are reset and reconcile')
 
     def _reconcile(self, command: Command, worker: DeviceWorker) -> None:
-        """Start a reconciliation with a copy of the window; a thread of its own sends the answer."""
+        """Start a reconciliation with a copy of the window. A new thread sends the answer."""
         window = worker.copy_window_and_temperature()
         if window is None:
             command.reply_refusal("no samples yet")

@@ -47,37 +47,37 @@ class HistoryOutput(Output):
     def close(self) -> None:
         """Store the incomplete minutes of all devices, and close the file."""
         for device, minutes in self._minutes.items():
-            self.writer.put_row(device, minutes.flush())
+            self.writer.queue_item(device, minutes.flush())
         self.writer.close()
 
     def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Aggregate the temperature of the samples."""
         unix_s = float((samples.t_ns + offset_ns)[-1]) / 1e9
-        self.writer.put_row(device, self._minutes[device].add_temperature(unix_s, samples.temperature_c))
+        self.writer.queue_item(device, self._minutes[device].add_temperature(unix_s, samples.temperature_c))
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         """Aggregate the coefficients and the deviations of an estimate."""
         if isinstance(result, Estimate):
-            self.writer.put_row(device, self._minutes[device].add_estimate(unix_s, result))
+            self.writer.queue_item(device, self._minutes[device].add_estimate(unix_s, result))
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Store an event."""
         # SQLite does not accept NumPy scalars, so they are converted to plain numbers
         what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.values.items()}
         sigma, since_s = None if event.sigma is None else float(event.sigma), event_start_s(unix_s, event)
-        self.writer.put_event(device, StoredEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma))
+        self.writer.queue_item(device, StoredEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma))
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Aggregate counts and state, once the time of the first sample is known."""
         self._received[device] = health.received
         if unix_s is not None:
-            self.writer.put_row(device, self._minutes[device].add_health(unix_s, health))
+            self.writer.queue_item(device, self._minutes[device].add_health(unix_s, health))
 
     def remove_device(self, device: str) -> None:
         """Store the last minute of a removed device."""
         self._received.pop(device, None)
         if device in self._minutes:
-            self.writer.put_row(device, self._minutes.pop(device).flush())
+            self.writer.queue_item(device, self._minutes.pop(device).flush())
 
     # --- reading
 

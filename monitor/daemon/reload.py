@@ -1,11 +1,11 @@
 """Comparison of the running configuration with the configuration file, for a reload without a restart.
 
-This module reads the file and returns the changes; it applies nothing. Devices are identified by name. A device
-continues if its table and its model in force are unchanged. If only its limits differ, only the limits are replaced.
-After any other change, the device is stopped and started again.
+This module reads the file and returns the changes. The service applies the changes. Devices are identified by name. If
+the table of a device and its noise model are unchanged, the device continues. If only the limits differ, only the
+limits are replaced. After any other change, the device is stopped and started again.
 
-The log level and the hooks are replaced as a whole. All other tables take effect only at the start of the service.
-Changes in them are reported and not applied. A file with any mistake changes nothing.
+The log level and the hooks are replaced as a whole. Changes of all other tables are only reported, because these tables
+take effect at the start of the service. A file with a mistake changes nothing.
 """
 
 from collections.abc import Mapping
@@ -19,12 +19,12 @@ from monitor.settings import loading
 from monitor.settings.loading import Config, Device
 
 RELOADABLE_TABLES: Final = ("device", "hook", "log")
-"""Tables that can change while the service runs. Of ``log``, only the level can."""
+"""Tables that can change while the service runs. In ``log``, only the level can change."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigChange:
-    """Changes from the running configuration to the file."""
+    """Differences between the running configuration and the file."""
 
     config: Config  # configuration after the reload
     removed: tuple[str, ...]  # names of removed and changed devices
@@ -55,7 +55,7 @@ def compare_with_file(running: Config, models: Mapping[str, NoiseModel | None]) 
     running : Config
         Running configuration, as read from its file.
     models : mapping of str to NoiseModel or None
-        Model in force of each device, as read at its start.
+        Noise model of each device, as read when the device was started.
 
     Returns
     -------
@@ -103,10 +103,7 @@ def _restart_tables(old: Mapping[str, Any], new: Mapping[str, Any]) -> tuple[str
 
 
 def _merge(running: Config, new: Config, restart: tuple[str, ...]) -> Config:
-    """Return the new configuration with the old values of the tables that need a restart.
-
-    The next reload then reports these tables again.
-    """
+    """Return the new configuration with the old tables that need a restart, so that the next reload reports them."""
     table = {key: value for key, value in new.table.items() if key not in restart}
     table |= {key: running.table[key] for key in restart if key in running.table}
     if "log.format" in restart:

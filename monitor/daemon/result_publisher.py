@@ -1,6 +1,6 @@
-"""Publication of the results of one device: passes each result that is due to all outputs.
+"""Publication of the results of one device to all outputs.
 
-The main loop calls the outputs in order. No output blocks: each has a queue, or drops data.
+The main loop calls the outputs in order. An output never blocks. It has a queue or drops data.
 """
 
 import time
@@ -26,13 +26,13 @@ from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings.loading import Device
 
 MAX_BATCH_S: Final = 0.1
-"""Longest time that samples are collected before they are published as one batch."""
+"""Longest time for which samples are collected into one batch."""
 TOTAL_INTERVAL_S: Final = 0.1
 """Shortest interval between two steps of the total and Hadamard deviations."""
 TOTAL_CPU_SHARE: Final = 0.005
-"""Share of one processor that the total and Hadamard deviations may use for a device."""
+"""Largest share of one processor for the total and Hadamard deviations of a device."""
 INTERPRETED_REFIT_S: Final = 1.0
-"""Minimum time between fits while their kernels are interpreted, because the compilation needs the processors."""
+"""Minimum time between two fits with interpreted kernels, because the compilation needs the processors."""
 
 
 class ResultPublisher:
@@ -68,17 +68,16 @@ class ResultPublisher:
         self.outputs = outputs
         self.schedule = Schedule()
         self.latest: Estimate | None = None
-        """Newest estimate; None before the first."""
         self.published = 0
-        """Number of samples handed to the outputs."""
+        """Number of published samples."""
         self.withholds_coefficients = False
-        """True while coefficients are not published, because the sample rate is in doubt."""
+        """True while coefficients are withheld, because the sample rate is in doubt."""
         self._agreement = ModelAgreement()
-        self._batch: list[SampleBlock] = []  # samples that were taken and not published yet
+        self._batch: list[SampleBlock] = []  # samples that are not published yet
         self._refitted = False  # True if the fit was updated since the last publication
 
     def publish_events(self, events: Sequence[Event]) -> None:
-        """Publish events."""
+        """Publish events to all outputs."""
         for event in events:
             for output in self.outputs:
                 output.publish_event(self.device.name, self._unix_s(event.t_ns), self._received, event)
@@ -101,7 +100,7 @@ class ResultPublisher:
         return True
 
     def publish_estimate_if_due(self) -> bool:
-        """Update the fit and publish the estimate if they are due; return True if the estimate was published."""
+        """Update the fit if it is due, and publish the estimate if it is due; return True if it was published."""
         self._refit()
         if self.latest is None or not self._refitted or not self.schedule.claim("publish", self.device.publish_s):
             return False
@@ -113,7 +112,7 @@ class ResultPublisher:
         return True
 
     def advance_total_and_hadamard(self) -> None:
-        """Compute one step of the total and Hadamard deviations, and publish them when they are complete."""
+        """Compute one step of the total and Hadamard deviations, and publish the completed deviations."""
         estimator = self.pipeline.estimator
         if estimator is None or not self.pipeline.ready.all.is_set() or not self.schedule.is_due("total"):
             return
@@ -137,12 +136,12 @@ class ResultPublisher:
         return self.timeline.unix_s(t_ns)
 
     def _result(self, t_ns: int, result: Any) -> None:
-        """Publish a result that belongs to the host time ``t_ns``."""
+        """Publish a result with the sample time ``t_ns``."""
         for output in self.outputs:
             output.publish_result(self.device.name, self._unix_s(t_ns), self._received, result)
 
     def _compensated(self, live: LiveCompensation, samples: SampleBlock) -> None:
-        """Publish the samples without gyroscope drift, and the state of the drift compensation."""
+        """Publish samples without gyroscope drift, and the state of the drift compensation."""
         at = 0
         while at < len(samples):
             piece = samples[at : at + live.compensator.samples_to_interval_end]
@@ -159,8 +158,7 @@ class ResultPublisher:
 
     def _refit(self) -> None:
         """Update the fit and the newest estimate, if a refit is due."""
-        # a refit at every sample needs no interval here; ``get`` empties the per-sample history, so it is called only
-        # for a publication
+        # with a refit at every sample, ``get`` is called only for a publication, because ``get`` empties the history
         interval_s = self.device.refit_s or self.device.publish_s
         pipeline = self.pipeline
         if pipeline.estimator is None or not pipeline.advanced or not self.schedule.claim("refit", interval_s):
@@ -177,7 +175,7 @@ class ResultPublisher:
         self._refitted = True
 
     def _model_gap(self, gap: ModelGap) -> None:
-        """Publish the comparison of the window with the model in force, and the events of the comparison."""
+        """Publish the comparison of the window with the noise model, and the resulting events."""
         if self.withholds_coefficients:
             gap = replace(gap, axes={})
         events = self._agreement.update(gap)

@@ -6,7 +6,7 @@ Task = Literal["refit", "publish", "samples", "total", "thermal"]
 
 
 class Schedule:
-    """Next run of each periodic task of one device, on the monotonic clock."""
+    """Time of the next run of each periodic task of one device, on the monotonic clock."""
 
     def __init__(self) -> None:
         self._next_s: dict[Task, float] = {}
@@ -14,7 +14,7 @@ class Schedule:
         self._drain = False
 
     def begin_round(self, now_s: float, drain: bool) -> None:
-        """Set the time of the present round of the main loop.
+        """Begin a round of the main loop.
 
         Parameters
         ----------
@@ -26,7 +26,7 @@ class Schedule:
         self._now_s, self._drain = now_s, drain
 
     def is_due(self, task: Task) -> bool:
-        """Return True if the time of a task has come."""
+        """Return True if a task is due in this round."""
         return self._now_s >= self._next_s.get(task, 0.0)
 
     def claim(self, task: Task, interval_s: float) -> bool:
@@ -41,10 +41,10 @@ class Schedule:
         """
         if not self.is_due(task):
             return self._drain
-        # keep the period, but do not catch up after a pause
+        # keep the interval, but do not catch up after a pause
         self._next_s[task] = max(self._next_s.get(task, 0.0) + interval_s, self._now_s + 0.5 * interval_s)
         return True
 
     def postpone(self, task: Task, delay_s: float) -> None:
-        """Do not run a task within ``delay_s`` seconds from the begin of this round."""
+        """Postpone a task until at least ``delay_s`` seconds after the beginning of this round."""
         self._next_s[task] = max(self._next_s.get(task, 0.0), self._now_s + delay_s)

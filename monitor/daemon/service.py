@@ -131,13 +131,7 @@ class Service:
         self._wake.set()
 
     def run(self, seconds: float | None = None) -> None:
-        """Start the service, run the main loop, and stop the service.
-
-        Parameters
-        ----------
-        seconds : float, optional
-            Duration in seconds. By default the service runs until ``request_stop`` is called or all replays have ended.
-        """
+        """Run the service for a number of seconds, by default until ``request_stop`` or the end of all replays."""
         threading.Thread(target=self._ready.compile, args=(self._wake,), name="warm-up", daemon=True).start()
         try:
             self._start()
@@ -159,12 +153,7 @@ class Service:
     def loop(self, until_s: float | None) -> None:
         """Process the samples of all devices in rounds, and publish the status once a second.
 
-        The loop ends when ``request_stop`` is called, when all replays have ended, or at the given time.
-
-        Parameters
-        ----------
-        until_s : float or None
-            End of the loop on the monotonic clock, in seconds; None for no end.
+        The loop ends after ``request_stop``, at the end of all replays, or at the monotonic time ``until_s``.
         """
         status_s = 0.0
         while not self._stop.is_set():
@@ -233,7 +222,7 @@ class Service:
             from monitor.simulator import SimulatedDevice
 
             simulated = SimulatedDevice(link, device.decoder, device.name)
-            link = simulated.link
+            link = simulated.port.link
         return DeviceWorker(device, link, self.outputs, self._wake, self._ready, self.recorder, simulated)
 
     # --- reload of the configuration

@@ -1,8 +1,8 @@
 """Unix time of samples, from the monotonic clock, slewed towards the host clock.
 
-NTP or an operator may set the host clock. Such a step must not cause a gap in a recording. The difference is therefore
-removed at a rate of at most MAX_SLEW_RATE. The offset between the two clocks is a continuous, piecewise linear function
-of the monotonic time with slopes of at most MAX_SLEW_RATE. Unix times therefore increase from sample to sample.
+NTP or an operator may set the host clock. To avoid a gap in a recording, the Unix time of the samples then approaches
+the host clock gradually. The offset between Unix time and monotonic time is a continuous, piecewise linear function of
+the monotonic time. Its slope is at most MAX_SLEW_RATE, so the Unix times increase from sample to sample.
 """
 
 from typing import Final
@@ -12,9 +12,9 @@ import numpy as np
 from drivers.sample import Ints
 
 MAX_SLEW_RATE: Final = 5e-4
-"""Maximum rate of a correction: 0.5 ms per second."""
+"""Maximum rate of a correction, 0.5 ms per second."""
 MAX_KNOTS: Final = 100
-"""Number of corrections that are kept. With one correction per second, they cover samples of the last minute."""
+"""Number of kept corrections. With one correction per second, samples of the last minute can be converted."""
 
 
 class SlewedClock:
@@ -23,7 +23,7 @@ class SlewedClock:
     Parameters
     ----------
     monotonic_ns, unix_ns : int
-        Both clocks at the same moment.
+        Monotonic time and Unix time of the same moment.
 
     Examples
     --------
@@ -51,7 +51,7 @@ class SlewedClock:
         return self._host_ns - self.offset_ns(self._slewed_at_ns)
 
     def slew_and_return_host_step(self, monotonic_ns: int, unix_ns: int) -> int:
-        """Start to slew towards the host clock. Call this about once a second.
+        """Start to slew towards the host clock. This method is called about once a second.
 
         Returns
         -------
@@ -69,11 +69,11 @@ class SlewedClock:
         return self._host_ns - before_ns
 
     def offset_ns(self, monotonic_ns: int) -> int:
-        """Return the difference of Unix and monotonic time at a monotonic time."""
+        """Return the difference between Unix time and monotonic time at a monotonic time."""
         return int(self.offsets_ns(np.array([monotonic_ns], np.int64))[0])
 
     def offsets_ns(self, monotonic_ns: Ints) -> Ints:
-        """Return the difference of Unix and monotonic time at each of the monotonic times [n]."""
+        """Return the difference between Unix time and monotonic time at each monotonic time [n]."""
         knots = self._knots
         begun_ns, offset_ns, correction_ns = knots[np.searchsorted(knots[1:, 0], monotonic_ns, side="right")].T
         most_ns = (MAX_SLEW_RATE * np.maximum(monotonic_ns - begun_ns, 0)).astype(np.int64)

@@ -1,1 +1,1 @@
-"""Long-term history: results aggregated per minute, kept in one file, merged with age without loss of extremes."""
+"""Long-term history of the results in one file: rows of one minute, which are merged into wider rows later."""

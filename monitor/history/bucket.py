@@ -1,9 +1,9 @@
-"""One history row: the statistics of a device's results within one time bucket, and the merging of rows.
+"""Rows of the history: statistics of the results of a device within one time bucket, and merging of rows.
 
-For each number (``gz.N``, ``gz.sigma.0.1``, ``temperature``; see ``columns``) a row holds the count, minimum, maximum
-and last value. The minimum of several minima is the overall minimum, so extremes survive any number of merges exactly.
-Counters (samples received, lost, bad, overflowed) are increments and are added. Values are rounded once to float32
-(seven digits) before they are compared. Rounding keeps the order, so later merges lose nothing. The module does no I/O.
+A row has columns such as ``gz.N``, ``gz.sigma.0.1`` and ``temperature`` (see ``columns``). For each column, the row has
+the count, minimum, maximum and last value. Any number of merges preserves the minimum and the maximum exactly. Counters
+(samples received, lost, bad, overflowed) are increments and are added. Values are rounded to float32 (seven digits)
+before they are compared. Rounding preserves the order, so merging adds no error. The module does no I/O.
 
 In the packed form, the bits of the maximum and of the last value are stored as differences (XOR) from the minimum.
 Bytes of equal significance are grouped and compressed. Values within a minute differ little, so most of these bytes
@@ -25,7 +25,7 @@ from drivers.sample import Floats, Ints
 Singles = NDArray[np.float32]
 
 STATES: Final = ("ended", "running", "waiting", "lost")
-"""States ordered from best to worst; a row holds the worst state of its bucket."""
+"""States ordered from best to worst. A row has the worst state of the bucket."""
 COUNTS: Final = ("received", "lost", "bad", "overflowed")
 MAX_COLUMNS: Final = 4096
 """Largest number of columns in a row; a device has about two hundred."""
@@ -34,14 +34,14 @@ _MAX_N: Final = 2**32 - 1
 
 @dataclass(frozen=True, slots=True)
 class HistoryRow:
-    """Statistics of k numbers in the bucket from ``start_s`` to ``start_s + width_s``."""
+    """Statistics of k columns in the bucket from ``start_s`` to ``start_s + width_s``."""
 
     start_s: int  # Unix time, a multiple of width_s
     width_s: int
-    newest_s: float  # Unix time of the newest result in it
+    newest_s: float  # Unix time of the newest result in the bucket
     names: tuple[str, ...]  # [k]
-    n: Ints  # [k] count of values of each number
-    low: Singles  # [k] SI; NaN if the number never had a value
+    n: Ints  # [k] number of values
+    low: Singles  # [k] SI; NaN without a value
     high: Singles
     last: Singles
     counts: tuple[int, int, int, int] = (0, 0, 0, 0)  # increments of COUNTS within the bucket
@@ -54,7 +54,7 @@ class HistoryRow:
 
 
 class RunningStatistics:
-    """Running count, minimum, maximum and last value of k numbers.
+    """Running count, minimum, maximum and last value of k columns.
 
     >>> seen = RunningStatistics(("a", "b"))
     >>> for numbers in ([1.0, 5.0], [3.0, np.nan], [2.0, 4.0]):
@@ -71,7 +71,7 @@ class RunningStatistics:
         self.last: Singles = self.minimum.copy()
 
     def add(self, numbers: Floats) -> None:
-        """Update the statistics with one value of each number ([k], SI); NaN marks a missing value."""
+        """Update the statistics with one value per column ([k], SI); NaN marks a missing value."""
         with np.errstate(over="ignore"):
             single = numbers.astype(np.float32)
         there = ~np.isnan(single)
@@ -81,54 +81,15 @@ class RunningStatistics:
         np.copyto(self.last, single, where=there)
 
 
-def combine_sources(
-    start_s: int,
-    width_s: int,
-    newest_s: float,
-    parts: Sequence[RunningStatistics],
-    counts: tuple[int, int, int, int],
-    state: int,
-) -> HistoryRow:
-    """Concatenate the statistics of several sources into one row.
-
-    Parameters
-    ----------
-    start_s
-        Unix time at which the bucket begins [s], a multiple of ``width_s``.
-    width_s
-        Width of the bucket [s].
-    newest_s
-        Unix time of the newest result in the bucket [s].
-    parts
-        Statistics of each source; their names must not overlap.
-    counts
-        Increments of COUNTS within the bucket.
-    state
-        Index of the worst state in STATES.
-    """
-    return HistoryRow(
-        start_s,
-        width_s,
-        newest_s,
-        tuple(name for part in parts for name in part.names),
-        np.concatenate([part.count for part in parts]),
-        np.concatenate([part.minimum for part in parts]),
-        np.concatenate([part.maximum for part in parts]),
-        np.concatenate([part.last for part in parts]),
-        counts,
-        state,
-    )
-
-
 def select_columns(row: HistoryRow, names: tuple[str, ...]) -> HistoryRow:
-    """Return the row with its columns selected and reordered.
+    """Return a row with selected columns.
 
     Parameters
     ----------
     row
-        The row.
+        Row to select from.
     names
-        Names of the columns to return, in this order. Names that the row lacks become missing values.
+        Names of the selected columns, in the order of the result. The values of unknown columns are missing.
     """
     if names == row.names:
         return row
@@ -140,13 +101,13 @@ def select_columns(row: HistoryRow, names: tuple[str, ...]) -> HistoryRow:
 
 @lru_cache(maxsize=64)
 def _column_indices(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[np.int64]:
-    """Return the index of each wanted name in ``names``; -1 if it is absent."""
+    """Return the index of each wanted name in ``names``; -1 for an unknown name."""
     at = {name: i for i, name in enumerate(names)}
     return np.array([at.get(name, -1) for name in wanted], np.int64)
 
 
 def merge_rows(rows: Sequence[HistoryRow], start_s: int, width_s: int) -> HistoryRow:
-    """Merge rows into one; the last value of a number comes from the newest row that has the number.
+    """Merge rows into one row. The last value of a column is taken from the newest row that has a value.
 
     Parameters
     ----------
@@ -163,7 +124,7 @@ def merge_rows(rows: Sequence[HistoryRow], start_s: int, width_s: int) -> Histor
         names = tuple(dict.fromkeys(name for row in rows for name in row.names))
         rows = [select_columns(row, names) for row in rows]
     n = np.stack([row.n for row in rows])
-    newest = len(rows) - 1 - np.argmax(n[::-1] > 0, axis=0)  # a number without values takes the NaN of any row
+    newest = len(rows) - 1 - np.argmax(n[::-1] > 0, axis=0)  # without values, the NaN of any row is taken
     counts = tuple(sum(each) for each in zip(*(row.counts for row in rows), strict=True))
     return HistoryRow(
         start_s,
@@ -188,7 +149,7 @@ def pack_count_min_max_last(row: HistoryRow) -> bytes:
 
 
 def unpack_count_min_max_last(data: bytes, count: int) -> tuple[Ints, Singles, Singles, Singles]:
-    """Return the count, minimum, maximum and last value of each number in packed bytes.
+    """Return the count, minimum, maximum and last value of each column in packed bytes.
 
     Parameters
     ----------
@@ -200,7 +161,7 @@ def unpack_count_min_max_last(data: bytes, count: int) -> tuple[Ints, Singles, S
     Raises
     ------
     RecordingError
-        If the bytes cannot be decompressed or do not hold ``count`` columns.
+        If the bytes cannot be decompressed, or do not contain ``count`` columns.
     """
     size = 16 * count
     try:

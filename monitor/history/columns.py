@@ -1,11 +1,13 @@
 """Columns of a history row, and the conversion of an estimate into column values.
 
-Each measured axis and symbol has four columns. ``gz.N`` is the value, if it is estimated. ``gz.N.lo`` and ``gz.N.hi``
-are the ends of its interval. ``gz.N.bound`` is the upper bound, if the data only bound the value. The set of present
-columns encodes the status, so a value is never stored without its status. Deviations are stored at the averaging times
-1, 3, 10 … s (``gz.sigma.0.3``). The grid of the curve depends on the measured rate, so the deviations are interpolated
-linearly in log-log between two neighbouring points. Half an octave from a point of a five-term curve, the error is
-below 1 %. The module does no I/O.
+Each noise coefficient of a measured axis has four columns. For example, ``gz.N`` is the estimated value of N on axis
+gz. ``gz.N.lo`` and ``gz.N.hi`` are the ends of the confidence interval. ``gz.N.bound`` is the upper bound, if the data
+only bound the value. The status of a coefficient follows from the columns that have a value.
+
+Allan deviations have columns such as ``gz.sigma.0.3``, for averaging times of 1 and 3 times powers of ten in seconds.
+The averaging times of an estimate depend on the measured rate, so the deviations are interpolated linearly in log-log
+between two neighbouring points. The error is below 1 % for a deviation with five noise terms, half an octave from a
+point. The module does no I/O.
 """
 
 from typing import Final
@@ -18,25 +20,25 @@ from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 
 TAU_S: Final = tuple(float(f"{one}e{power}") for power in range(-4, 6) for one in (1, 3))
-"""Averaging times of stored deviations [s], from 0.1 ms to 300 000 s; each window covers a part of them."""
+"""Averaging times of stored deviations [s], from 0.1 ms to 300 000 s. A window covers a part of this range."""
 HEALTH_COLUMNS: Final = ("rate", "latency", "memory")
 """Sample rate [Hz], 99th percentile of the latency from receipt to publication [s], memory of the process [bytes]."""
 TEMPERATURE_COLUMNS: Final = ("temperature",)
 """Mean temperature of a batch [°C]."""
 VALUE_SUFFIXES: Final = ("", ".lo", ".hi", ".bound")
 TAU_MATCH_RATIO: Final = 1.02
-"""A point of the curve within this factor of a stored averaging time is used without interpolation."""
+"""A deviation within this factor of a stored averaging time is used without interpolation."""
 MAX_TAU_RATIO: Final = 2.5
 """Largest ratio of neighbouring averaging times between which deviations are interpolated."""
 
 
 class ColumnConverter:
-    """Converter of estimates with one set of axes and averaging times into column values.
+    """Converter of estimates into column values, for fixed axes and averaging times.
 
     Parameters
     ----------
     estimate
-        The first estimate. Later estimates can be converted if ``fit`` returns True for them.
+        First estimate, which determines the axes and the averaging times.
     """
 
     def __init__(self, estimate: Estimate) -> None:
@@ -58,7 +60,7 @@ class ColumnConverter:
         self._coefficient_count = len(self._coefficient_indices)
 
     def is_compatible(self, estimate: Estimate) -> bool:
-        """Return True if an estimate has the measured axes and averaging times of the first estimate."""
+        """Return True if an estimate has the same measured axes and averaging times as the first estimate."""
         tau_s = estimate.curve.tau_s
         same = tau_s is self._tau_s or np.array_equal(tau_s, self._tau_s)
         return same and bool((_measured(estimate) == self._measured).all())
@@ -86,13 +88,13 @@ class ColumnConverter:
 
 
 def _measured(estimate: Estimate) -> NDArray[np.bool_]:
-    """Return which of the six axes have a curve; every curve has a value at the shortest τ."""
+    """Return for each of the six axes whether the axis has a deviation at the shortest averaging time."""
     shortest = estimate.curve.avar[0]
     return np.asarray(~np.isnan(shortest))
 
 
 def _interpolation_points(tau_s: Floats) -> "tuple[list[int], list[int], list[int], Floats]":
-    """Return indices of TAU_S within the curve, its points below and above, and the log-distance from below, 0 to 1."""
+    """Return the usable indices of TAU_S, the points below and above, and the log-distance from below, 0 to 1."""
     at, below, above, share = [], [], [], []
     for i, wanted in enumerate(TAU_S):
         near = int(np.argmin(np.abs(np.log(tau_s / wanted)))) if tau_s.size else 0

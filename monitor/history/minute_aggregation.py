@@ -1,9 +1,9 @@
 """Aggregation of one device's results into rows of one minute, by the time of the samples.
 
-A row is returned when the first result of the next minute arrives. A result that is slightly late is counted in the
+A row is returned when the first result of the next minute arrives. A result that is slightly late is added to the
 current row. A result from an earlier time begins a new row, for example after the clock was set back or when a
-recording is replayed. The store merges this row with the existing one. When the process ends, at most one minute of
-aggregated results is lost. The module does no I/O.
+recording is replayed. The store merges the new row with the stored row. If the process is killed, at most one minute of
+results is lost. The module does no I/O.
 """
 
 from typing import Final
@@ -13,12 +13,12 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.health import Health
 from monitor.estimation.estimate import Estimate
-from monitor.history.bucket import STATES, HistoryRow, RunningStatistics, combine_sources
+from monitor.history.bucket import STATES, HistoryRow, RunningStatistics
 from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
 
 MINUTE_S: Final = 60
 LATE_TOLERANCE_S: Final = 5.0
-"""Tolerance for results that arrive out of order: batches and estimates of the same time are not reported together."""
+"""Tolerance for results that arrive out of order, because batches and estimates are not reported together."""
 
 
 class MinuteAggregator:
@@ -31,19 +31,19 @@ class MinuteAggregator:
         self._estimates: RunningStatistics | None = None
         self._health = RunningStatistics(HEALTH_COLUMNS)
         self._temperature = RunningStatistics(TEMPERATURE_COLUMNS)
-        self._previous_counters = (0, 0, 0, 0)  # counters at the last report, since the start of the device
+        self._previous_counters = (0, 0, 0, 0)  # counters at the last report
         self._counts = (0, 0, 0, 0)  # increments within this minute
         self._state = 0
 
     def add_estimate(self, unix_s: float, estimate: Estimate) -> HistoryRow | None:
-        """Add an estimate, and return the previous row if the estimate begins a new one.
+        """Add an estimate, and return the completed row if a new row begins.
 
         Parameters
         ----------
         unix_s
             Unix time of the estimate [s].
         estimate
-            The estimate.
+            Estimate to add.
         """
         full = self._advance(unix_s)
         if self._numbers is None or not self._numbers.is_compatible(estimate):
@@ -58,7 +58,7 @@ class MinuteAggregator:
         return full
 
     def add_temperature(self, unix_s: float, temperature_c: Floats) -> HistoryRow | None:
-        """Add the mean temperature of a batch, and return the previous row if a new one begins.
+        """Add the mean temperature of a batch, and return the completed row if a new row begins.
 
         Parameters
         ----------
@@ -75,20 +75,20 @@ class MinuteAggregator:
         return full
 
     def add_health(self, unix_s: float, health: Health) -> HistoryRow | None:
-        """Add a health report, and return the previous row if a new one begins.
+        """Add a health report, and return the completed row if a new row begins.
 
         Parameters
         ----------
         unix_s
             Unix time of the report [s].
         health
-            Health of the device. Its counters run since the start; the increments since the last report are stored.
+            Health of the device. The row receives the increments of the counters since the last report.
         """
         full = self._advance(unix_s)
         known = [np.nan if one is None else float(one) for one in (health.rate_hz, health.latency_p99_s)]
         self._health.add(np.array([*known, float(health.memory_bytes)]))
         counted = (health.received, health.lost, health.bad, health.overflowed)
-        # A counter below its previous value has been restarted from zero.
+        # a counter below the previous value was restarted from zero
         more = tuple(
             now - old if now >= old else now for now, old in zip(counted, self._previous_counters, strict=True)
         )
@@ -99,7 +99,7 @@ class MinuteAggregator:
         return full
 
     def flush(self) -> HistoryRow | None:
-        """Return the current, incomplete row and close it; None if there were no results."""
+        """Close the current, incomplete row and return it; None if there were no results."""
         return self._close_row() if self._start_s is not None else None
 
     def _advance(self, unix_s: float) -> HistoryRow | None:
@@ -114,16 +114,22 @@ class MinuteAggregator:
 
     def _close_row(self) -> HistoryRow:
         """Close the current row and return it."""
-        parts = [part for part in (self._estimates, self._health, self._temperature) if part is not None]
-        parts = [part for part in parts if part.count.any()]
+        sources = (self._estimates, self._health, self._temperature)
+        parts = [one for one in sources if one is not None and one.count.any()] or [self._health]
         assert self._start_s is not None
-        row = combine_sources(
-            self._start_s, MINUTE_S, self._newest_s, parts or [self._health], self._counts, self._state
+        row = HistoryRow(
+            self._start_s,
+            MINUTE_S,
+            self._newest_s,
+            tuple(name for part in parts for name in part.names),
+            np.concatenate([part.count for part in parts]),
+            np.concatenate([part.minimum for part in parts]),
+            np.concatenate([part.maximum for part in parts]),
+            np.concatenate([part.last for part in parts]),
+            self._counts,
+            self._state,
         )
-        self._estimates, self._health, self._temperature = (
-            None,
-            RunningStatistics(HEALTH_COLUMNS),
-            RunningStatistics(TEMPERATURE_COLUMNS),
-        )
+        self._estimates, self._health = None, RunningStatistics(HEALTH_COLUMNS)
+        self._temperature = RunningStatistics(TEMPERATURE_COLUMNS)
         self._counts, self._state, self._start_s = (0, 0, 0, 0), 0, None
         return row

@@ -1,8 +1,8 @@
 """Query of a device's history, parsed from the parameters of a zenoh selector.
 
 Parameters are ``_time=[…]`` (default: the last day), ``step=15min``, ``what=coefficients,deviations,status,events``,
-``axis=gz,gx`` and ``letter=N,B``. Parameters that begin with ``_`` belong to zenoh and are ignored. Any other parameter
-raises a ConfigError. The module does no I/O.
+``axis=gz,gx`` and ``letter=N,B``. Other parameters that begin with ``_`` are parameters of zenoh and are ignored. Any
+other parameter raises a ConfigError. The module does no I/O.
 """
 
 import re
@@ -23,7 +23,7 @@ STATUS: Final = "status"
 EVENTS: Final = "events"
 PARTS: Final = (COEFFICIENTS, DEVIATIONS, STATUS, EVENTS)
 DEFAULT_PARTS: Final = (COEFFICIENTS, STATUS, EVENTS)
-"""Parts returned by default; deviations would be larger than all other parts together."""
+"""Parts that are returned by default. Deviations would be larger than all other parts together."""
 PARAMETER_NAMES: Final = ("_time", "step", "what", "axis", "letter")
 MAX_PARAMETERS_LENGTH: Final = 1000
 """Longest accepted parameter string [characters]."""
@@ -32,7 +32,7 @@ _PART: Final = re.compile(r"([^=;]+)(?:=((?:[\[\]][^\[\]]*[\[\]])|[^;]*))?(?:;|$
 
 @dataclass(frozen=True, slots=True)
 class HistoryQuery:
-    """A query: time range, bucket width and the requested parts, axes and coefficients."""
+    """Query with time range, bucket width, and the requested parts, axes and coefficients."""
 
     span: TimeRange | None = None  # None: the last day of the stored history
     step_s: int | None = None  # None: chosen by the reader
@@ -106,14 +106,14 @@ def parse_query(parameters: str, now_s: float) -> HistoryQuery:
 
 
 def _split(parameters: str) -> Mapping[str, str]:
-    """Split parameters into keys and values; a semicolon within the brackets of a time range does not separate them."""
+    """Split parameters into keys and values at the semicolons outside the brackets of a time range."""
     if len(parameters) > MAX_PARAMETERS_LENGTH:
         raise ConfigError(f"parameters of {len(parameters)} characters; at most {MAX_PARAMETERS_LENGTH}")
     return {key.strip(): (value or "").strip() for key, value in _PART.findall(parameters)}
 
 
 def _parse_list(key: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
-    """Parse a comma-separated list, and return its words in the order of ``known``."""
+    """Return the words of a comma-separated list, in the order of ``known``."""
     words = [word.strip() for word in text.split(",") if word.strip()]
     for word in words:
         if word not in known:

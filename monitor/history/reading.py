@@ -1,8 +1,8 @@
-"""Read the stored results of a time range as one table with a limited number of buckets.
+"""Reading of the stored results of a time range as a table with a limited number of buckets.
 
-``read_history`` merges the rows of each bucket while it reads them from disk. Memory therefore depends on the number of
-points requested and not on the length of the time range. A bucket is never narrower than the stored rows of its time.
-Merging (see ``bucket``) preserves the extremes.
+``read_history`` merges the rows of each bucket while reading, so the memory depends on the number of requested points
+and not on the length of the time range. A bucket is at least as wide as the stored rows in the bucket. Merging (see
+``bucket``) preserves minima and maxima.
 """
 
 import math
@@ -23,26 +23,26 @@ from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 
 DEFAULT_POINTS: Final = 1000
-"""Approximate number of buckets in a table; at most twice as many if old and new rows differ in width."""
+"""Approximate number of buckets in a table. If rows differ in width, there may be up to twice as many."""
 MAX_EVENTS: Final = 1000
 BUCKET_WIDTHS_S: Final = (
     *(60, 300, 900, 1800, 3600, 10_800, 21_600, 43_200),
     *(days * DAY_S for days in (1, 2, 4, 7, 30, 90, 365)),
 )
-"""Permitted bucket widths [s]; each is a multiple of every row width that is not larger."""
+"""Permitted bucket widths [s]. A width is a multiple of every row width that is not larger."""
 
 
 @dataclass(frozen=True, slots=True)
 class HistoryTable:
-    """History of one device: k numbers in p buckets, ordered by time."""
+    """History of one device: k columns in p buckets, ordered by time."""
 
     device: str
-    span: TimeRange  # the requested time range, clipped to the stored one
-    step_s: int  # width of the buckets, except where the stored rows are wider
+    span: TimeRange  # requested time range, clipped to the stored time range
+    step_s: int  # width of the buckets, unless the stored rows are wider
     start_s: Ints  # [p] Unix time
     width_s: Ints  # [p]
     names: tuple[str, ...]  # [k], see ``columns``
-    n: Ints  # [p, k] count of values
+    n: Ints  # [p, k] number of values
     low: Singles  # [p, k] SI; NaN if the bucket has no value
     high: Singles
     last: Singles
@@ -60,7 +60,7 @@ class HistoryTable:
         return self.start_s + self.width_s
 
     def column(self, name: str) -> "ColumnStatistics":
-        """Return one number over time; all values are missing if the table has no column of this name."""
+        """Return one column over time; all values are missing if the table has no column of this name."""
         if name not in self.names:
             nothing: Floats = np.full(len(self), np.nan)
             return ColumnStatistics(np.zeros(len(self), np.int64), nothing, nothing, nothing)
@@ -74,16 +74,16 @@ class HistoryTable:
         return tuple(found)
 
     def taus(self) -> tuple[str, ...]:
-        """Return the averaging times of the deviations [s] as they appear in the column names, in ascending order."""
+        """Return the averaging times of the deviations [s] as written in the column names, in ascending order."""
         found = {name.split(".sigma.")[1] for name in self.names if ".sigma." in name}
         return tuple(sorted(found, key=float))
 
 
 @dataclass(frozen=True, slots=True)
 class ColumnStatistics:
-    """One number over p buckets."""
+    """Statistics of one column over p buckets."""
 
-    n: Ints  # [p] count of values
+    n: Ints  # [p] number of values
     low: Floats  # [p] NaN if the bucket has no value
     high: Floats
     last: Floats
@@ -106,11 +106,11 @@ def read_history(
     device
         Name of the device.
     span
-        Time range. None: the last stored day.
+        Time range; None for the last stored day.
     wanted
-        Predicate that selects columns by name.
+        Returns True for the name of a column that is wanted.
     step_s
-        Minimum bucket width [s]. None: as narrow as ``points`` allows.
+        Minimum bucket width [s]; None for the width that follows from ``points``.
     points
         Approximate number of buckets.
 
@@ -138,7 +138,7 @@ def read_history(
     found = [merge_rows(part, *key) for key, part in sorted(parts.items())]
     events, in_all = reader.events(device, span, MAX_EVENTS)
     if not found and not events:
-        raise NotReady(f"{device}: nothing in that time; kept are {_format_range(held)}")
+        raise NotReady(f"{device}: no results in this time range; stored are {_format_range(held)}")
     return build_table(device, span, step_s, found, events, in_all)
 
 
@@ -189,7 +189,7 @@ def build_table(
 
 
 def bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
-    """Return the bucket width [s]: the smallest permitted one for this number of points, at least ``step_s``.
+    """Return the smallest permitted bucket width [s] for a number of points, at least ``step_s``.
 
     >>> bucket_width_s(TimeRange(0.0, 86_400.0)), bucket_width_s(TimeRange(0.0, 5 * 31_536_000.0))
     (300, 172800)
@@ -213,7 +213,7 @@ def bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEF
 
 
 def _clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
-    """Clip a time range to the stored one, extended by one day, because events may lie outside the rows."""
+    """Clip a time range to the stored time range plus one day, because events may be outside the stored rows."""
     start_s, end_s = max(span.start_s, held[0] - DAY_S), min(span.end_s, held[1] + DAY_S)
     return replace(span, start_s=min(start_s, end_s), end_s=max(start_s, end_s))
 
@@ -226,5 +226,4 @@ def _bucket(row: HistoryRow, step_s: int) -> tuple[int, int]:
 
 def _format_range(held: tuple[float, float]) -> str:
     """Format the stored time range for a message."""
-
     return f"{format_utc(held[0])} to {format_utc(held[1])} UTC"

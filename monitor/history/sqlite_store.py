@@ -1,13 +1,13 @@
-"""History on disk: one SQLite file in WAL mode, with one writer and any number of readers in threads and processes.
+"""History file: one SQLite file in WAL mode, with one writer and any number of readers in threads and processes.
 
-Rows have three levels: one minute for a week, 15 minutes for three months, and six hours without limit. Age is counted
-from a device's newest row, or from the current time if the newest row lies in the future.
+Rows have three widths: one minute for a week, 15 minutes for three months, and six hours for all earlier times. The age
+of a row is counted from the newest row of the device, or from the current time if that row is in the future.
 ``HistoryStore.merge_old_rows`` merges the rows of one wider bucket per transaction, so each moment belongs to exactly
 one row even if the process is killed. A row for an existing bucket is merged with the stored row. Restarts, late rows
 and repeated replays therefore leave one row per bucket.
 
-A file that is damaged, was written by a newer version, or is not a history is never modified. RecordingError names the
-cause. Errors of a full or read-only disk are raised as ``sqlite3.Error``. A transaction is complete or has no effect.
+A file that is damaged, was written by a newer version, or is not a history is never modified. RecordingError states the
+reason. Errors of a full or read-only disk are raised as ``sqlite3.Error``. A transaction is complete or has no effect.
 """
 
 import contextlib
@@ -49,7 +49,7 @@ FILE_NAME: Final = "history.sqlite"
 VERSION: Final = 1
 APPLICATION: Final = 0x494D5548  # "IMUH"
 LEVELS: Final = ((60, 7 * DAY_S), (900, 90 * DAY_S), (21_600, None))
-"""Width of the rows of a level [s], and the age at which they are merged into the next level [s]; None: never."""
+"""Width of rows [s], and the age at which they are merged into rows of the next width [s]; None: never."""
 BUSY_TIMEOUT_S: Final = 5.0
 CACHE_KIB: Final = 2048
 SCHEMA: Final = """
@@ -69,7 +69,7 @@ CREATE INDEX event_time ON event (device, t);
 """
 TABLES: Final = frozenset({"device", "layout", "row", "event"})
 SQLITE_SUFFIXES: Final = ("-wal", "-shm", "-journal")
-"""Suffixes of the files that SQLite keeps next to a database."""
+"""Suffixes of the additional files of an SQLite database."""
 DELETED: Final = "was deleted or renamed"
 REPLACED: Final = "was replaced by another file"
 EMPTIED: Final = "was emptied"
@@ -83,23 +83,23 @@ _FileState = tuple[int, int, int, int]
 
 
 class UnusableHistory(RecordingError):
-    """Error: the history file is damaged or holds something else."""
+    """Error: the history file is damaged or is not a history."""
 
 
 class HistoryStore:
-    """Writer of a history file; it must be used by one thread only.
+    """Writer of a history file, for one thread.
 
     Parameters
     ----------
     path
-        The file. The file and its folder are created if they do not exist.
+        History file. Missing files and folders are created.
 
     Raises
     ------
     RecordingError
         If the file is not a history, is damaged, or was written by a newer version.
     sqlite3.Error, OSError
-        If the file cannot be opened now.
+        If the file cannot be opened at present.
     """
 
     def __init__(self, path: Path) -> None:
@@ -107,7 +107,7 @@ class HistoryStore:
         check_folder_or_absent(path.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
         _check_files(path)
-        path.touch()  # the file needs an inode that can be compared before SQLite opens it
+        path.touch()  # creates an inode that can be compared after SQLite has opened the file
         before = os.stat(path)
         self._files = _file_states(path)
         self._db = sqlite3.connect(path, timeout=BUSY_TIMEOUT_S, isolation_level=None, check_same_thread=False)
@@ -129,12 +129,12 @@ class HistoryStore:
         if not _is_history(self._db, self.path):
             self._db.execute("PRAGMA journal_mode = WAL")
             with self._transaction():
-                if not _is_history(self._db, self.path):  # another process may have created the tables meanwhile
+                if not _is_history(self._db, self.path):  # another process may have created the tables
                     for statement in SCHEMA.split(";"):
                         self._db.execute(statement)
                     self._db.execute(f"PRAGMA application_id = {APPLICATION}")
                     self._db.execute(f"PRAGMA user_version = {VERSION}")
-        # Each commit, one per minute, is flushed to disk. The cost is negligible; a power cut loses one commit at most.
+        # each commit is flushed to disk, about once a minute, so a power failure loses at most one commit
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
 
@@ -163,14 +163,14 @@ class HistoryStore:
         self._files = _file_states(self.path)
 
     def merge_old_rows(self, now_s: float, at_most: int = 100) -> int:
-        """Merge rows that are old enough, and return the number of merged buckets; 0 if nothing is due.
+        """Merge rows that are old enough, and return the number of merged buckets.
 
         Parameters
         ----------
         now_s
             Current Unix time [s].
         at_most
-            Limit of the number of buckets merged in this call.
+            Largest number of buckets to merge in this call.
 
         Raises
         ------
@@ -196,9 +196,9 @@ class HistoryStore:
         return done
 
     def describe_external_change(self) -> str:
-        """Return how another program has changed the file since this store last used the file; "" if unchanged.
+        """Return how another program has changed the file since the last use of this store; "" if unchanged.
 
-        SQLite does not detect such changes: it would continue to write to a file that has been deleted.
+        SQLite does not detect such changes and would continue to write to a deleted file.
         """
         now = _file_states(self.path)
         if now == self._files:
@@ -211,10 +211,10 @@ class HistoryStore:
         return CHANGED if file[2] else EMPTIED
 
     def close(self) -> None:
-        """Close the connection; if there is no reader, the log is merged into the file.
+        """Close the connection. Without readers, SQLite merges the write-ahead log into the file.
 
-        SQLite does not merge the log of a file that was deleted or renamed. If another program has overwritten the
-        file, SQLite would apply the log to the new content. This method handles both cases.
+        SQLite does not merge the log if the file was deleted or renamed, so this method does. If another program has
+        overwritten the file, SQLite would apply the log to the new content, so this method empties the log.
         """
         before, now = self._files[0], _file_states(self.path)[0]
         if before is not None and (now is None or now[:2] != before[:2]):
@@ -249,19 +249,13 @@ class HistoryStore:
         self._db.execute(
             f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
-                device,
-                row.start_s,
-                row.width_s,
-                row.newest_s,
-                self._layouts.id(row.names),
-                *row.counts,
-                row.state,
-                pack_count_min_max_last(row),
+                *(device, row.start_s, row.width_s, row.newest_s, self._layouts.id(row.names)),
+                *(*row.counts, row.state, pack_count_min_max_last(row)),
             ),
         )
 
     def _newest_end_s(self) -> dict[int, float]:
-        """Return the end of each device's newest row (Unix time); -inf for a device without rows."""
+        """Return the end of the newest row of each device (Unix time); -inf without rows."""
         devices = [one for (one,) in self._db.execute("SELECT id FROM device").fetchall()]
         spans = {device: _stored_span(self._db, device) for device in devices}
         return {device: -math.inf if span is None else span[1] for device, span in spans.items()}
@@ -297,11 +291,9 @@ class HistoryStore:
     # --- internal
 
     def _device_id(self, name: str) -> int:
-        """Return the identifier of a device, which is created if it does not exist."""
+        """Return the identifier of a device. A new device gets a new identifier."""
         if name not in self._devices:
-            self._db.execute("INSERT OR IGNORE INTO device (name) VALUES (?)", (name,))
-            (found,) = self._db.execute("SELECT id FROM device WHERE name = ?", (name,)).fetchone()
-            self._devices[name] = int(found)
+            self._devices[name] = _identifier(self._db, "device", "name", name)
         return self._devices[name]
 
     def _refresh_identifiers(self) -> None:
@@ -325,7 +317,7 @@ class HistoryStore:
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
-        """Run the body in one transaction, which is rolled back if the body raises."""
+        """Run the body in one transaction, which is rolled back after an exception."""
         self._db.execute("BEGIN IMMEDIATE")
         try:
             self._refresh_identifiers()
@@ -340,7 +332,7 @@ class HistoryStore:
 
 
 class HistoryReader:
-    """Reader of a history file; all its results belong to one moment. Created by ``open_history``."""
+    """Reader of a history file, created by ``open_history``. All results show the file at one moment."""
 
     def __init__(self, db: sqlite3.Connection, path: Path) -> None:
         self._db = db
@@ -352,17 +344,17 @@ class HistoryReader:
         return tuple(name for (name,) in self._db.execute("SELECT name FROM device ORDER BY name"))
 
     def stored_range(self, device: str) -> tuple[float, float] | None:
-        """Return the start and end of the stored rows of a device (Unix time [s]); None if there are no rows."""
+        """Return the start and end of the stored rows of a device (Unix time [s]); None without rows."""
         return _stored_span(self._db, self._id(device))
 
     def newest_s(self, device: str) -> float:
-        """Return the Unix time of the newest result of a device [s]; NaN if there are no rows."""
+        """Return the Unix time of the newest result of a device [s]; NaN without rows."""
         query = "SELECT newest FROM row WHERE device = ? AND width = ? ORDER BY start DESC LIMIT 1"
         found = [self._db.execute(query, (self._id(device), width_s)).fetchone() for width_s, _ in LEVELS]
         return max((one[0] for one in found if one is not None), default=math.nan)
 
     def rows(self, device: str, span: TimeRange) -> Iterator[HistoryRow]:
-        """Iterate over the rows that overlap a time range: the widest level first, each level in order of time.
+        """Iterate over the rows that overlap a time range: wide rows first, rows of one width in order of time.
 
         Parameters
         ----------
@@ -382,7 +374,7 @@ class HistoryReader:
                     yield row
 
     def events(self, device: str, span: TimeRange, at_most: int) -> tuple[list[StoredEvent], int]:
-        """Return the newest events in a time range, in order of time, and the number of all events in it.
+        """Return the newest events in a time range, in order of time, and the number of all events in this range.
 
         Parameters
         ----------
@@ -420,7 +412,7 @@ def open_history(path: Path) -> Iterator[HistoryReader]:
     try:
         with _damage_as_unusable(path), contextlib.closing(_open_read_only(path)) as db:
             if not _is_history(db, path):
-                raise RecordingError(f"{path}: nothing is in it yet")
+                raise RecordingError(f"{path}: the history is still empty")
             db.execute("BEGIN")
             yield HistoryReader(db, path)
     except sqlite3.OperationalError as error:
@@ -428,7 +420,7 @@ def open_history(path: Path) -> Iterator[HistoryReader]:
 
 
 def _stored_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | None:
-    """Return the start and end of the rows of a device; each end is one index lookup and needs no scan."""
+    """Return the start and end of the rows of a device, each by one index lookup."""
     starts: list[int] = []
     ends: list[int] = []
     for width_s, _ in LEVELS:
@@ -441,7 +433,7 @@ def _stored_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | N
 
 
 def _is_history(db: sqlite3.Connection, path: Path) -> bool:
-    """Return True if the database is a history and False if it is empty; raise an error for any other database."""
+    """Return True for a history and False for an empty database; raise an error for any other database."""
     (version,), (application,) = (
         db.execute(f"PRAGMA {what}").fetchone() for what in ("user_version", "application_id")
     )
@@ -459,7 +451,7 @@ def _is_history(db: sqlite3.Connection, path: Path) -> bool:
 
 
 class _LayoutCache:
-    """Cache of layouts: the column names of rows, each stored once in the file under an identifier."""
+    """Cache of layouts. A layout is a tuple of column names, which the file stores once under an identifier."""
 
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
@@ -472,16 +464,13 @@ class _LayoutCache:
         self._names.clear()
 
     def id(self, names: tuple[str, ...]) -> int:
-        """Return the identifier of a layout, which is created if it does not exist."""
+        """Return the identifier of a layout. A new layout gets a new identifier."""
         if names not in self._ids:
-            text = " ".join(names)
-            self._db.execute("INSERT OR IGNORE INTO layout (names) VALUES (?)", (text,))
-            (found,) = self._db.execute("SELECT id FROM layout WHERE names = ?", (text,)).fetchone()
-            self._ids[names] = int(found)
+            self._ids[names] = _identifier(self._db, "layout", "names", " ".join(names))
         return self._ids[names]
 
     def row(self, found: Sequence[Any]) -> HistoryRow:
-        """Convert the selected database columns into a row."""
+        """Convert a record of the database into a row."""
         start, width, newest, layout, received, lost, bad, overflowed, state, data = found
         whole = (start, width, layout, received, lost, bad, overflowed, state)
         if not (all(isinstance(one, int) for one in whole) and isinstance(newest, float) and isinstance(data, bytes)):
@@ -498,28 +487,28 @@ class _LayoutCache:
         return HistoryRow(start, width, newest, names, *unpack_count_min_max_last(data, len(names)), counts, state)
 
 
+def _identifier(db: sqlite3.Connection, table: str, column: str, text: str) -> int:
+    """Return the identifier of a text in a table. A new text is inserted."""
+    db.execute(f"INSERT OR IGNORE INTO {table} ({column}) VALUES (?)", (text,))
+    return int(db.execute(f"SELECT id FROM {table} WHERE {column} = ?", (text,)).fetchone()[0])
+
+
 def _open_read_only(path: Path) -> sqlite3.Connection:
-    """Open a file for reading; as immutable if there is no log and the folder cannot be written to."""
-    options = ["mode=ro"]
-    if not Path(f"{path}-wal").exists():
-        options.append("mode=ro&immutable=1")
-    for option in options:
-        db = sqlite3.connect(
-            f"{path.resolve().as_uri()}?{option}", uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None
-        )
-        try:
-            db.execute("SELECT count(*) FROM sqlite_master").fetchone()
-        except sqlite3.OperationalError:
-            db.close()
-            if option == options[-1]:
-                raise
-        else:
-            return db
-    raise AssertionError("one of them was the last")
+    """Open a file for reading. Without a log and without write access to the folder, open it as immutable."""
+    uri = f"{path.resolve().as_uri()}?mode=ro"
+    db = sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
+    try:
+        db.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    except sqlite3.OperationalError:
+        db.close()
+        if Path(f"{path}-wal").exists():
+            raise
+        db = sqlite3.connect(f"{uri}&immutable=1", uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
+    return db
 
 
 def _file_states(path: Path) -> tuple[_FileState | None, _FileState | None]:
-    """Return the state of the file and of its log; None for a missing file, and for a missing or empty log."""
+    """Return the state of the file and of its log; None for a missing file, or a missing or empty log."""
     found: list[_FileState | None] = []
     for one in (path, Path(f"{path}-wal")):
         try:
@@ -533,7 +522,7 @@ def _file_states(path: Path) -> tuple[_FileState | None, _FileState | None]:
 
 
 def _check_files(path: Path) -> None:
-    """Raise OSError if the file, or a file that SQLite keeps next to it, is not a regular file."""
+    """Raise OSError if the file, or an additional file of the database, is not a regular file."""
     for end in ("", *SQLITE_SUFFIXES):
         with contextlib.suppress(FileNotFoundError):
             check_regular(Path(f"{path}{end}"))
@@ -541,7 +530,7 @@ def _check_files(path: Path) -> None:
 
 @contextlib.contextmanager
 def _damage_as_unusable(path: Path) -> Iterator[None]:
-    """Raise damage of the file as UnusableHistory; errors that may pass (busy, full, read-only) are not changed."""
+    """Raise UnusableHistory for a damaged file. Temporary errors (busy, full, read-only) are not changed."""
     try:
         yield
     except sqlite3.OperationalError:

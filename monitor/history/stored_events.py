@@ -1,8 +1,8 @@
-"""Events of a history file: insertion, reading, and the thinning of events that are too many.
+"""Events of a history file: insertion, reading and thinning.
 
-All events are kept up to MAX_EVENTS per device. Beyond that limit, only the first, the last and the most significant
-event of each kind, axis and day are kept. If this is not sufficient, the same is done per month and then per year.
-``represented_events`` of the last event counts the deleted ones.
+If a device has more than MAX_EVENTS events, only the first, the last and the most significant event of each kind, axis
+and day are kept. If too many events remain, only three per month, and then only three per year, are kept in this way.
+``represented_events`` of the last event includes the number of deleted events.
 """
 
 import math
@@ -13,20 +13,20 @@ from typing import Any, Final
 
 import msgspec
 
+from drivers.quantities import DAY_S
 from monitor.history.time_ranges import TimeRange
 
-DAY_S: Final = 86_400
 MAX_EVENTS: Final = 20_000
 """Largest number of events per device."""
 THINNING_SPANS_S: Final = (DAY_S, 30 * DAY_S, 365 * DAY_S)
-"""Lengths of the time ranges of which only a few events are kept [s]."""
+"""Lengths of the time ranges in which only a few events are kept [s]."""
 MAX_TEXT_LENGTH: Final = 2000
 _FIELDS: Final = "t, kind, text, axis, what, since, sigma, stands_for"
 
 
 @dataclass(frozen=True, slots=True)
 class StoredEvent:
-    """An event of a device, as it is stored."""
+    """Stored event of a device."""
 
     t_s: float  # Unix time
     kind: str
@@ -35,11 +35,11 @@ class StoredEvent:
     what: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     since_s: float | None = None  # Unix time at which the reported condition began
     sigma: float | None = None
-    represented_events: int = 1  # number of events it represents: itself, and deleted earlier events of its kind
+    represented_events: int = 1  # this event, and deleted earlier events of the same kind
 
 
 def insert_event(db: sqlite3.Connection, device: int, event: StoredEvent) -> None:
-    """Insert an event.
+    """Insert an event into the history file.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def insert_event(db: sqlite3.Connection, device: int, event: StoredEvent) -> Non
     device
         Identifier of the device.
     event
-        The event.
+        Event to insert.
     """
     text, values = event.text[:MAX_TEXT_LENGTH], _encode_values(event.what)
     fields = (event.t_s, event.kind, text, event.axis, values, event.since_s, event.sigma, event.represented_events)
@@ -56,7 +56,7 @@ def insert_event(db: sqlite3.Connection, device: int, event: StoredEvent) -> Non
 
 
 def read_events(db: sqlite3.Connection, device: int, span: TimeRange, at_most: int) -> tuple[list[StoredEvent], int]:
-    """Return the newest events in a time range, in order of time, and the number of all events in it.
+    """Return the newest events in a time range, in order of time, and the number of all events in this range.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def count_events(db: sqlite3.Connection, device: int) -> int:
 
 
 def thin_events(db: sqlite3.Connection, device: int, span_s: int) -> None:
-    """Keep the first, last and most significant event per kind, axis and time range; the last counts the others.
+    """Keep only the first, last and most significant event of each kind, axis and time range.
 
     Parameters
     ----------
@@ -131,13 +131,13 @@ def clamp_time(t_s: float) -> float:
 
 
 def _encode_values(what: Mapping[str, Mapping[str, float]]) -> str:
-    """Encode event values as JSON, NaN as null. Values that are too long for an event are replaced by ``{}``."""
+    """Encode event values as JSON, with null for NaN. If the JSON is too long, return ``{}``."""
     text = msgspec.json.encode(what).decode()
     return text if len(text) <= MAX_TEXT_LENGTH else "{}"
 
 
 def _decode_values(text: str) -> dict[str, dict[str, float]]:
-    """Decode event values from JSON, null as NaN."""
+    """Decode event values from JSON, with NaN for null."""
     found = msgspec.json.decode(text, type=dict[str, dict[str, float | None]])
     return {
         name: {key: math.nan if one is None else one for key, one in sides.items()} for name, sides in found.items()

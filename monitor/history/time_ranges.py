@@ -1,9 +1,9 @@
 """Parsing and formatting of times, durations and time ranges, as users and zenoh write them.
 
-The selectors of zenoh have ``_time=[<start>..<end>]`` or ``_time=[<start>;<duration>]``. Either end may be omitted,
-and a bracket that points outwards excludes its end. A time is RFC 3339 in UTC, ``now()`` or ``now(-1h)``. Users write
-``-1d``, ``2026-11-20``, ``2026-11-20 14:30`` (UTC) or ``now``. Any other text raises a ConfigError that names the
-accepted forms. Results are Unix times in seconds. The module does no I/O.
+A selector of zenoh has ``_time=[<start>..<end>]`` or ``_time=[<start>;<duration>]``. The start or the end may be
+omitted. A bracket that points outwards excludes this end of the range. Times are ``now()``, ``now(-1h)`` or RFC 3339
+times in UTC. Users write ``-1d``, ``2026-11-20``, ``2026-11-20 14:30`` (UTC) or ``now``. For any other text, a
+ConfigError lists valid examples. Results are Unix times in seconds. The module does no I/O.
 """
 
 import math
@@ -27,9 +27,9 @@ UNITS_S: Final = {
     "d": float(DAY_S),
     "w": 7.0 * DAY_S,
 }
-"""Length of each unit [s]: the units of zenoh, and ``min``, which the configuration file uses for zenoh's ``m``."""
+"""Length of each unit [s]. zenoh writes ``m`` for minutes, the configuration file ``min``."""
 MAX_DURATION_S: Final = 1e11
-"""Longest accepted duration, about three thousand years; longer ones are taken for typing errors."""
+"""Longest valid duration, about three thousand years."""
 MAX_DATE_S: Final = 253_402_300_800.0  # the year 10000
 _DURATION: Final = re.compile(r"\s*([0-9]+(?:\.[0-9]*)?|\.[0-9]+)\s*([a-z]*)\s*")
 _NOW: Final = re.compile(r"now\(\s*([+-]?)\s*([^)]*)\)")
@@ -37,7 +37,7 @@ _NOW: Final = re.compile(r"now\(\s*([+-]?)\s*([^)]*)\)")
 
 @dataclass(frozen=True, slots=True)
 class TimeRange:
-    """A time range from ``start_s`` to ``end_s`` in Unix seconds; an open end is infinite.
+    """Time range from ``start_s`` to ``end_s`` in Unix seconds. A range without start or end is infinite there.
 
     >>> TimeRange(10.0, 20.0).contains(20.0), TimeRange(10.0, 20.0, end_included=False).contains(20.0)
     (True, False)
@@ -45,8 +45,8 @@ class TimeRange:
 
     start_s: float
     end_s: float
-    start_included: bool = True  # True if the range includes its start
-    end_included: bool = True  # True if the range includes its end
+    start_included: bool = True  # True if the start belongs to the range
+    end_included: bool = True  # True if the end belongs to the range
 
     def contains(self, t_s: float) -> bool:
         """Return True if the time range contains ``t_s``."""
@@ -55,7 +55,7 @@ class TimeRange:
         return after and before
 
     def to_zenoh(self) -> str:
-        """Return the range in the notation of zenoh; ends before 1970 are left open, as no results are older."""
+        """Return the range in the notation of zenoh. A time before 1970 or after 9999 is omitted."""
         ends = [
             "" if not 0.0 <= one < MAX_DATE_S else f"{datetime.fromtimestamp(one, UTC):%Y-%m-%dT%H:%M:%S.%fZ}"
             for one in (self.start_s, self.end_s)
@@ -90,7 +90,7 @@ def parse_zenoh_range(text: str, now_s: float) -> TimeRange:
     Parameters
     ----------
     text
-        The parameter, e.g. ``[now(-1h)..now()]``.
+        Value of the parameter, for example ``[now(-1h)..now()]``.
     now_s
         Current Unix time [s].
 
@@ -119,7 +119,7 @@ def parse_zenoh_range(text: str, now_s: float) -> TimeRange:
 
 
 def parse_time(text: str, now_s: float) -> float:
-    """Parse a time as a user writes it, and return Unix time [s].
+    """Parse a time that a user has written, and return Unix time [s].
 
     >>> parse_time("-1d", 90_000.0), parse_time("1970-01-02", 0.0), parse_time("1970-01-01T00:01:30Z", 0.0)
     (3600.0, 86400.0, 90.0)
@@ -127,7 +127,7 @@ def parse_time(text: str, now_s: float) -> float:
     Parameters
     ----------
     text
-        The time, e.g. ``-1d``, ``2026-11-20 14:30`` or ``now``.
+        Time, for example ``-1d``, ``2026-11-20 14:30`` or ``now``.
     now_s
         Current Unix time [s].
 
@@ -147,7 +147,7 @@ def parse_time(text: str, now_s: float) -> float:
 
 
 def parse_duration_s(text: str) -> float:
-    """Parse a duration above zero, and return it in seconds.
+    """Parse a duration above zero, and return the seconds.
 
     >>> parse_duration_s("15min"), parse_duration_s("1d"), parse_duration_s("90")
     (900.0, 86400.0, 90.0)
@@ -174,29 +174,29 @@ def _zenoh_time(text: str, now_s: float) -> float:
 
 
 def _instant(text: str) -> float:
-    """Parse an RFC 3339 time; a date means midnight, and a time without an offset means UTC."""
+    """Parse an RFC 3339 time. A date means midnight, and a time without an offset means UTC."""
     try:
         found = datetime.fromisoformat(text.strip())
         found = found if found.tzinfo is not None else found.replace(tzinfo=UTC)
         return found.timestamp()
     except (ValueError, OverflowError):
         raise ConfigError(
-            f'"{_short(text)}" is no time; write 2026-11-20, 2026-11-20T14:30:00Z, -1d, or now(-1h) in _time'
+            f'"{_short(text)}" is not a time; write 2026-11-20, 2026-11-20T14:30:00Z, -1d, or now(-1h) in _time'
         ) from None
 
 
 def _duration_s(text: str) -> float:
-    """Parse a duration of zero or more, and return it in seconds."""
+    """Parse a duration of zero or more, and return the seconds."""
     match = _DURATION.fullmatch(text)
     if match is None or match[2] not in UNITS_S:
-        raise ConfigError(f'"{_short(text)}" is no duration; write 90s, 30m, 1h, 2d, 1w')
+        raise ConfigError(f'"{_short(text)}" is not a duration; write 90s, 30m, 1h, 2d, 1w')
     seconds = float(match[1]) * UNITS_S[match[2]]
     if seconds > MAX_DURATION_S:
-        raise ConfigError(f'"{_short(text)}" is too long; at most some three thousand years')
+        raise ConfigError(f'"{_short(text)}" is too long; at most about three thousand years')
     return seconds
 
 
 def _short(text: str) -> str:
-    """Return the text shortened to 60 printable characters, for use in an error message."""
+    """Return at most 60 printable characters of a text, for an error message."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     return printable if len(printable) <= 60 else f"{printable[:57]}…"

@@ -1,17 +1,18 @@
-"""Background writer of the history: rows and events are queued, and a thread writes them to a file.
+"""Background writer of the history: rows and events are queued, and a thread writes the queue to a file.
 
-``put`` and ``tell`` add to a bounded queue and return at once. The thread writes the queue in one transaction and then
-merges a few old rows. If a write fails (disk full, read-only or busy), the data remain in the queue and the write is
-repeated. If the queue is full, new data are dropped and counted. A file of a newer version is not modified. Writing
-continues once it has been moved away. A file that is damaged or holds something else is renamed and a new file is
-created, unless ASIDE_AT_MOST renamed files exist already. Before each write and every CHECK_S, the thread checks that
-the file is still the one that it wrote. If the file was deleted, replaced or emptied, a new one is created. ``state``
-reports all of these conditions. ``close`` makes one attempt to write the remaining data.
+``HistoryWriter.queue_item`` adds to a bounded queue and returns at once. The thread writes the queue in one transaction
+and then merges a few old rows. If a write fails (disk full, read-only or busy), the data remain in the queue and the
+write is repeated. If the queue is full, new data are dropped and counted. ``close`` makes one attempt to write the
+remaining data. ``state`` reports errors and changes of the file.
+
+A file of a newer version is not modified, and writing continues as soon as a user has moved the file away. A file that
+is damaged or is not a history is renamed, and a new file is created, unless MAX_RENAMED_FILES renamed files exist.
+Before each write and every CHECK_S, the thread checks whether another program has deleted, replaced or emptied the
+file. In these cases, the thread opens or creates the file again.
 
 Only one process at a time writes the history of a folder (``FolderLock``). While another process holds the lock, rows
-and events are discarded, because that process stores its own. ``state`` names the process. When that process ends,
-this writer continues. It then discards the first row of each device, because that row began earlier and is partly
-stored.
+and events are discarded, because the other process stores the same results. When that process ends, this writer
+continues, but discards the first row of each device, which the other process has stored in part.
 """
 
 import contextlib
@@ -42,17 +43,17 @@ from monitor.history.sqlite_store import (
 from monitor.history.stored_events import StoredEvent
 
 QUEUE_CAPACITY: Final = 4096
-"""Capacity of the queue in rows and events: three days of a full disk with one device, about 12 MB."""
+"""Capacity of the queue in rows and events: about three days of one device, or 12 MB."""
 RETRY_S: Final = 5.0
 CHECK_S: Final = 10.0
-"""Interval between two checks that the file still exists, if there is nothing to write."""
+"""Interval between two checks of the file while the queue is empty."""
 MAX_RENAMED_FILES: Final = 10
-"""Largest number of renamed files; beyond it, an unusable file is left in place until a user intervenes."""
+"""Largest number of renamed files. After that, a user must move an unusable file away."""
 BATCH_SIZE: Final = 256
 MERGES_PER_STEP: Final = 50
 CLOSE_TIMEOUT_S: Final = 10.0
 RENAMED_SUFFIX: Final = ".aside-"
-"""Separator between the name of a history file and the time at which it was renamed."""
+"""Separator between the name of a history file and the time of renaming."""
 
 _log = structlog.get_logger("imu-monitor")
 
@@ -63,7 +64,7 @@ class HistoryWriter:
     Parameters
     ----------
     path
-        The file.
+        History file.
     now_s
         Function that returns the current Unix time [s].
     """
@@ -74,12 +75,11 @@ class HistoryWriter:
         self.written = 0
         self._now_s = now_s
         self._error = ""
-        self._note = ""  # description of the newest incident with the file
+        self._note = ""  # description of the newest change of the file
         self._folder = FolderLock(path.parent, HISTORY_LOCK)
         self._excluded = False  # True if another process writes the history of this folder
-        self._resumed_devices: set[str] | None = (
-            None  # devices whose first row has been discarded; None: discard nothing
-        )
+        # devices whose first row has been discarded; None if no rows are to be discarded
+        self._resumed_devices: set[str] | None = None
         self._waiting: deque[tuple[str, HistoryRow | StoredEvent]] = deque()
         self._lock = threading.Lock()
         self._wake = threading.Event()
@@ -89,8 +89,8 @@ class HistoryWriter:
 
     @property
     def state(self) -> str:
-        """``ok``, or a description of the problem; part of the status message."""
-        dropped = f"{self.dropped} results not kept" if self.dropped else ""
+        """Status message: ``ok``, or a description of the problem."""
+        dropped = f"{self.dropped} results not stored" if self.dropped else ""
         if self._error:
             return f"{self._error} ({dropped})" if dropped else self._error
         but = "; ".join(filter(None, (self._note, self._folder.warning, dropped)))
@@ -100,53 +100,36 @@ class HistoryWriter:
         """Start the thread."""
         self._thread.start()
 
-    def put_row(self, device: str, row: HistoryRow | None) -> None:
-        """Queue a row for writing.
+    def queue_item(self, device: str, item: HistoryRow | StoredEvent | None) -> None:
+        """Queue a row or an event for writing. If the queue is full, drop and count the item.
 
         Parameters
         ----------
         device
             Name of the device.
-        row
-            The row; None is ignored.
+        item
+            Row or event to write. None is ignored.
         """
-        if row is not None:
-            self._push(device, row)
-
-    def put_event(self, device: str, event: StoredEvent) -> None:
-        """Queue an event for writing.
-
-        Parameters
-        ----------
-        device
-            Name of the device.
-        event
-            The event.
-        """
-        self._push(device, event)
+        with self._lock:
+            if item is None or self._discards(device, item):
+                return
+            if len(self._waiting) >= QUEUE_CAPACITY:
+                self.dropped += 1
+            else:
+                self._waiting.append((device, item))
+        self._wake.set()
 
     def close(self) -> None:
-        """Write the remaining data and stop the thread; a thread that needs longer than CLOSE_TIMEOUT_S is logged."""
+        """Write the remaining data and stop the thread. After CLOSE_TIMEOUT_S, log a warning and return."""
         self._closing.set()
         self._wake.set()
         if self._thread.is_alive():
             self._thread.join(CLOSE_TIMEOUT_S)
             if self._thread.is_alive():
-                _log.warning("history did not end in time", path=str(self.path))
-
-    def _push(self, device: str, what: HistoryRow | StoredEvent) -> None:
-        """Add an item to the queue; drop and count it if the queue is full."""
-        with self._lock:
-            if self._discards(device, what):
-                return
-            if len(self._waiting) >= QUEUE_CAPACITY:
-                self.dropped += 1
-            else:
-                self._waiting.append((device, what))
-        self._wake.set()
+                _log.warning("history writer did not end in time", path=str(self.path))
 
     def _discards(self, device: str, what: HistoryRow | StoredEvent) -> bool:
-        """Return True if another process stores this item."""
+        """Return True if another process stores the item."""
         if self._excluded:
             return True
         if self._resumed_devices is None or device in self._resumed_devices or isinstance(what, StoredEvent):
@@ -170,12 +153,12 @@ class HistoryWriter:
                 self._wake.wait(CHECK_S)
         if self._waiting:
             self.dropped += len(self._waiting)
-            _log.warning("history is not whole", path=str(self.path), state=self.state)
+            _log.warning("history is not complete", path=str(self.path), state=self.state)
         self._close_store()
         self._folder.release()
 
     def _write(self) -> bool:
-        """Write the queue and merge old rows; False if something prevented it."""
+        """Write the queue and merge old rows; return False after an error."""
         try:
             if holder := self._folder.hold():
                 self._suspend(holder)
@@ -206,7 +189,7 @@ class HistoryWriter:
         return True
 
     def _suspend(self, holder: str) -> None:
-        """Discard the queue and stop writing while another process holds the lock."""
+        """Discard the queue, and stop to write while another process holds the lock."""
         self._close_store()
         with self._lock:
             self._excluded = True
@@ -222,7 +205,7 @@ class HistoryWriter:
                 self._excluded, self._resumed_devices = False, set()
 
     def _current_store(self) -> HistoryStore:
-        """Return the open store; reopen it if another program has changed the file."""
+        """Return the open store. If another program has changed the file, open the store again."""
         change = "" if self._store is None else self._store.describe_external_change()
         if change:
             self._close_store()
@@ -241,17 +224,14 @@ class HistoryWriter:
         }
         if sum(not name.endswith(SQLITE_SUFFIXES) for name in taken) >= MAX_RENAMED_FILES:
             self._set_error(
-                f"{error}; {MAX_RENAMED_FILES} such files are kept already: look at {self.path.name}{RENAMED_SUFFIX}*"
+                f"{error}; {MAX_RENAMED_FILES} such files exist already: move {self.path.name}{RENAMED_SUFFIX}* away"
             )
             return False
         when = datetime.fromtimestamp(self._now_s(), UTC)
         name = f"{self.path.name}{RENAMED_SUFFIX}{when:%Y-%m-%dT%H-%M-%SZ}"
         name = next(one for one in chain([name], (f"{name}.{i}" for i in count(2))) if one not in taken)
         try:
-            for end in (
-                *SQLITE_SUFFIXES,
-                "",
-            ):  # SQLite would apply the old companion files to the new database
+            for end in (*SQLITE_SUFFIXES, ""):  # SQLite would apply additional files to a new database
                 with contextlib.suppress(FileNotFoundError):
                     os.rename(f"{self.path}{end}", self.path.with_name(f"{name}{end}"))
         except OSError as failed:
@@ -274,19 +254,19 @@ class HistoryWriter:
         self.written += n
 
     def _set_note(self, note: str) -> None:
-        """Set the note about the file in the state, and log it."""
+        """Set and log the note about the file."""
         self._note = note
         _log.warning("history", text=note)
 
     def _set_error(self, wrong: str) -> None:
-        """Set the error in the state; log it if it has changed."""
+        """Set the error, and log a changed error."""
         if wrong == self._error:
             return
         self._error = wrong
         if wrong:
             _log.warning("history", text=wrong)
         else:
-            _log.info("history", text="written again")
+            _log.info("history", text="writing continues")
 
     def _close_store(self) -> None:
         """Close the store."""

@@ -1,7 +1,8 @@
-"""Table ``[device.driver]``: it names a link and a decoder, whose modules bring the models of their keys.
+"""Table ``[device.driver]`` of a configuration file, which names a link and a decoder.
 
-Only the modules of the named link and decoder are imported. A simulated sensor (``link = "virtual"``) is described
-here. It is created by ``monitor.simulator``, which is in a higher layer.
+The modules of links and decoders define the keys of their settings. Only the modules of the named link and decoder are
+imported. The keys of a simulated sensor (``link = "virtual"``) are defined here. ``monitor.simulator``, which is in a
+higher layer, creates the simulated sensor.
 """
 
 import re
@@ -42,7 +43,7 @@ Share = Annotated[float, number_ranges.FRACTION]
 
 
 class FaultsTable(SettingsModel):
-    """``[device.driver.faults]``: faults between a simulated sensor and the link. The seed determines all of them."""
+    """``[device.driver.faults]``: faults between a simulated sensor and the link. The seed determines all faults."""
 
     lost: Share = Field(0.0, description="share of samples that are not sent; the counter of the sensor continues")
     repeated: Share = Field(0.0, description="share of samples that are sent twice")
@@ -51,7 +52,7 @@ class FaultsTable(SettingsModel):
     jitter: Annotated[float, number_ranges.JITTER_S] = Field(
         0.0, description="longest random delay of a burst of bytes in s"
     )
-    unplugged: Share = Field(0.0, description="probability at each sample that the cable is pulled before it")
+    unplugged: Share = Field(0.0, description="probability per sample that the cable is pulled before the sample")
     unplugged_for: Duration = Field(
         2.0, description="time in s, on the clock of the sensor, until the cable is plugged in again"
     )
@@ -72,7 +73,7 @@ def _model_file(name: str, info: ValidationInfo) -> str:
 
 
 class VirtualTable(LinkSettings):
-    """Keys of ``link = "virtual"``: a simulated IMU that sends a real wire format over a real link.
+    """Keys of ``link = "virtual"``, a simulated IMU that sends a real wire format over a real link.
 
     The decoder determines the link: bytes over a pseudo-terminal, CAN frames over a bus of python-can in this process,
     or messages over zenoh on loopback.
@@ -82,7 +83,7 @@ class VirtualTable(LinkSettings):
         "consumer-mems", validate_default=True, description="path of a model file, or name of a shipped model"
     )
     seed: Annotated[int, number_ranges.SEED] = Field(
-        1, description="seed of the random numbers: same seed, same samples"
+        1, description="seed of the random numbers; the same seed gives the same samples"
     )
     speed: Annotated[float, number_ranges.SIMULATION_SPEED] = Field(1.0, description="speed relative to real time")
     effect: ListOf[str] = Field(
@@ -98,7 +99,7 @@ class VirtualTable(LinkSettings):
 
 @dataclass(frozen=True, slots=True)
 class Driver:
-    """Link and decoder of a device. Nothing is open."""
+    """Link and decoder of a device. The link is not open."""
 
     link: Link | VirtualTable
     decoder: Decoder
@@ -106,12 +107,12 @@ class Driver:
 
 
 def link_settings(name: str) -> type[LinkSettings]:
-    """Return the model of the keys of a link.
+    """Return the settings class of a link.
 
     Raises
     ------
     ConfigError
-        If there is no such link. The text lists all links, the most similar one first.
+        If there is no such link. The message lists all links, the most similar name first.
     """
     if name == VIRTUAL:
         return VirtualTable
@@ -122,12 +123,12 @@ def link_settings(name: str) -> type[LinkSettings]:
 
 
 def link_names() -> tuple[str, ...]:
-    """Return the names of all links of a configuration file."""
+    """Return the names of all links, with the link of a simulated sensor."""
     return tuple(sorted({*discovery.list_modules(drivers.links, "_link"), VIRTUAL}))
 
 
 def default_decoder(link: str) -> str:
-    """Return the default decoder of a link; "" if the configuration must name one."""
+    """Return the default decoder of a link; "" if the configuration must name a decoder."""
     if link == VIRTUAL:
         return VIRTUAL_DECODER
     return str(discovery.import_module(drivers.links, link, "_link").DEFAULT_DECODER)
@@ -139,9 +140,9 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
     Parameters
     ----------
     table
-        Keys and values, as TOML gives them.
+        Keys and values as read from TOML.
     folder
-        Folder at which relative paths begin.
+        Folder to which relative paths refer.
 
     Raises
     ------
@@ -177,7 +178,7 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
 def _read_decoder(
     name: object, options: object, folder: Path | None, link: tuple[str, str], problems: list[Problem]
 ) -> Decoder | None:
-    """Return the decoder for a link with a name and a carrier. Append the problems; None if there are any."""
+    """Return the decoder for a link, given as name and carrier. If there are problems, append them and return None."""
     known = discovery.list_modules(drivers.decoders)
     if not isinstance(name, str) or name not in known:
         said = format_value(name) if name else "missing"
@@ -201,7 +202,7 @@ def _read_decoder(
 
 
 def _build(module: ModuleType | None, checked: TableCheckResult[Any]) -> Any:
-    """Return the link or decoder of a module; None if its settings are wrong. Add the mistakes that ``build`` finds."""
+    """Return the link or decoder that a module builds; None if the settings have mistakes, which are added."""
     if checked.value is None or module is None:
         return None
     keys = fields_by_key(type(checked.value))
@@ -222,6 +223,6 @@ def _build(module: ModuleType | None, checked: TableCheckResult[Any]) -> Any:
 
 
 def _carrier_of(module: ModuleType) -> str:
-    """Return the kind of data that a link provides or a decoder reads; "" if its settings decide."""
+    """Return the carrier of a link or decoder; "" if the carrier depends on the settings."""
     kinds = [one for one in vars(module).values() if isinstance(one, type) and one.__module__ == module.__name__]
     return next((str(kind.carrier) for kind in kinds if hasattr(kind, "carrier")), "")

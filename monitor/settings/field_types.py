@@ -1,4 +1,4 @@
-"""Types of the keys of a configuration file that are no plain numbers: durations, rates, paths, keys and addresses."""
+"""Types of configuration keys that are not plain numbers: durations, rates, paths, zenoh keys and addresses."""
 
 import re
 from pathlib import Path
@@ -14,7 +14,7 @@ from drivers.settings_model import ReadAs, checked_by
 from monitor.common.topics import ENDPOINT
 
 UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
-"""Length of each unit of a duration in s."""
+"""Length of each unit of a duration, in seconds."""
 DURATION_TEXT: Final = re.compile(r"\s*([0-9.]+(?:e[+-]?[0-9]+)?)\s*([a-z]*)\s*")
 RATE_TEXT: Final = re.compile(r"\s*([0-9.]+)\s*Hz\s*")
 ENDPOINT_TEXT: Final = re.compile(r"[a-z]+/.+")
@@ -32,7 +32,7 @@ class Metrics(NamedTuple):
 
 
 def seconds(value: float | str) -> float:
-    """Return a duration in s: a number of seconds, or a text such as "90s", "30min", "1h", "2d".
+    """Return a duration in seconds, from a number of seconds or a text such as "90s", "30min", "1h", "2d".
 
     >>> seconds("30min"), seconds(3600), seconds("1.5 h")
     (1800.0, 3600.0, 5400.0)
@@ -41,14 +41,14 @@ def seconds(value: float | str) -> float:
 
 
 def parse_rate_as_period(value: str, always: str) -> float:
-    """Return the time between two runs in s for a rate such as "10 Hz"; 0 for the word that means each time.
+    """Return the period in seconds of a rate such as "10 Hz"; 0 for the text ``always``.
 
     Parameters
     ----------
     value
-        Rate, or the word.
+        Rate with unit, or the text ``always``.
     always
-        Word that means each time.
+        Text for a run at each sample or block, for example "every sample".
 
     >>> parse_rate_as_period("10 Hz", "every sample"), parse_rate_as_period("every sample", "every sample")
     (0.1, 0.0)
@@ -58,24 +58,24 @@ def parse_rate_as_period(value: str, always: str) -> float:
     match = RATE_TEXT.fullmatch(value)
     rate_hz = _positive_number(match[1]) if match else 0.0
     if not rate_hz > 0.0:
-        raise ConfigError(f'{format_value(value)} is no rate; write "10 Hz" or "{always}"')
+        raise ConfigError(f'{format_value(value)} is not a rate; write "10 Hz" or "{always}"')
     return 1.0 / UPDATE_RATE_HZ.check(rate_hz)
 
 
 def period_annotation(always: str) -> ReadAs:
-    """Return the annotation of a period in s that is a rate in the file, or the word that means each time."""
+    """Return the annotation of a period in seconds that the file states as a rate or as the text ``always``."""
     return ReadAs(str, lambda value, folder: parse_rate_as_period(value, always))
 
 
 def check_memory(size: str) -> None:
-    """Raise ConfigError for a text that is no memory limit of the viewer.
+    """Raise ConfigError if a text is not a memory limit of the viewer.
 
     >>> check_memory("256MiB"), check_memory("25%")
     (None, None)
     """
     match = SIZE_TEXT.fullmatch(size)
     if match is None:
-        raise ConfigError(f'{format_value(size)} is no size; write "256MiB", "1GB" or "25%"')
+        raise ConfigError(f'{format_value(size)} is not a size; write "256MiB", "1GB" or "25%"')
     number, prefix, binary = match.groups()
     if size.endswith("%"):
         PERCENT.check(float(number))
@@ -90,18 +90,18 @@ def check_viewer_mode(mode: str) -> None:
 
 
 def _seconds(value: Any) -> Any:
-    """Convert the text of a duration to s. Values of other types are left to the check of the number."""
+    """Convert a duration from text to seconds. Values of other types are returned unchanged and checked later."""
     if not isinstance(value, str):
         return value
     match = DURATION_TEXT.fullmatch(value)
     duration_s = _positive_number(match[1]) * UNITS_S.get(match[2], 0.0) if match else 0.0
     if not duration_s > 0.0:
-        raise ConfigError(f'{format_value(value)} is no duration; write seconds, or "90s", "30min", "1h", "2d"')
+        raise ConfigError(f'{format_value(value)} is not a duration; write seconds, or "90s", "30min", "1h", "2d"')
     return duration_s
 
 
 def _positive_number(text: str) -> float:
-    """Return a number; 0 if the text is none."""
+    """Return the number in a text; 0 if the text is not a number."""
     try:
         return float(text)
     except ValueError:
@@ -109,13 +109,13 @@ def _positive_number(text: str) -> float:
 
 
 def _path(name: str, folder: Path | None) -> Path:
-    """Return a path relative to the folder of the configuration file."""
+    """Return a path. A relative path refers to the folder of the configuration file."""
     return (folder or Path()) / file_access.expand_user(name)
 
 
 def _check_endpoint(endpoint: str) -> None:
     if not ENDPOINT_TEXT.fullmatch(endpoint):
-        raise ConfigError(f'{format_value(endpoint)} is no endpoint; write "{ENDPOINT}"')
+        raise ConfigError(f'{format_value(endpoint)} is not an endpoint; write "{ENDPOINT}"')
 
 
 def _check_zenoh_key(key: str) -> None:
@@ -125,18 +125,18 @@ def _check_zenoh_key(key: str) -> None:
 
 
 def _address(text: str, _: Path | None) -> Metrics:
-    """Return host and port."""
+    """Return host and port of an address such as "127.0.0.1:9464"."""
     match = ADDRESS_TEXT.fullmatch(text)
     if match is None or int(match[2]) == 0 or not PORT.supports(int(match[2])):
-        raise ConfigError(f'{format_value(text)} is no host and port; write "127.0.0.1:9464"')
+        raise ConfigError(f'{format_value(text)} is not a host and port; write "127.0.0.1:9464"')
     return Metrics(match[1].strip("[]"), int(match[2]))
 
 
 DURATION_FROM_TEXT: Final = BeforeValidator(_seconds)
-"""Annotation of a field that is a duration in s, or a text such as "1h" in the file."""
+"""Annotation of a duration in seconds, which may be a text such as "1h" in the file."""
 Duration = Annotated[float, DURATION_S, DURATION_FROM_TEXT]
 RelativePath = Annotated[Path, ReadAs(str, _path)]
-"""Path that begins at the folder of the configuration file if it is relative."""
+"""Path. A relative path refers to the folder of the configuration file."""
 Endpoint = Annotated[str, checked_by(_check_endpoint)]
 ZenohKey = Annotated[str, checked_by(_check_zenoh_key)]
 Address = Annotated[Metrics, ReadAs(str, _address)]

@@ -1,9 +1,8 @@
-"""Checks of who else on this machine can change or read a file that the service trusts.
+"""Checks whether other users of this machine can change or read the files of the service.
 
-A configuration names commands, ports and keys. Everyone who can write it, or replace it in its folder, can run commands
-as the user of the service. Such a file is refused. A file with a secret that everyone can read causes a warning. The
-group of a file is trusted, since many systems give each user a group of its own. On systems without POSIX permissions,
-nothing is reported.
+A configuration names commands, ports and keys. Users who can change or replace the file can run commands as the user of
+the service, so such a file is refused. A file with a secret that all users can read causes a warning. The group of a
+file is trusted, because many systems have one group per user. Without POSIX permissions, files are not checked.
 """
 
 import os
@@ -15,7 +14,7 @@ from drivers.credential_masking import has_secret
 from drivers.file_access import open_regular, real_path
 
 MAX_SECRET_FILE_BYTES: Final = 1_000_000
-"""Bytes at the start of a file that are searched for a secret."""
+"""Number of bytes at the start of a file that are searched for a secret."""
 
 
 def explain_untrusted_file(path: Path) -> str:
@@ -30,14 +29,14 @@ def explain_untrusted_file(path: Path) -> str:
 
 
 def describe_exposed_secret(path: Path, secret: bool | None = None) -> str:
-    """Return a warning if everyone can read the secret in a file; "" if not.
+    """Return a warning if all users can read a secret in a file, else "".
 
     Parameters
     ----------
     path
         File to check.
     secret
-        True if the file is a secret, such as a private key. If it is None, the text of the file is searched.
+        True if the file is a secret, such as a private key. By default, the file is searched for secrets.
     """
     real = real_path(path)
     if not _others_may(real, stat.S_IROTH) or not _is_reachable(real):
@@ -66,7 +65,7 @@ def _is_reachable(path: Path) -> bool:
 
 
 def _mode(path: Path) -> int:
-    """Return the permissions of a file; 0 if it does not exist, which its reader reports."""
+    """Return the permissions of a file; 0 for a missing file, which is reported elsewhere."""
     try:
         return path.stat().st_mode
     except OSError:

@@ -1,4 +1,4 @@
-"""Reader of configuration files. It reports all mistakes of a file at once, and it opens no device."""
+"""Reading of configuration files. All mistakes of a file are reported together. No device is opened."""
 
 import dataclasses
 import os
@@ -44,9 +44,9 @@ __all__ = [
     "VirtualTable",
     "ZenohTable",
     "check_viewer_mode",
+    "examine",
     "load",
     "parse_rate_as_period",
-    "read",
     "seconds",
 ]
 
@@ -65,13 +65,15 @@ class Config:
     hooks: tuple[Hook, ...] = ()
     metrics: Metrics | None = None
     path: Path | None = None  # of the file
-    table: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # content of the file, to compare at a reload
-    warnings: tuple[str, ...] = ()  # one line for each state that should not remain
+    table: Mapping[str, Any] = dataclasses.field(
+        default_factory=dict
+    )  # content of the file, for the comparison at a reload
+    warnings: tuple[str, ...] = ()  # one line per warning
 
 
 @dataclass(frozen=True, slots=True)
 class ModelDependentSettings:
-    """Parts of a device that depend on model files. They are checked even if other keys of the device are wrong."""
+    """Settings of a device that depend on model files. They are checked even if other keys are wrong."""
 
     device: str  # "device bench-1"
     model: Path | None  # model in force
@@ -84,7 +86,7 @@ class Reading:
     """Result of reading a configuration file."""
 
     config: Config | None  # None if the file has mistakes
-    wrong: list[str]  # one line for each mistake, which begins with the file
+    wrong: list[str]  # one line per mistake, beginning with the path of the file
     models: tuple[ModelDependentSettings, ...] = ()
 
 
@@ -101,27 +103,13 @@ def load(path: Path, *, pipe: bool = False) -> Config:
     Raises
     ------
     ConfigError
-        If the file has mistakes. The line describes the first mistake and gives the number of the others.
-    """
-    config, wrong = read(path, pipe=pipe)
-    if config is None:
-        more = f" (and {len(wrong) - 1} more: imu-monitor check {path})" if len(wrong) > 1 else ""
-        raise ConfigError(wrong[0] + more)
-    return config
-
-
-def read(path: Path, *, pipe: bool = False) -> tuple[Config | None, list[str]]:
-    """Return the configuration in a file, or None and one line for each mistake.
-
-    Parameters
-    ----------
-    path
-        Configuration file.
-    pipe
-        True if a pipe may be read as well.
+        If the file has mistakes. The message describes the first mistake and states the number of further mistakes.
     """
     reading = examine(path, pipe=pipe)
-    return reading.config, reading.wrong
+    if reading.config is None:
+        count = len(reading.wrong) - 1
+        raise ConfigError(reading.wrong[0] + (f" (and {count} more: imu-monitor check {path})" if count else ""))
+    return reading.config
 
 
 def examine(path: Path, *, pipe: bool = False) -> Reading:
@@ -164,7 +152,7 @@ def _configuration(file: ConfigFile) -> Config:
 
 
 def _check_zenoh_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
-    """Check that zenoh accepts its file, and that nobody else can change it. Return warnings about readable secrets."""
+    """Check that zenoh accepts the zenoh file and that the file is safe; return warnings about readable secrets."""
     zenoh = checked.value.zenoh if checked.value else None
     if zenoh is None or zenoh.config is None or zenoh.mode == "none":
         return []
@@ -176,7 +164,7 @@ def _check_zenoh_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
         checked.problems.append(Problem("zenoh.config", line))
     secrets: tuple[Path, ...] = ()
     try:
-        secrets = zenoh_file_secrets(path)
+        secrets = _zenoh_file_secrets(path)
     except ConfigError as error:
         checked.problems.append(Problem("zenoh.config", str(error)))
     files = ((path, None), *((one, True) for one in secrets))
@@ -184,14 +172,8 @@ def _check_zenoh_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
     return [f"zenoh.config: {file.name}: {line}" for file, line in exposed if line]
 
 
-def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
-    """Return the files of keys and passwords that a zenoh file names.
-
-    Raises
-    ------
-    ConfigError
-        If zenoh refuses the file.
-    """
+def _zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
+    """Return the files of keys and passwords that a zenoh file names; raise ConfigError if zenoh refuses the file."""
     import zenoh
 
     try:
@@ -202,7 +184,7 @@ def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
 
 
 def _format_problem(problem: Problem, table: Mapping[str, Any]) -> str:
-    """Return the line of a problem. It begins with the name of the device, if the problem concerns one."""
+    """Return the message of a problem. For a problem of a device, the message begins with its name."""
     match = DEVICE_PLACE.fullmatch(problem.place)
     name = _device_name(table, int(match[1])) if match else ""
     return f"{name}: {Problem(match[2], problem.text)}" if match and name else str(problem)
@@ -218,7 +200,7 @@ def _device_name(table: Mapping[str, Any], index: int) -> str:
 def _model_dependent_settings(
     checked: TableCheckResult[ConfigFile], table: Mapping[str, Any]
 ) -> tuple[ModelDependentSettings, ...]:
-    """Return what is to be checked against model files, as far as it is not wrong."""
+    """Return the settings to check against model files, without settings that have mistakes."""
     uses = []
     for i, device in enumerate(checked.value.devices if checked.value else ()):
         at = f"device[{i}]"

@@ -1,6 +1,6 @@
-"""Text of a configuration file with all keys, generated from the models of the settings.
+"""Text of a configuration file with all keys, generated from the settings classes.
 
-Keys of the tables that a service always has stand with their defaults. All other keys are comments, with an example.
+The keys of the required tables have their default values. All other keys are in comments with example values.
 """
 
 import json
@@ -25,7 +25,7 @@ INTRODUCTION: Final = """\
 # folder of this file.
 """
 FIRST_LINK, FIRST_DECODER = "serial", "vectornav_ascii"
-"""Link and decoder of the device that is not a comment."""
+"""Link and decoder of the device that is not in a comment."""
 COMMENT_COLUMN: Final = 30
 COMMENT: Final = "# "
 DECODER_TABLE: Final = "device.driver.decoder_options"
@@ -45,7 +45,7 @@ def format_defaults() -> str:
         "\n".join(
             ["[device.axes]", *(_line(axis, axis, str(fields_by_key(Device)["axes"].description)) for axis in AXES)]
         ),
-        "# The other links. One of these tables takes the place of [device.driver] above.",
+        "# The other links. Replace the table [device.driver] above by one of these tables.",
         *(_commented(format_link(name)) for name in links),
         "# The other decoders.",
         *(_commented(format_decoder(name)) for name in decoders),
@@ -91,7 +91,7 @@ def format_decoder(name: str) -> str:
 
 
 def _table(model: type[SettingsModel], name: str, about: str = "", omit: tuple[str, ...] = ()) -> str:
-    """Return the header and the keys of a table. Optional keys are comments."""
+    """Return the header and the keys of a table, with optional keys in comments."""
     header = f"[[{name}]]" if name in LIST_TABLES else f"[{name}]"
     lines = [f"{header:<{COMMENT_COLUMN - 1}} # {about}" if about else header]
     for key, info in fields_by_key(model).items():
@@ -115,7 +115,7 @@ def _line(key: str, value: object, comment: str) -> str:
 
 
 def _values(info: FieldInfo) -> str:
-    """Return the possible words or the range of a key in parentheses."""
+    """Return the possible words or the range of a key, in parentheses."""
     parts = list(_find_parts((info.annotation, *info.metadata)))
     words = [str(one) for one in parts if not isinstance(one, NumberRange)]
     ranges = [one.format_range() for one in parts if isinstance(one, NumberRange)]
@@ -123,7 +123,7 @@ def _values(info: FieldInfo) -> str:
 
 
 def _find_parts(types: Iterable[Any]) -> Iterator[object]:
-    """Yield the words of the Literal types and the quantities in types."""
+    """Yield the words of all Literal types and the Quantity objects in type annotations."""
     for one in types:
         if isinstance(one, NumberRange):
             yield one
@@ -134,7 +134,7 @@ def _find_parts(types: Iterable[Any]) -> Iterator[object]:
 
 
 def format_toml(value: Any) -> str:
-    """Return a value as TOML writes it.
+    """Return a value in TOML notation.
 
     >>> format_toml({"gx": 0.5}), format_toml(("a", "b")), format_toml(True)
     ('{ gx = 0.5 }', '["a", "b"]', 'true')

@@ -1,6 +1,6 @@
-"""Models of the tables of a configuration file: keys, types with ranges, defaults and descriptions.
+"""Settings classes of the tables of a configuration file: keys, types with ranges, defaults and descriptions.
 
-``[device.driver]`` is in ``driver_settings``. The models hold the converted values: "1h" in the file is 3600.0 here.
+``driver_settings`` defines the table ``[device.driver]``. Values are converted: "1h" in the file becomes 3600.0.
 """
 
 import os
@@ -40,7 +40,7 @@ WINDOW_SAMPLES: Final = (100, 10_000_000)
 MAX_WINDOW_S: Final = 40 * DAY_S
 """Longest window if the sample rate is not configured."""
 THERMAL_INTERVAL_SAMPLES: Final = 8
-"""Minimum number of samples in a thermal interval. Their scatter gives the uncertainty of their mean."""
+"""Minimum number of samples in a thermal interval. The scatter of the samples gives the uncertainty of the mean."""
 THERMAL_INTERVAL_S: Final = NumberRange("s", 1e-6, DAY_S)
 SEGMENT_LENGTH_S: Final = NumberRange("s", 10.0, DAY_S)
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
@@ -50,7 +50,7 @@ Coefficient = Annotated[float, number_ranges.COEFFICIENT]
 
 
 def select_axes(pattern: str, _: object = None) -> tuple[str, ...]:
-    """Return the axes of a name, or of "g*", "a*" or "*".
+    """Return the axes that an axis name, "g*", "a*" or "*" selects.
 
     >>> select_axes("g*"), select_axes("az")
     (('gx', 'gy', 'gz'), ('az',))
@@ -104,7 +104,7 @@ def _model_in_force(name: str, folder: Path | None) -> Path:
 
 
 class Device(SettingsModel):
-    """``[[device]]``: one device. Nothing is open."""
+    """``[[device]]``: one device. The link is not open."""
 
     name: Annotated[str, checked_by(_check_name)] = Field(
         examples=["bench-1"], description="letters, digits, - and _; unique, since it is part of every zenoh key"
@@ -173,7 +173,7 @@ class Device(SettingsModel):
 
     @property
     def silence_s(self) -> float:
-        """Time without data in s after which the link is opened again; 0 = never."""
+        """Time without data in seconds after which the link is opened again; 0 = never."""
         return self.driver.silence_s
 
     @property
@@ -182,7 +182,7 @@ class Device(SettingsModel):
         return self.motion == "leave out"
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict for each length that does not match the sample rate, and for a limit without a model."""
+        """Yield a conflict for each time that does not match the sample rate, and for each limit without a model."""
         if text := self._window_problem():
             yield Conflict("window", text, ("rate",))
         if text := self._tau_problem():
@@ -196,7 +196,7 @@ class Device(SettingsModel):
                 yield Conflict(f"limit[{i}].times_model", "the device has no model in force; add model", ("model",))
 
     def _window_problem(self) -> str:
-        """Return why the window is too short or too long; "" if it is possible."""
+        """Return why the window is too short or too long; "" if its length is possible."""
         if self.rate_hz is None:
             return f"{self.window_s:g} s; at most {MAX_WINDOW_S:g} s" if self.window_s > MAX_WINDOW_S else ""
         low, high = WINDOW_SAMPLES
@@ -209,7 +209,7 @@ class Device(SettingsModel):
         )
 
     def _tau_problem(self) -> str:
-        """Return why no averaging time of a list is possible; "" if one is. They are rounded to whole samples."""
+        """Return why no averaging time is possible; "" if one is possible after rounding to whole samples."""
         shortest_s = 1.0 / self.rate_hz if self.rate_hz else 0.0
         if isinstance(self.tau, str) or any(0.5 * shortest_s < one <= 0.5 * self.window_s for one in self.tau):
             return ""
@@ -218,7 +218,7 @@ class Device(SettingsModel):
 
 
 class ZenohTable(SettingsModel):
-    """``[zenoh]``: session of the daemon. mode and listen are None if only the file of ``config`` sets them."""
+    """``[zenoh]``: session of the daemon. If the zenoh file decides, ``mode`` and ``listen`` are None."""
 
     mode: Literal["peer", "client", "router", "none"] | None = Field("peer", description="mode of the session")
     listen: ListOf[Endpoint] | None = Field(
@@ -235,20 +235,20 @@ class ZenohTable(SettingsModel):
     @model_validator(mode="before")
     @classmethod
     def _prefer_file(cls, table: Any, info: ValidationInfo) -> Any:
-        """Leave mode and listen to the zenoh file if the table names one."""
+        """If the table names a zenoh file, let this file decide ``mode`` and ``listen``."""
         if info.context is None or not isinstance(table, dict) or "config" not in table:
             return table
         return {"mode": None, "listen": None, **table}
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict if a client does not know a router."""
+        """Yield a conflict if a client has no endpoint of a router."""
         if self.mode == "client" and not self.connect and self.config is None:
             text = 'empty, but a client needs a router, e.g. ["tcp/127.0.0.1:7447"]'
             yield Conflict("connect", text, ("mode", "config"))
 
 
 def _viewer_mode(mode: str, info: ValidationInfo) -> str:
-    """Return the mode of the viewer, with the whole path of a file."""
+    """Return the mode of the viewer. A file name is completed to a path."""
     check_viewer_mode(mode)
     folder = info.context.folder if info.context else None
     return str(folder / file_access.expand_user(mode)) if folder and mode.endswith(".rrd") else mode
@@ -301,11 +301,11 @@ class Storage(SettingsModel):
 
 
 def _program(words: tuple[str, ...], folder: Path | None) -> tuple[str, ...]:
-    """Return a program and its arguments. A relative path begins at the folder of the configuration file."""
+    """Return a program and its arguments. A relative path refers to the folder of the configuration file."""
     if not words:
         return ()
     if "/" not in words[0]:
-        raise ConfigError(f'"{words[0]}" is no path; write where the program is, e.g. "/usr/bin/{words[0]}"')
+        raise ConfigError(f'"{words[0]}" is not a path; write the path of the program, e.g. "/usr/bin/{words[0]}"')
     if any("\0" in word for word in words):
         raise ConfigError("a word with a NUL character cannot be passed to a program")
     path = (folder or Path()) / file_access.expand_user(words[0])

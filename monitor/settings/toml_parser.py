@@ -20,7 +20,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     Raises
     ------
     ConfigError
-        If the text is not TOML, is nested too deep, or contains an integer of more than 64 bits.
+        If the text is not TOML, is nested too deeply, or contains an integer of more than 64 bits.
     """
     try:
         found = tomllib.loads(text)

@@ -32,7 +32,7 @@ def parse_effects(text: str) -> list[tuple[str, Effect]]:
     """
     written = EFFECT_SYNTAX.fullmatch(text)
     if written is None:
-        raise ConfigError(f'"{text}" is no effect; write axis.effect:parameter=value,… as in {EXAMPLE}')
+        raise ConfigError(f'"{text}" is not an effect; write axis.effect:parameter=value,… as in {EXAMPLE}')
     axis, effect, parameters = written.groups()
     table = [f"[{json.dumps(axis)}.{json.dumps(effect)}]", *_parameters(text, parameters)]
     return list(NoiseModel.from_toml("\n".join(table)))
@@ -44,7 +44,7 @@ def _parameters(text: str, parameters: str) -> Iterator[str]:
     for part in filter(None, map(str.strip, parameters.split(","))):
         name, equals, value = (word.strip() for word in part.partition("="))
         if not (name and equals and value):
-            raise ConfigError(f'"{text}": "{part}" is no parameter; write name=value')
+            raise ConfigError(f'"{text}": "{part}" is not a parameter; write name=value')
         if name in given:
             raise ConfigError(f'"{text}": {name} occurs twice')
         given.add(name)

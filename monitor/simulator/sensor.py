@@ -33,12 +33,7 @@ _log = structlog.get_logger("imu-monitor")
 
 
 def check_sensor(table: VirtualTable) -> None:
-    """Check the model and the effects of a simulated sensor without a simulation.
-
-    Parameters
-    ----------
-    table : VirtualTable
-        Settings of the sensor. The model is not checked if ``model`` is empty.
+    """Check the model and the effects of a simulated sensor without a simulation. An empty ``model`` is not checked.
 
     Raises
     ------

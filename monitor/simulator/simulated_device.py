@@ -14,7 +14,6 @@ import structlog
 
 from drivers.decoders.base import Decoder
 from drivers.errors import LinkUnavailable
-from drivers.links.base import Link
 from drivers.sample import Chunk
 from monitor.settings.loading import VirtualTable
 from monitor.simulator.faults import DrawnFaults, FaultCounts, Faults
@@ -63,14 +62,9 @@ class SimulatedDevice:
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="virtual imu", daemon=True)
 
-    @property
-    def link(self) -> Link:
-        """Link that reads the samples of the sensor."""
-        return self.port.link
-
     def start(self) -> None:
         """Connect the cable and start to send samples."""
-        self.plug()
+        self.port.plug()
         self._thread.start()
 
     def stop(self) -> None:
@@ -79,14 +73,6 @@ class SimulatedDevice:
         if self._thread.is_alive():
             self._thread.join()
         self.port.close()
-
-    def plug(self) -> None:
-        """Connect the cable."""
-        self.port.plug()
-
-    def unplug(self) -> None:
-        """Disconnect the cable."""
-        self.port.unplug()
 
     # --- thread of the sensor
 
@@ -138,7 +124,7 @@ class SimulatedDevice:
 
     def _unplug_by_fault(self, index: int) -> None:
         """Disconnect the cable because of a fault."""
-        self.unplug()
+        self.port.unplug()
         self.fault_counts.unplugged += 1
         self._back_at = index + self._unplugged_samples
 
@@ -146,7 +132,7 @@ class SimulatedDevice:
         """Connect the cable again after a fault."""
         self._back_at = None
         try:
-            self.plug()
+            self.port.plug()
         except LinkUnavailable as error:
             _log.warning(
                 "the cable of the simulated sensor cannot be connected again", device=self.name, error=str(error)

@@ -22,7 +22,8 @@ def test_what_is_too_large_is_one_line_for_every_reader(tmp_path: Path) -> None:
         file.truncate(file_access.MAX_BYTES + 1)
     with pytest.raises(OSError, match="more than 32 MB"):
         file_access.read_small_file(path)
-    config, wrong = loading.read(path)
+    reading = loading.examine(path)
+    config, wrong = reading.config, reading.wrong
     assert config is None
     assert "more than 32 MB" in wrong[0]
     for read in (read_model, thermal.read_model_file):

@@ -260,9 +260,9 @@ def fleet(out: Path, folder: Path) -> Path:
         wait_until(lambda: all(station.publisher.latest is not None for station in service.workers), 120.0)
         begun_s = time.monotonic()
         for at_s, act in (
-            (PULLED_S, tail.unplug),
-            (PLUGGED_S, tail.plug),
-            (PULLED_AGAIN_S, wing.unplug),
+            (PULLED_S, tail.port.unplug),
+            (PLUGGED_S, tail.port.plug),
+            (PULLED_AGAIN_S, wing.port.unplug),
             (LOOKED_S, lambda: shoot(path)),
         ):
             time.sleep(max(begun_s + at_s - time.monotonic(), 0.0))
@@ -300,8 +300,8 @@ def view(out: Path, folder: Path) -> Path:
                 lambda: all(station.publisher.latest is not None for one in daemons for station in one.workers), 120.0
             )
             time.sleep(PULLED_AGAIN_S)
-            daemons[0].workers[1].simulated.unplug()  # MEMBERS[3]
-            daemons[1].workers[1].simulated.unplug()  # MEMBERS[4]
+            daemons[0].workers[1].simulated.port.unplug()  # MEMBERS[3]
+            daemons[1].workers[1].simulated.port.unplug()  # MEMBERS[4]
             daemons[2].request_stop()
             time.sleep(SETTLE_S)
             shoot(path)

@@ -161,7 +161,7 @@ def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None
     assert duration.start_s.tolist() == minutes[1:2]
     assert "did you mean" in answer("axes=gz")
     assert "no brackets" in answer("_time=yesterday")
-    assert "nothing in that time; kept are 2020-09-13" in answer("_time=[now(-1h)..]")
+    assert "no results in this time range; stored are 2020-09-13" in answer("_time=[now(-1h)..]")
 
 
 @pytest.mark.long
@@ -173,7 +173,7 @@ def test_a_damaged_history_is_said_in_the_status_and_to_who_asks(asked: tuple[Se
     path.write_bytes(b"no more" * 1000)
     (reply,) = client.get("imu/bench-1/history", timeout=PATIENCE_S)
     assert "damaged" in json.loads(bytes(reply.err.payload))["error"]
-    service.history.writer.put_event("bench-1", StoredEvent(T0, "moved", "once more"))
+    service.history.writer.queue_item("bench-1", StoredEvent(T0, "moved", "once more"))
     wait_for(lambda: "damaged" in service.output_states()["history"])
     (aside,) = path.parent.glob(f"{FILE_NAME}.aside-*Z")
     assert aside.read_bytes() == b"no more" * 1000

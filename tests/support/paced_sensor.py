@@ -26,7 +26,7 @@ def unlimited() -> float:
 
 def is_open(imu: SimulatedDevice) -> bool:
     """Return True if a reader has opened the sensor's link, so that the next sample will reach it."""
-    link, port = imu.link, imu.port
+    link, port = imu.port.link, imu.port
     if isinstance(port, ZenohPort):
         return port._session is not None and bool(port._publisher.matching_status.matching)
     return getattr(link, "_port" if isinstance(port, PtyPort) else "_bus") is not None

@@ -40,12 +40,12 @@ mode = "none"
 def pull_and_put_back(run: Running) -> None:
     """A few samples are sent into the air, and some come after it."""
     imu, station = run.station("loose").simulated, run.station("loose")
-    imu.unplug()
+    imu.port.unplug()
     wait_for(lambda: station.driver.state == "lost", "the loss")
     before = imu.fault_counts.dropped
     wait_for(lambda: imu.fault_counts.dropped >= before + 3, "samples that find no cable")
     received = station.driver.counts.received
-    imu.plug()
+    imu.port.plug()
     wait_for(lambda: station.driver.counts.received >= received + 3, "samples after the pause")
     wait_for(lambda: station.driver.state == "running", "the state")
 

@@ -159,9 +159,9 @@ mode = "none"
         wait_for(lambda: listener.hears(lambda: "imu/bench-1/coefficients" in listener.heard), "coefficients")
         wait_for(lambda: listener.hears(lambda: listener.alive), "the token")
         assert listener.alive == [("imu/bench-1/alive", True)]
-        imu.unplug()
+        imu.port.unplug()
         wait_for(lambda: listener.hears(lambda: len(listener.alive) == 2), "the token to go")
-        imu.plug()
+        imu.port.plug()
         wait_for(lambda: listener.hears(lambda: len(listener.alive) == 3), "the token to come back")
         assert listener.alive[1:] == [("imu/bench-1/alive", False), ("imu/bench-1/alive", True)]
         wait_for(lambda: listener.hears(lambda: len(events(listener)) >= 2), "both events")

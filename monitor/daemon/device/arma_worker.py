@@ -1,6 +1,6 @@
-"""Background identification of ARMA drift models.
+"""Identification of ARMA drift models in the background.
 
-The identification of one axis takes some 50 ms, and would delay the samples if it ran in the main loop.
+The identification of one axis takes about 50 ms. In the main loop, the identification would delay the samples.
 """
 
 import threading
@@ -13,14 +13,14 @@ from monitor.drift.compensation.live_compensation import LiveCompensation
 
 
 class ArmaWorker:
-    """Worker that identifies the ARMA models of one device, one axis after the other, each in a thread of its own.
+    """Worker that identifies the ARMA models of one device, one axis after the other, each in a new thread.
 
     Parameters
     ----------
     name : str
         Name of the threads.
     synchronous : bool
-        True if the model is identified in the calling thread. A replayed recording can wait for it.
+        True if models are identified in the calling thread, because a replayed recording can wait.
     """
 
     def __init__(self, name: str, synchronous: bool) -> None:
@@ -29,7 +29,7 @@ class ArmaWorker:
         self._work: _Identification | None = None
 
     def adopt_and_start_models(self, live: LiveCompensation) -> None:
-        """Adopt a model that has been identified, and start the identification of the next axis that is due."""
+        """Adopt the model that has been identified, and start to identify the next axis that is due."""
         if self._work is not None:
             if self._work.thread.is_alive():
                 return
@@ -56,8 +56,8 @@ class _Identification:
         self.thread = threading.Thread(target=self.identify_model, name=name, daemon=True)
 
     def identify_model(self) -> None:
-        """Identify the model; ``found`` stays None if the data do not allow it."""
+        """Identify the model; ``found`` stays None if the data do not determine a model."""
         try:
             self.found = fit_arma(*self._window)
-        except NotReady:  # values that are all equal, or too few; the identification is repeated later
+        except NotReady:  # all values are equal, or there are too few; a later attempt may succeed
             self.found = None

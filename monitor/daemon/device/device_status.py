@@ -1,4 +1,4 @@
-"""Status report of one device: counts, latency, and a message about the most important problem."""
+"""Status report of one device, with counts, latency, and a message about the most important problem."""
 
 import time
 
@@ -10,7 +10,7 @@ from monitor.daemon.result_publisher import ResultPublisher
 
 
 class DeviceStatus:
-    """Status report of one device. It reads the other parts of the device's worker and changes none of them.
+    """Status report of one device. The report does not change the other parts of the device worker.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class DeviceStatus:
         return lacking or driver.late_frames_hint or self._publisher.timeline.host_clock_offset_text()
 
     def _missing_estimate_text(self) -> str:
-        """Return the reason why there are no coefficients; empty if there are coefficients, or will be."""
+        """Return the reason why coefficients are not possible; empty if they are possible."""
         clock = self._driver.clock
         measured_hz = clock.contradicted_hz
         if measured_hz is not None:

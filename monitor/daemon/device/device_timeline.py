@@ -1,8 +1,8 @@
-"""Timeline of the samples of one device: Unix time, present time, and events that wait for a time.
+"""Timeline of the samples of one device: Unix time, present time, and events without a time.
 
 The samples of a live sensor carry host monotonic times. ``SlewedClock`` converts these times to Unix time. The samples
-of a recording, or of a device that stamps its samples itself, carry Unix times. Such a timeline is unknown before the
-first sample, and the events of the device wait until then.
+of a recording, or of a device with its own time stamps, carry Unix times. Such a timeline is unknown before the first
+sample, and the events of the device wait for the first sample.
 """
 
 import time
@@ -14,9 +14,9 @@ from drivers.sample import Event, Ints, SampleBlock
 from monitor.daemon.slewed_clock import MAX_SLEW_RATE, SlewedClock
 
 MAX_UNTIMED_EVENTS: Final = 100
-"""Largest number of events that wait for the time of the first sample. The oldest are dropped."""
+"""Largest number of events that wait for the first sample. If there are more, the oldest events are dropped."""
 MIN_CLOCK_STEP_S: Final = 1.0
-"""Smallest step of the host clock, and smallest offset of the sample times from the host clock, that is reported."""
+"""Smallest reported step of the host clock, and smallest reported offset between sample times and host clock."""
 
 
 class DeviceTimeline:
@@ -25,28 +25,28 @@ class DeviceTimeline:
     Parameters
     ----------
     driver : Driver
-        Driver of the device. Its state decides whether the present time advances with the host clock.
+        Driver of the device. The present time advances with the host clock while the driver waits or its link is lost.
     """
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
         self._replayed = driver.link.epoch == "unix"
         self._clock = SlewedClock(time.monotonic_ns(), time.time_ns())
-        self._newest_ns: int | None = None  # time of the newest sample that was taken from the ring buffer
-        self._taken_ns = 0  # host monotonic time at which this sample was taken
+        self._newest_ns: int | None = None  # time of the newest sample from the ring buffer
+        self._taken_ns = 0  # monotonic time of the host when that sample was taken
         self._events: list[Event] = []
         self._untimed: deque[tuple[str, str]] = deque(maxlen=MAX_UNTIMED_EVENTS)  # kind and text
 
     # --- conversion of times
 
     def offset_ns(self, t_ns: int) -> int:
-        """Return the difference of Unix time and a time of the samples, in nanoseconds."""
+        """Return the difference between Unix time and a sample time, in nanoseconds."""
         return 0 if self._driver.times_are_unix else self._clock.offset_ns(t_ns)
 
     def offsets_ns(self, samples: SampleBlock) -> Ints | int:
-        """Return the difference of Unix time and the time of each sample, int64 [n] or one number for all samples.
+        """Return the difference between Unix time and the time of each sample, int64 [n] or one number for all.
 
-        The Unix times increase even if the host clock was set back.
+        The resulting Unix times increase even if the host clock was set back.
         """
         return 0 if self._driver.times_are_unix else self._clock.offsets_ns(samples.t_ns)
 
@@ -66,9 +66,8 @@ class DeviceTimeline:
         Returns
         -------
         float or None
-            The time of the newest sample. While the device waits or is lost, the time advances from there with the host
-            clock. None if the samples bring their own times and no sample has arrived yet, because the host clock does
-            not show such a timeline.
+            Time of the newest sample. While the device waits or is lost, this time advances with the host clock. None
+            before the first sample of a device with its own time stamps.
         """
         now_ns = self._now_ns()
         return None if now_ns is None else self.unix_s(now_ns)
@@ -80,7 +79,9 @@ class DeviceTimeline:
             return newest_ns
         if not self._driver.times_are_unix:
             return now_ns
-        if newest_ns is None:  # samples may wait in the ring buffer; only the first time is not ahead of them
+        if (
+            newest_ns is None
+        ):  # samples may wait in the ring buffer, and only the first time is not later than these samples
             return self._driver.first_t_ns
         return newest_ns + now_ns - self._taken_ns
 
@@ -91,7 +92,7 @@ class DeviceTimeline:
         self._events.append(event)
 
     def add_event_now(self, kind: str, text: str) -> None:
-        """Queue an event of the present moment. Its time is set as soon as the timeline is known.
+        """Queue an event of the present moment. The event gets a time as soon as the timeline is known.
 
         Parameters
         ----------
@@ -107,7 +108,7 @@ class DeviceTimeline:
             self._events.append(Event(kind, now_ns, text))
 
     def take_events(self) -> list[Event]:
-        """Return the queued events since the last call, except those that still wait for the timeline."""
+        """Return the events since the last call, except events that wait for the timeline."""
         now_ns = self._now_ns() if self._untimed else None
         if now_ns is not None:
             self._events += [Event(kind, now_ns, text) for kind, text in self._untimed]

@@ -38,11 +38,11 @@ RING_SAMPLES_RANGE: Final = (65_536, 1_000_000)
 UNKNOWN_RATE_HZ: Final = 1000.0
 """Sample rate for which the ring buffer is sized if no rate is configured."""
 REPLAY_PAUSE_S: Final = 0.002
-"""Pause after which a replayed recording checks again for space in a queue."""
+"""Interval at which the reader of a replayed recording checks a full queue for space."""
 MODEL_SELECTION_S: Final = 0.001
-"""Processor time in a round for the selection of a thermal model, for a live sensor."""
+"""Processor time per round for the selection of a thermal model, for a live sensor."""
 MODEL_SELECTION_REPLAY_S: Final = 0.02
-"""The same for a replayed recording, which waits for the selection and may use more time."""
+"""Processor time per round for the selection of a thermal model, for a replayed recording, which can wait."""
 MODEL_SELECTION_CPU_SHARE: Final = 0.02
 """Share of one processor that the selection of a thermal model may use for a device."""
 
@@ -59,9 +59,9 @@ class DeviceWorker:
     outputs : sequence of Output
         Receivers of the results.
     wake : threading.Event
-        Set whenever samples have arrived.
+        Event that is set when samples have arrived.
     ready : KernelReadiness
-        Flags of the compiled kernels. Samples wait in order until the kernels that the device needs are compiled.
+        Flags of the compiled kernels. The samples wait until the kernels that the device needs are compiled.
     recorder : Recorder, optional
         Records samples and raw bytes, and provides the samples from before a restart.
     simulated : SimulatedDevice, optional
@@ -113,17 +113,17 @@ class DeviceWorker:
     # --- start and stop
 
     def start(self) -> None:
-        """Start the reader thread; if the recording ended less than a window ago, resume from its end."""
+        """Start the reader thread. A recording that ended less than one window ago is continued."""
         if self.simulated is not None:
             self.simulated.start()
         if self._recorder is not None and not self._replayed:
             self.restore.resume_from(self._recorder.find_recording_tail(self.name))
-            if self.restore.active:  # the next restart may come before a new estimate exists
+            if self.restore.active:  # the program may restart before a new estimate exists
                 self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
         self._thread.start()
 
     def rebuild_window(self) -> None:
-        """Fill the window from the recording while new samples wait in the ring buffer; call it in a thread."""
+        """Fill the window from the recording while new samples wait in the ring buffer. Called in a thread."""
         self.restore.rebuild_window()
         self._wake.set()
 
@@ -134,7 +134,7 @@ class DeviceWorker:
             self.simulated.stop()
 
     def join(self, timeout_s: float) -> bool:
-        """Wait for the reader thread; return False if it does not end within ``timeout_s`` seconds."""
+        """Wait for the end of the reader thread; return False if the thread still runs after ``timeout_s`` seconds."""
         if self._thread.is_alive():
             self._thread.join(timeout_s)
         return not self._thread.is_alive()
@@ -150,8 +150,7 @@ class DeviceWorker:
     def read_attempts(self) -> int | None:
         """Number of read attempts of the reader thread, see ``Driver.iterations``.
 
-        None for a replayed recording, whose reader may block while the ring buffer is full, and for a reader that has
-        ended.
+        None for a reader that has ended, and for a replayed recording, which blocks while the ring buffer is full.
         """
         return None if self._replayed or self.driver.state == "ended" else self.driver.iterations
 
@@ -165,20 +164,20 @@ class DeviceWorker:
         now_s : float
             Present time on the monotonic clock, in seconds.
         drain : bool, optional
-            True if all samples are to be processed and all results published now, because the device stops.
+            True to process all samples and publish all results now, because the device stops.
         """
         self.publisher.schedule.begin_round(now_s, drain)
         with self.pipeline.kernel_context(self.clock.rate_hz):
             self._process_new_samples(drain)
 
     def _process_new_samples(self, drain: bool) -> None:
-        """Process the new samples in the context in which the kernels can be called."""
+        """Process the new samples. The numerical kernels must be callable."""
         events = self.driver.take_events()
-        if self.restore.active:  # until the window is rebuilt, the rebuilding thread owns the pipeline
+        if self.restore.active:  # the thread that rebuilds the window owns the pipeline
             self.publisher.publish_events(self.timeline.take_events() + events)
             return
         blocks = self._take() if drain or self._can_take() else []
-        events = self.timeline.take_events() + events  # only now is the time of the first sample known
+        events = self.timeline.take_events() + events  # the time of the first sample is known now
         self.pipeline.advance(blocks, self.clock.rate_hz, drain)
         if drain:
             self.pipeline.process_held_samples()
@@ -195,18 +194,18 @@ class DeviceWorker:
             self.status.latency.note_publication()
 
     def _can_take(self) -> bool:
-        """Return True if samples may be taken; they wait in the ring buffer until rate and kernels are available."""
+        """Return True if samples may be taken from the ring buffer, which needs the sample rate and the kernels."""
         pipeline = self.pipeline
         if pipeline.awaits_thermal_model or self.restore.active:
             return False
         if pipeline.estimator is not None or pipeline.refusal_reason:
             return True
-        if self.clock.rate_hz is None:  # samples are published even if their times do not show a rate
+        if self.clock.rate_hz is None:  # samples are published even if the sample rate stays unknown
             return self.ring.room < self.ring.capacity // 2
         return pipeline.required_kernels_ready(self.clock.rate_hz)
 
     def _take(self) -> list[SampleBlock]:
-        """Take all samples from the ring buffer."""
+        """Return all samples from the ring buffer."""
         self.status.latency.note_samples_taken()
         blocks = self.ring.take()
         if blocks:
@@ -223,12 +222,12 @@ class DeviceWorker:
         while thermal.step() and time.perf_counter() < until_s:
             pass
         if self._replayed:
-            self._wake.set()  # the waiting samples of the recording can be processed
+            self._wake.set()  # waiting samples of the recording can be processed
         else:
             schedule.postpone("thermal", (time.perf_counter() - begun_s) / MODEL_SELECTION_CPU_SHARE)
 
     def _check_rate(self, drain: bool) -> None:
-        """Withhold the coefficients while the configured rate is contradicted by the data, or is not checked yet."""
+        """Withhold the coefficients while the data contradict the configured rate, or have not confirmed it yet."""
         if drain:
             self.clock.compare_rates_at_end()
         doubts = (self.clock.contradicted_hz is not None, self.clock.rate_check_pending)
@@ -247,7 +246,7 @@ class DeviceWorker:
     # --- commands and status
 
     def empty_window(self) -> None:
-        """Empty the window, unless it is being rebuilt."""
+        """Empty the window, unless the window is being rebuilt."""
         if not self.restore.active:
             self.pipeline.empty_window()
 
@@ -256,7 +255,7 @@ class DeviceWorker:
         return None if self.restore.active else self.pipeline.copy_window_and_temperature()
 
     def set_limits(self, device: Device) -> None:
-        """Replace the limits by those of new settings. Limits that both settings have keep their state.
+        """Replace the limits by the limits of new settings. Unchanged limits keep their state.
 
         Raises
         ------
@@ -268,9 +267,7 @@ class DeviceWorker:
         self.device, self.publisher.limits = device, limits
 
     def publish_event(self, kind: str, text: str) -> None:
-        """Publish an event of the present moment, such as a stopped recording.
-
-        The event waits while the timeline of the device is unknown.
+        """Publish an event of the present moment, as soon as the timeline of the device is known.
 
         Parameters
         ----------
@@ -283,7 +280,7 @@ class DeviceWorker:
         self.publisher.publish_events(self.timeline.take_events())
 
     def slew_and_publish_status(self, states: dict[str, str], memory_bytes: int) -> Health:
-        """Publish the status of the device, and slew its times towards the host clock.
+        """Slew the sample times towards the host clock, and publish the status of the device.
 
         Parameters
         ----------
@@ -315,10 +312,9 @@ class DeviceWorker:
             self._recorder.queue_chunks(self.name, chunks, self.timeline.offset_ns(chunks[0].t_ns))
 
     def _push(self, samples: SampleBlock) -> None:
-        """Record decoded samples and put them into the ring buffer.
+        """Record decoded samples, and put the samples into the ring buffer.
 
-        A live sensor never waits: a full ring buffer overwrites its oldest samples. A replayed recording waits for
-        space.
+        For a live sensor, a full ring buffer overwrites the oldest samples. A replayed recording waits for space.
         """
         if self._recorder is not None:
             if self.pipeline.estimator is None:  # the program may crash before the first status is published
@@ -334,10 +330,7 @@ class DeviceWorker:
 
 
 def _arrivals_are_timed(device: Device, link: Link) -> bool:
-    """Return True if arrival times show the sample rate of the device.
-
-    They do not if a file is read or a sensor is simulated faster than in real time.
-    """
+    """Return True if arrival times show the sample rate: not for a file or an accelerated simulation."""
     simulated = isinstance(device.link, VirtualTable) and device.link.speed != 1.0
     captured = isinstance(link, ReplayLink) and link.epoch == "monotonic"
     return not simulated and not captured

@@ -1,4 +1,4 @@
-"""Time from the reception of samples to the publication of the results that contain them."""
+"""Latency from the reception of samples to the publication of the results."""
 
 import time
 
@@ -8,12 +8,12 @@ import numpy as np
 class LatencyMeter:
     """Latency of the published results of one device.
 
-    ``note_samples_arrived`` is called by the reader thread, and all other methods are called by the main loop.
+    The reader thread calls ``note_samples_arrived``. The main loop calls all other methods.
     """
 
     def __init__(self) -> None:
         self._arrived_ns = 0  # arrival of the oldest sample in the ring buffer; 0 if the buffer is empty
-        self._taken_ns = 0  # arrival of the oldest sample that was taken and not published; 0 if there is none
+        self._taken_ns = 0  # arrival of the oldest unpublished sample that was taken; 0 if there is none
         self._latencies_s: list[float] = []
 
     def note_samples_arrived(self) -> None:
@@ -32,7 +32,7 @@ class LatencyMeter:
             self._taken_ns = 0
 
     def take_quantiles(self) -> tuple[float | None, float | None]:
-        """Return the median and the 99 % quantile in seconds since the last call; None without a publication."""
+        """Return median and 99 % quantile of the latency since the last call, in seconds; None without results."""
         latencies_s, self._latencies_s = self._latencies_s, []
         if not latencies_s:
             return None, None

@@ -1,10 +1,10 @@
 """Processing pipeline of one device: motion detection, noise estimation, thermal model and drift compensation.
 
-Blocks of samples enter in order. The latest results are in ``estimator``, ``thermal``, ``compensation`` and
-``signal_monitor``. Detections are taken as events.
+``DevicePipeline.advance`` processes blocks of samples in order of time. The newest results are in ``estimator``,
+``thermal``, ``compensation`` and ``signal_monitor``. ``take_events`` returns the detections.
 
-The pipeline publishes nothing and reads no clock. Its owner decides when it may advance and what is published. After a
-restart of the program, ``replay_samples`` passes the end of the recording through the pipeline without events.
+The pipeline publishes nothing and reads no clock. The device worker decides when to call the pipeline and what to
+publish. After a restart of the program, ``replay_samples`` processes the end of the recording without events.
 """
 
 from collections import deque
@@ -29,7 +29,7 @@ from monitor.noise.model import NoiseModel
 from monitor.settings.loading import Device
 
 MAX_PIECE_SAMPLES: Final = 512
-"""Samples that are processed before the noise is tested for a change. A fast replay brings thousands at once."""
+"""Largest number of samples between two tests for changed noise. A fast replay passes thousands at a time."""
 
 
 class DevicePipeline:
@@ -40,13 +40,13 @@ class DevicePipeline:
     device : Device
         Settings of the device.
     model : NoiseModel or None
-        Model in force.
+        Noise model in force, with which the samples are compared.
     ready : KernelReadiness
-        Flags of the compiled kernels. ``advance`` compiles nothing, because that would delay all devices.
+        Flags of the compiled kernels. ``advance`` compiles no kernel, because compilation would delay all devices.
     replayed : bool
-        True if samples may wait while a thermal model is being selected, as the samples of a recording can.
+        True for the samples of a recording. They can wait while a thermal model is being selected.
     needs_all : bool
-        True if processing begins only when all kernels can be called.
+        True if processing must wait until all kernels can be called.
     live : bool
         True if samples arrive at the device's sample rate, so that kernels can be interpreted at a low rate.
     """
@@ -66,11 +66,11 @@ class DevicePipeline:
         self.compensation: LiveCompensation | None = None
         self.model_in_force: PreparedModel | None = None
         self.refusal_reason = ""
-        """Reason why no estimate is possible; empty if it is."""
+        """Reason why an estimate is not possible; empty if it is possible."""
         self.advanced = False
-        """True if samples were processed since the owner last set this to False."""
+        """True if samples were processed since the publisher last set this attribute to False."""
         self.since_ns: list[int | None] = [None] * len(AXES)
-        """Time in nanoseconds of the first sample in the window of an axis that was restarted, else None."""
+        """Time of the first sample after the restart of each axis, in nanoseconds; None without a restart."""
         self.newest_ns = 0
         """Time of the newest sample that entered the pipeline, in nanoseconds; 0 before the first."""
         self.arma_worker = ArmaWorker(f"drift of {device.name}", synchronous=replayed)
@@ -84,49 +84,43 @@ class DevicePipeline:
         self._temperatures: TemperatureRing | None = None  # of the samples in the window
         self._thermal_intervals: list[ThermalIntervalResult] = []  # thermal intervals that were not taken yet
         self._handled = 0  # last seen value of ``signal_monitor.orientation_changes``
-        self._pieces: deque[SampleBlock] = deque()  # samples of a recording that wait for the thermal model
+        self._pieces: deque[SampleBlock] = deque()  # samples of a recording that wait for a thermal model
         self._replaying = False
 
     def required_kernels_ready(self, rate_hz: float) -> bool:
-        """Return True if the kernels that the pipeline needs to begin are compiled or can be interpreted."""
+        """Return True if the kernels that the first samples need are compiled or can be interpreted."""
         if not self._interprets and not self._needs.is_set():
             self._interprets = self._live and self.ready.reserve_interpreter(rate_hz)
         return self._interprets or self._needs.is_set()
 
     @property
     def fit_kernels_ready(self) -> bool:
-        """True if the kernels of the noise coefficients can be called."""
+        """True if the kernels that fit the noise coefficients can be called."""
         return self._interprets or self.ready.fit.is_set()
 
     @property
     def fit_is_interpreted(self) -> bool:
-        """True if the kernels of the fit are interpreted. A fit then takes about 0.1 s."""
+        """True if Python interprets the kernels of the fit. A fit then takes about 0.1 s."""
         return self._interprets and not self.ready.fit.is_set()
 
     @property
     def detection_kernels_ready(self) -> bool:
-        """True if the kernels of the motion and change detection can be called."""
+        """True if the kernels of motion and change detection can be called."""
         return self._interprets or self.ready.all.is_set()
 
     def kernel_context(self, rate_hz: float | None) -> AbstractContextManager[None]:
-        """Return the context in which the kernels are to be called.
-
-        Parameters
-        ----------
-        rate_hz : float or None
-            Sample rate; None if it is unknown. No kernel is called before it is known.
-        """
+        """Return the context manager for calls of the kernels, which interprets kernels if necessary."""
         if rate_hz is not None and self.estimator is None:
             self.required_kernels_ready(rate_hz)
         return interpreted() if self._interprets and not self.ready.all.is_set() else nullcontext()
 
     @property
     def awaits_thermal_model(self) -> bool:
-        """True while samples wait for the selection of a thermal model."""
+        """True while samples of a recording wait for the selection of a thermal model."""
         return bool(self._pieces)
 
     def advance(self, blocks: Sequence[SampleBlock], rate_hz: float | None, drain: bool) -> None:
-        """Process blocks of samples. Until a rate is known they are discarded.
+        """Process blocks of samples. While the sample rate is unknown, the samples are discarded.
 
         Parameters
         ----------
@@ -135,7 +129,7 @@ class DevicePipeline:
         rate_hz : float or None
             Sample rate; None if it is unknown.
         drain : bool
-            True if no sample may wait for the selection of a thermal model.
+            True if all samples are to be processed now, without a wait for the thermal model.
         """
         if blocks:
             self.newest_ns = int(blocks[-1].t_ns[-1])
@@ -155,24 +149,24 @@ class DevicePipeline:
             self._update_thermal()
 
     def process_held_samples(self) -> None:
-        """Process the samples that the motion detector still holds back, after the last sample has arrived."""
+        """Process the samples that the motion detector holds back. Called after the last sample."""
         self._update_estimator(self.signal_monitor.flush() if self.signal_monitor is not None else [])
         self._restart_changed_axes()
         self._update_thermal()
 
     def update_drift_models(self) -> None:
-        """Adopt new drift models and start the identification of those that are due, if an interval has just ended."""
+        """At the end of an interval, adopt new drift models, and start to identify the models that are due."""
         live = self.compensation
-        if live is None or not self.ready.all.is_set():  # another thread identifies the models and would compile
+        if live is None or not self.ready.all.is_set():  # the thread that identifies models would compile kernels
             return
         if live.compensator.samples_to_interval_end == live.compensator.interval_samples:
             self.arma_worker.adopt_and_start_models(live)
 
     def replay_samples(self, samples: SampleBlock, rate_hz: float) -> None:
-        """Process a recorded block without events, to rebuild the window after a restart.
+        """Process a recorded block after a restart of the program, to rebuild the window.
 
-        The events of these samples were published before the restart. The start of each axis is known from the
-        recording, so changes of the noise restart no axis here.
+        The events of these samples were published before the restart, so they are discarded. Changes of the noise
+        restart no axis, because the recording states the start of each axis.
 
         Parameters
         ----------
@@ -209,7 +203,7 @@ class DevicePipeline:
                 one.set_rate(rate_hz)
 
     def copy_window_and_temperature(self) -> tuple[WindowSnapshot, Floats] | None:
-        """Return a copy of the window and its temperature, float64 [n] in °C; None if the window is empty."""
+        """Return a copy of the window, and the temperature float64 [n] in °C; None if the window is empty."""
         if self.estimator is None or self._temperatures is None or not self.estimator.samples_in_window:
             return None
         return self.estimator.copy_window(), self._temperatures.newest_temperatures(self.estimator.samples_in_window)
@@ -231,7 +225,7 @@ class DevicePipeline:
     # --- private methods
 
     def _create_estimator(self, rate_hz: float) -> bool:
-        """Create the estimator for a sample rate; return False if it cannot be created yet, or not at all."""
+        """Create the estimator for a sample rate; return False if this is not possible now."""
         if self.refusal_reason or not self.required_kernels_ready(rate_hz):
             return False
         device = self._device
@@ -240,13 +234,15 @@ class DevicePipeline:
             self._temperatures = TemperatureRing(self.estimator.window_samples)
             if self._model is not None:
                 self.model_in_force = PreparedModel(self._model, self.estimator.window_samples)
-        except ConfigError as error:  # the configured τ do not suit the measured rate; samples are still published
+        except (
+            ConfigError
+        ) as error:  # the configured averaging times do not suit the measured rate; samples are still published
             self.refusal_reason = f"no estimate: {error}"
             return False
         return True
 
     def _create_detectors(self) -> None:
-        """Create the motion and change detection, the thermal model and the drift compensation, as configured."""
+        """Create the configured parts: motion and change detection, thermal model and drift compensation."""
         if self.estimator is None:
             return
         device, rate_hz = self._device, self.estimator.rate_hz

@@ -1,8 +1,8 @@
-"""Ring buffer between the reader thread and the worker of a device, with one writer and one reader.
+"""Ring buffer for samples between the reader thread and the worker of a device.
 
-The writer never waits. A full buffer overwrites its oldest samples. The overwritten samples count in ``overflowed``,
-and in ``lost`` of the next block that is taken, so that the gap keeps its length in time. The lock is held only while
-samples are copied.
+There is one writer and one reader. The writer never waits, and a full buffer overwrites its oldest samples.
+``RingBuffer.overflowed`` counts the overwritten samples. They are also added to ``lost`` of the next block, so the gap
+keeps its length in time. The lock is held only while samples are copied.
 """
 
 import threading
@@ -15,7 +15,7 @@ from drivers.sample import SampleBlock, make_block
 
 
 class RingBuffer:
-    """Ring buffer for samples, with 80 bytes for each sample.
+    """Ring buffer for samples, with 80 bytes per sample.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class RingBuffer:
 
     @property
     def room(self) -> int:
-        """Number of samples that fit in before the oldest is overwritten."""
+        """Number of samples that fit into the buffer without overwriting older samples."""
         return self.capacity - (self._written - self._read)
 
     def push(self, samples: SampleBlock) -> None:
@@ -51,7 +51,7 @@ class RingBuffer:
                 self._write(samples[start : start + self.capacity])
 
     def take(self) -> list[SampleBlock]:
-        """Return all samples since the last call, in blocks that are split where samples are missing."""
+        """Return all samples since the last call, split into blocks where samples are missing."""
         with self._lock:
             n = self._written - self._read
             if n == 0:

@@ -1,8 +1,7 @@
 """Restore of the estimation window after a restart of the program, from the end of the recording.
 
-The recorded samples of the last window pass through the same pipeline again, without events. The other values come from
-the state that was recorded with the samples (``segment.DaemonState``): the start of each axis, and the values of the
-iterated fit.
+The pipeline processes the recorded samples of the last window again, without events. The start of each axis and the
+values of the iterated fit are read from the state that was recorded with the samples (``segment.DaemonState``).
 """
 
 import time
@@ -21,11 +20,11 @@ from monitor.daemon.storage.recording_tail import RecordingTail
 from monitor.settings.loading import Device
 
 MIN_REPLAY_S: Final = 600.0
-"""Shortest part of the recording that is replayed, because change detection needs a history of this length."""
+"""Minimum length of the replayed recording, because change detection needs a history of this length."""
 
 
 class WindowRestore:
-    """Restore of the window of one device, and the state that the next restart needs.
+    """Restore of the window of one device, and the state for the next restart.
 
     Parameters
     ----------
@@ -34,9 +33,9 @@ class WindowRestore:
     pipeline : DevicePipeline
         Pipeline to fill. While ``active`` is True, only ``rebuild_window`` may use the pipeline.
     clock : SampleClock
-        Sample clock of the device. It counts the samples since the end of the recording as missing.
+        Sample clock of the device. The clock counts the samples since the end of the recording as missing.
     timeline : DeviceTimeline
-        Timeline of the device. It receives the event ``window_rebuilt``.
+        Timeline of the device, which receives the event ``window_rebuilt``.
     """
 
     def __init__(self, device: Device, pipeline: DevicePipeline, clock: SampleClock, timeline: DeviceTimeline) -> None:
@@ -44,16 +43,16 @@ class WindowRestore:
         self._pipeline = pipeline
         self._clock = clock
         self._timeline = timeline
-        self._tail: RecordingTail | None = None  # end of the recording, until the window has been rebuilt from it
+        self._tail: RecordingTail | None = None  # end of the recording, until the window is rebuilt
         self._state_before = DaemonState()  # state of the estimate before the restart
 
     @property
     def active(self) -> bool:
-        """True from ``resume_from`` to the end of ``rebuild_window``."""
+        """True while the window waits for ``rebuild_window`` or is being rebuilt."""
         return self._tail is not None
 
     def resume_from(self, tail: RecordingTail | None) -> None:
-        """Continue after the end of the recording, if there is one that ended less than one window ago."""
+        """Continue a recording that ended less than one window ago; without such a recording, do nothing."""
         if tail is None:
             return
         newest, state = tail.newest.samples, tail.newest.state
@@ -70,7 +69,7 @@ class WindowRestore:
         self._tail, self._state_before = tail, state
 
     def rebuild_window(self) -> None:
-        """Fill the window from the recording while new samples wait in the ring buffer; call it in a thread."""
+        """Fill the window from the recording while new samples wait in the ring buffer. Called in a thread."""
         tail = self._tail
         if tail is None:
             return
@@ -86,7 +85,7 @@ class WindowRestore:
             self._tail = None
 
     def state_to_record(self) -> DaemonState:
-        """Return the state of the estimate that is to be recorded with the samples now."""
+        """Return the present state of the estimate, which is recorded with the samples."""
         before, estimator = self._state_before, self._pipeline.estimator
         if self.active:
             return before
@@ -100,7 +99,7 @@ class WindowRestore:
         return DaemonState(estimator.rate_hz, since, tick_step, parameters, tuple(entered.ravel().tolist()))
 
     def _replay(self, tail: RecordingTail, offset_ns: int) -> str:
-        """Fill the pipeline with the end of a recording; return a message that describes the result."""
+        """Fill the window with the end of a recording; return a message about the result."""
         pipeline, state = self._pipeline, tail.newest.state
         rate_hz = self._clock.rate_hz or state.rate or 0.0
         counted = np.zeros(len(AXES), np.int64)
@@ -112,7 +111,7 @@ class WindowRestore:
         if pipeline.estimator is None:
             return pipeline.refusal_reason or "the recording holds no samples for the window"
         for axis, unix_s in enumerate(state.since):
-            # changes that are detected in the replay were already known before the restart
+            # these times replace the times of the changes that were detected in the replay
             pipeline.since_ns[axis] = None if unix_s is None else round(unix_s * 1e9) - offset_ns
             if unix_s is not None:
                 pipeline.estimator.restart(axis, int(counted[axis]))
@@ -125,7 +124,7 @@ class WindowRestore:
 
 
 def _count_since_restart(samples: SampleBlock, state: DaemonState) -> Ints:
-    """Return the number of samples in a block since the restart of each axis, int64 [6], missing ones included."""
+    """Return the number of samples since the start of each axis in a block, int64 [6], with missing samples."""
     counting = np.zeros(len(AXES), np.int64)
     for axis, unix_s in enumerate(state.since):
         if unix_s is not None:

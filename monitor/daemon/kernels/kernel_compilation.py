@@ -1,12 +1,11 @@
 """Parallel compilation of the numerical kernels in child processes.
 
-Numba compiles a kernel at its first call and keeps the machine code in a folder on disk. After an installation or an
-upgrade this folder is empty, and compilation takes tens of seconds of processor time. Child processes therefore compile
-the parts side by side, and this process loads each part from disk once it is compiled. The main loop is not delayed,
-and the memory that the compiler needs is never allocated by the process that runs for months.
+Numba compiles a kernel at the first call and keeps the machine code in a cache folder on disk. After an installation or
+an upgrade, this folder is empty, and compilation takes tens of seconds of processor time. Child processes therefore
+compile parts of the kernels in parallel. The main process then loads each compiled part from disk. In this way, the
+compilation does not delay the main loop, and the main process never allocates the memory of the compiler.
 
-The stamp, a file in the same folder, shows that every part is compiled for this version of the program, of Numba and of
-the processor.
+A stamp file in the cache folder shows that all parts are compiled for the present program, Numba and processor.
 """
 
 import os
@@ -30,11 +29,11 @@ from monitor.common.program import PROGRAM
 from monitor.daemon.kernels.kernel_parts import GROUPS, KernelGroup, KernelPart
 
 MAX_PROCESSES: Final = 2
-"""Largest number of compiling processes. Each takes some 200 MB, which must be available on a small board too."""
+"""Largest number of compiling processes. Each process needs about 200 MB, which a small board must have too."""
 COMPILER: Final = (*PROGRAM, "warm-up", "--from-stdin")
 """Command line of a child process."""
 NICENESS: Final = 5
-"""Niceness of the child processes. The processing of samples has priority."""
+"""Niceness of the child processes, so that the processing of samples has priority."""
 BAR_LENGTH: Final = 12
 """Length of the progress bar in characters."""
 
@@ -72,18 +71,17 @@ class Progress:
 def prepare_kernels(
     group: KernelGroup, tell: Callable[[Progress], None], processes: int | None = None
 ) -> Iterator[str]:
-    """Make the kernels of a group ready to be called, and yield the name of each part when it is ready.
+    """Prepare the kernels of a group for calls, and yield the name of each part that is ready.
 
     Parameters
     ----------
     group : KernelGroup
         Parts to prepare.
     tell : callable
-        Called with a ``Progress`` when the compilation of a part begins or ends. Not called if all parts are in the
-        cache on disk.
+        Called with a ``Progress`` when the compilation of a part begins or ends, unless all parts are cached on disk.
     processes : int, optional
-        Number of child processes that compile. The default is one for each processor, at most ``MAX_PROCESSES``. With
-        0, or if no cache folder can be written, this process compiles by itself.
+        Number of child processes. The default is the number of processors, at most ``MAX_PROCESSES``. If the number is
+        0 or no cache folder can be written, the calling process compiles the kernels.
 
     Yields
     ------
@@ -93,7 +91,7 @@ def prepare_kernels(
     Raises
     ------
     OSError
-        If the cache cannot be written, for example on a full disk. Exceptions of ``tell`` are passed on.
+        If the cache cannot be written, for example on a full disk.
     """
     if is_warm(group):
         for part in group.parts:
@@ -108,7 +106,7 @@ def prepare_kernels(
     with closing(_ChildProcesses(group.parts, processes)) as children:
         for done, part in enumerate(group.parts):
             if not children.wait_for(part, tell):
-                tell(Progress(done, len(group.parts), (part.name,)))  # no child has compiled it, so this process does
+                tell(Progress(done, len(group.parts), (part.name,)))
             part.prepare()
             yield part.name
     if folder is not None:
@@ -116,16 +114,16 @@ def prepare_kernels(
 
 
 def is_warm(group: KernelGroup) -> bool:
-    """Return True if all kernels of a group are in the cache on disk, for this program, Numba and processor."""
+    """Return True if all kernels of a group are cached on disk for the present program, Numba and processor."""
     folder = cache_folder()
     return folder is not None and _stamp_file(folder, group).is_file()
 
 
 def compile_from_stdin(stdin: IO[str], stdout: IO[str]) -> NoReturn:
-    """Compile the parts whose names arrive line by line, and answer each line with the same line.
+    """Compile parts in a child process of ``prepare_kernels``.
 
-    This function is the child's side of ``prepare_kernels``. The process ends when its standard input closes, even in
-    the middle of a compilation, because its parent has ended then.
+    The function reads one part name per line, compiles the part, and writes the name. When the standard input closes,
+    the parent process has ended, and the child process ends at once.
 
     Parameters
     ----------
@@ -150,18 +148,17 @@ def compile_from_stdin(stdin: IO[str], stdout: IO[str]) -> NoReturn:
 
 
 class _ChildProcesses:
-    """Child processes that compile parts, each with a thread that passes one part after the other to its child.
+    """Child processes that compile parts. Each child has a thread that sends the names of the parts.
 
-    If a child cannot be started or fails, its thread ends. Parts that no child has compiled are left to this process.
+    If a child cannot be started or fails, its thread ends. The calling process compiles the remaining parts.
     """
 
     def __init__(self, parts: Sequence[KernelPart], processes: int) -> None:
         self._number_of_parts = len(parts)
         self._waiting = deque(part.name for part in parts)
         self._running: list[str] = []
-        self._compiled: dict[
-            str, bool
-        ] = {}  # True if a child has compiled the part, False if it is left to this process
+        # True if a child has compiled the part, False if the calling process must compile it
+        self._compiled: dict[str, bool] = {}
         self._changes: queue.SimpleQueue[Progress] = queue.SimpleQueue()
         self._children: list[subprocess.Popen[str]] = []
         self._active_threads = processes
@@ -179,7 +176,7 @@ class _ChildProcesses:
                 child.kill()
 
     def wait_for(self, part: KernelPart, tell: Callable[[Progress], None]) -> bool:
-        """Wait until a part is compiled, and report the progress; return False if the part is left to this process."""
+        """Wait for a part, and report the progress; return False if the calling process must compile the part."""
         while part.name not in self._compiled or not self._changes.empty():
             progress = self._changes.get()
             if progress.running:
@@ -187,7 +184,7 @@ class _ChildProcesses:
         return self._compiled[part.name]
 
     def _run_child(self) -> None:
-        """Pass parts to a child process until none is left or the child fails."""
+        """Send part names to a child process until no part is left or the child fails."""
         pipe = subprocess.PIPE
         try:
             with (
@@ -210,7 +207,7 @@ class _ChildProcesses:
                     self._leave_waiting_parts()
 
     def _leave_waiting_parts(self) -> None:
-        """Leave the waiting parts to this process."""
+        """Mark the waiting parts for compilation by the calling process."""
         self._compiled |= dict.fromkeys(self._waiting, False)
         self._put_progress()
 
@@ -232,13 +229,13 @@ class _ChildProcesses:
             self._put_progress()
 
     def _put_progress(self) -> None:
-        """Queue the progress for the thread that waits."""
+        """Put the progress into the queue of the waiting thread."""
         done = sum(self._compiled.values())
         self._changes.put(Progress(done, self._number_of_parts, tuple(self._running)))
 
 
 def _compile_in_child(child: "subprocess.Popen[str]", name: str) -> bool:
-    """Let a child process compile a part; return True if it has."""
+    """Let a child process compile a part; return True on success."""
     assert child.stdin is not None
     assert child.stdout is not None
     try:
@@ -255,7 +252,7 @@ def _count_processors() -> int:
 
 
 def _stamp_file(folder: Path, group: KernelGroup) -> Path:
-    """Return the path of the stamp of a group. The file name depends on everything that the machine code depends on."""
+    """Return the path of the stamp file of a group. The name depends on all that affects the machine code."""
     machine = [binding.get_host_cpu_name(), binding.get_host_cpu_features().flatten()]
     parts = [part.name for part in group.parts]
     everything = [*parts, source_hash(Path(__file__)), numba.__version__, sys.version, *machine]

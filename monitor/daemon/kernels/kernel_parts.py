@@ -1,6 +1,6 @@
-"""Numerical kernels that are compiled before they are needed, in parts, with a call of each kernel of a part.
+"""Parts of the numerical kernels, each with a function that calls the kernels of the part.
 
-A call with the argument types of the program makes Numba compile a kernel, or load the kernel from the cache on disk.
+When a kernel is called with the argument types of the program, Numba compiles the kernel or loads it from the cache.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ class KernelPart:
 
 @dataclass(frozen=True, slots=True)
 class KernelGroup:
-    """Parts that are needed together. A part comes after the parts whose kernels it uses."""
+    """Parts that are needed together. A part follows the parts whose kernels it uses."""
 
     name: str
     parts: tuple[KernelPart, ...]
@@ -104,9 +104,9 @@ def _call_reconciliation() -> None:
 
 
 WINDOW: Final = "Allan deviation"
-"""Name of the part after which a window can be filled."""
+"""Name of the part with the kernels of the window."""
 FIT: Final = "noise coefficients"
-"""Name of the part after which coefficients can be fitted."""
+"""Name of the part with the kernels of the fit."""
 SERVICE: Final = KernelGroup(
     "service",
     (
@@ -126,6 +126,6 @@ _RECONCILIATION: Final = KernelPart("reconciliation", _call_reconciliation)
 COMMANDS: Final = KernelGroup(
     "commands", (_ANALYSIS,) if find_missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION)
 )
-"""Parts that only the commands on recordings need. A few kernels of rare cases are compiled at their first call."""
+"""Parts that only the commands on recordings need. A few rarely used kernels are compiled at their first call."""
 GROUPS: Final = (SERVICE, COMMANDS)
 """All groups."""

@@ -10,14 +10,14 @@ import structlog
 from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
 MAX_INTERPRETED_HZ: Final = 250.0
-"""Maximum total sample rate of the devices whose kernels are interpreted. A sample takes up to 0.8 ms."""
+"""Maximum total sample rate of the devices with interpreted kernels. A sample takes up to 0.8 ms."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
 @dataclass(slots=True)
 class KernelReadiness:
-    """Flags of the compiled kernels. Until a flag is set, Python interprets the kernels of devices with low rates."""
+    """Flags of the compiled kernels. Until the kernels are compiled, Python interprets them for low sample rates."""
 
     window: threading.Event = field(default_factory=threading.Event)
     """Set if the kernels of the Allan deviation are compiled."""
@@ -28,26 +28,26 @@ class KernelReadiness:
     progress: str = ""
     """Progress of the compilation as one line of text; empty if nothing is being compiled."""
     interpretable_hz: float = MAX_INTERPRETED_HZ
-    """Total sample rate of further devices whose kernels can be interpreted."""
+    """Total sample rate that is still available for devices with interpreted kernels."""
 
     def reserve_interpreter(self, rate_hz: float) -> bool:
-        """Return True if the kernels of one more device of this sample rate can be interpreted."""
+        """Return True if Python can also interpret the kernels for a device with this sample rate."""
         if rate_hz > self.interpretable_hz:
             return False
         self.interpretable_hz -= rate_hz
         return True
 
     def compile(self, wake: threading.Event) -> None:
-        """Compile the kernels, and set each flag and ``wake`` as soon as its kernels are compiled; call it in a thread.
+        """Compile the kernels, and set a flag and ``wake`` for each compiled part. Called in a thread.
 
-        If the compilation fails, all flags are set nevertheless. The main loop then compiles the kernels that are
-        missing, or ends with their error. Without the flags it would wait forever.
+        All flags are set even if the compilation fails, because the main loop would otherwise wait forever. The main
+        loop then compiles the missing kernels or ends with the error.
         """
         begin_s = time.monotonic()
 
         def show(progress: kernel_compilation.Progress) -> None:
             if not self.progress:
-                _log.info("compiling kernels, because none are kept for this version on this machine")
+                _log.info("compiling kernels, because this version has not run on this machine before")
             self.progress = f"{progress} {progress.bar}"
             wake.set()
 
@@ -58,9 +58,11 @@ class KernelReadiness:
                     flag.set()
                     wake.set()
             if self.progress:
-                _log.info("kernels are compiled and kept for the next start", seconds=round(time.monotonic() - begin_s))
+                _log.info(
+                    "kernels are compiled and stored for the next start", seconds=round(time.monotonic() - begin_s)
+                )
         except OSError as error:
-            _log.warning("compiled kernels cannot be kept, the next start will be slow again", error=str(error))
+            _log.warning("compiled kernels cannot be stored; the next start will be slow again", error=str(error))
         finally:
             self.progress = ""
             for flag in (self.window, self.fit, self.all):

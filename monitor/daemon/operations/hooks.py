@@ -1,16 +1,15 @@
 """Hooks: user commands and zenoh messages that are triggered by events.
 
 An event that matches a hook is encoded as JSON. If the hook names a zenoh key, the JSON is published immediately. If
-the hook names a command, the JSON enters a bounded queue. A few threads take entries from this queue, and each runs one
-command at a time. A command runs without a shell. It receives the JSON on its standard input, and nothing of it in its
-arguments.
+the hook names a command, the JSON enters a bounded queue. A few threads run the commands of this queue. A command runs
+without a shell and receives the JSON on the standard input.
 
-A command that exceeds its time is killed together with its child processes. Only the end of its output is kept. A
-failure is logged, and stays in the status under ``hook`` until a hook succeeds again. The main loop never waits.
+A command that exceeds its time limit is killed together with its child processes. Only the end of its output is kept. A
+failure is logged, and the status shows it under ``hook`` until a hook succeeds. The main loop never waits.
 
 For each kind of event and each device, a hook runs at most BURST times in a row and then once in RUN_INTERVAL_S. A
-faulty cable that reports losses every second therefore neither starts a thousand programs nor suppresses other alarms.
-Suppressed runs are counted and reported.
+faulty cable that reports losses every second therefore starts only a few programs, and other events still run their
+hooks. The status shows the number of suppressed runs.
 """
 
 import os
@@ -35,28 +34,28 @@ from monitor.settings.loading import Hook
 THREADS: Final = 4
 """Number of threads, each of which runs one command at a time."""
 MAX_QUEUED: Final = 100
-"""Capacity of the queue."""
+"""Largest number of queued commands."""
 BURST: Final = 10
-"""Runs that are possible in a row."""
+"""Largest number of runs in a row."""
 RUN_INTERVAL_S: Final = 6.0
-"""Interval at which a further run becomes possible."""
+"""Minimum mean interval between two runs after a burst."""
 OUTPUT_BYTES: Final = 4096
-"""Length of the end of a command's output that is kept."""
+"""Number of bytes that are kept from the end of a command's output."""
 MAX_LINE_CHARS: Final = 200
-"""Length of the command's last line in a message, in characters."""
+"""Largest length of the last output line in a message, in characters."""
 POLL_S: Final = 0.05
-"""Interval at which the end of a command is checked."""
+"""Interval between two checks whether a command has ended."""
 CLOSE_TIMEOUT_S: Final = 2.0
-"""Time that commands have left when the service ends."""
+"""Time for running commands to end when the service stops."""
 PRIVATE_VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
-"""Environment variables that are meant for this process alone."""
+"""Environment variables that are not passed to commands."""
 
 _log = structlog.get_logger("imu-monitor")
 
 
 @dataclass(frozen=True, slots=True)
 class _Job:
-    """Command that is to run for an event."""
+    """Queued command of a hook."""
 
     hook: Hook
     payload: bytes
@@ -71,7 +70,7 @@ class Hooks(Output):
     hooks : sequence of Hook
         Configured hooks.
     put : callable
-        Publishes a message on a zenoh key. It returns "", or the reason why the message was not published.
+        Publishes a message on a zenoh key; returns "", or the reason why the message was not published.
     now : callable, optional
         Monotonic clock in seconds.
     """
@@ -83,7 +82,9 @@ class Hooks(Output):
         self._put = put
         self._now = now
         self._jobs: queue.Queue[_Job | None] = queue.Queue(MAX_QUEUED)
-        self._allowed: dict[tuple[Hook, str, str], tuple[float, float]] = {}  # runs left, and the time of that count
+        self._allowed: dict[
+            tuple[Hook, str, str], tuple[float, float]
+        ] = {}  # number of allowed runs, and the time of this number
         self._threads: list[threading.Thread] = []
         self._closing = threading.Event()
         self._last_error = ""  # error of the newest run; empty if it succeeded
@@ -101,7 +102,7 @@ class Hooks(Output):
         return f"ok, but {held_back}" if held_back else "ok"
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Run the hooks that match an event; see ``Output`` for the parameters."""
+        """Run the hooks that match an event."""
         wanted = [one for one in self.hooks if _matches(one, device, event.kind)]
         if not wanted:
             return
@@ -117,11 +118,11 @@ class Hooks(Output):
                 self._start(_Job(hook, payload + b"\n", named))
 
     def close(self) -> None:
-        """Let queued and running commands end within CLOSE_TIMEOUT_S, then kill them."""
+        """Wait up to CLOSE_TIMEOUT_S for queued and running commands, then kill them."""
         for _ in self._threads:
             try:
                 self._jobs.put_nowait(None)
-            except queue.Full:  # more commands are queued than can still run
+            except queue.Full:  # the queue has more commands than can still run
                 break
         until_s = time.monotonic() + CLOSE_TIMEOUT_S
         for thread in self._threads:
@@ -143,7 +144,7 @@ class Hooks(Output):
         return may
 
     def _start(self, job: _Job) -> None:
-        """Queue a command, and start the threads if they do not run yet."""
+        """Queue a command. The first command starts the threads."""
         try:
             while len(self._threads) < THREADS:
                 thread = threading.Thread(target=self._run_queued, name=f"hooks {len(self._threads)}", daemon=True)
@@ -159,10 +160,10 @@ class Hooks(Output):
     def _run_queued(self) -> None:
         """Run queued commands one after the other, in a thread."""
         while not self._closing.is_set() and (job := self._jobs.get()) is not None:
-            self._log_result(job.hook.command[0], run_command(job.hook, job.payload, job.named, self._closing.is_set))
+            self._log_result(job.hook.command[0], _run_command(job.hook, job.payload, job.named, self._closing.is_set))
 
     def _log_result(self, what: str, wrong: str) -> None:
-        """Log the result of a run and keep its error for the status."""
+        """Log the result of a run, and keep the error for the status."""
         if wrong:
             self._failed += 1
             _log.warning("hook", hook=what, error=wrong)
@@ -176,25 +177,8 @@ def _matches(hook: Hook, device: str, kind: str) -> bool:
     return ("*" in hook.on or kind in hook.on) and (not hook.devices or device in hook.devices)
 
 
-def run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Callable[[], bool]) -> str:
-    """Run the command of a hook to its end.
-
-    Parameters
-    ----------
-    hook : Hook
-        Hook with its command and its time limit.
-    payload : bytes
-        Standard input of the command.
-    named : mapping of str to str
-        Additional environment variables.
-    ending : callable
-        Returns True if the command is to be killed now.
-
-    Returns
-    -------
-    str
-        "" if the command succeeded, else a description of the error.
-    """
+def _run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Callable[[], bool]) -> str:
+    """Run the command of a hook, or kill it when ``ending`` returns True; return "" or a description of the error."""
     environment = {name: value for name, value in os.environ.items() if name not in PRIVATE_VARIABLES}
     try:
         process = subprocess.Popen(
@@ -203,7 +187,7 @@ def run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Ca
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             env={**environment, **named},
-            start_new_session=True,  # a process group of its own can be killed as a whole
+            start_new_session=True,  # a separate process group can be killed as a whole
         )
     except (OSError, ValueError) as error:
         return f"cannot be started: {getattr(error, 'strerror', None) or error}"
@@ -214,7 +198,7 @@ def run_command(hook: Hook, payload: bytes, named: Mapping[str, str], ending: Ca
         return f"killed: {error.strerror or error}"
     finally:
         if process.poll() is None:
-            os.killpg(process.pid, signal.SIGKILL)  # the process was not reaped yet, so the id is still its own
+            os.killpg(process.pid, signal.SIGKILL)  # not yet reaped, so no other process has this id
             process.wait()
 
 
@@ -237,7 +221,7 @@ def _wait_for_end(
 
 
 class _Pipes:
-    """Non-blocking pipes to a command, so that a command that neither reads nor writes delays nothing."""
+    """Non-blocking pipes to a command, so that a command that does not read or write delays nothing."""
 
     def __init__(self, process: "subprocess.Popen[bytes]", payload: bytes) -> None:
         assert process.stdin is not None
@@ -267,22 +251,17 @@ class _Pipes:
                 self._read()
 
     def read_rest_of_pipe(self) -> None:
-        """Read what is left in the pipe after the command has ended, within limits: its child processes may go on
-        writing.
-        """
+        """Read the rest of the output of a finished command, within limits, because its children may still write."""
         for _ in range(16):
             if self._out.closed or not self._read():
                 return
 
     def last_line(self) -> str:
-        """Return ``: `` and the last line that the command printed, with unprintable characters replaced; "" if there
-        is none.
-        """
+        """Return ``: `` and the last output line with unprintable characters replaced; "" without output."""
         lines = self._tail.decode("utf-8", "replace").strip().splitlines()
-        said = (
-            "".join(letter if letter.isprintable() else "�" for letter in lines[-1])[-MAX_LINE_CHARS:] if lines else ""
-        )
-        return f": {said}" if said else ""
+        if not lines:
+            return ""
+        return f": {''.join(letter if letter.isprintable() else '�' for letter in lines[-1])[-MAX_LINE_CHARS:]}"
 
     def _write(self) -> None:
         """Write as much of the payload as the pipe accepts."""
@@ -297,7 +276,7 @@ class _Pipes:
             self._in.close()
 
     def _read(self) -> bool:
-        """Read the pipe once; return True if there may be more data."""
+        """Read once from the pipe; return True if more data may follow."""
         try:
             data = os.read(self._out.fileno(), OUTPUT_BYTES)
         except BlockingIOError:

@@ -1,15 +1,15 @@
 """User limits on noise coefficients: detects when a coefficient crosses a limit and when it returns.
 
-A single value crosses a limit by chance from time to time, so the confidence interval decides. An upper limit is
-crossed if ``lo`` is above it. A lower limit is crossed if ``hi`` is below it, and the ``hi`` of an upper bound counts
-as well. The event ``limit_crossed`` is raised if every estimate during ``hold_s`` of samples is beyond the limit.
+A single value may cross a limit by chance, so the confidence interval decides. An upper limit is crossed if the lower
+end ``lo`` of the interval is above the limit. A lower limit is crossed if the upper end ``hi`` is below the limit. If
+every estimate during ``hold_s`` seconds of samples is beyond the limit, the event ``limit_crossed`` is raised.
 
-The event ``limit_back`` is raised when the value itself has been back for the same time. In between, the state does not
-change. An upper bound is back under an upper limit when its ``hi`` is, because the data do not show a smaller value. An
-estimate without a value, as after the restart of an axis, counts for neither, and the hold time starts again.
+If the value has been within the limit for ``hold_s`` seconds of samples, the event ``limit_back`` is raised. For an
+upper bound without a value, ``hi`` is compared with the limit. An estimate without value and bound, for example after
+the restart of an axis, restarts the hold time.
 
-The hold time is counted in samples, not by a clock. Missing samples are no evidence, and a replayed recording gives the
-same events as the live sensor. The module uses no clock and no thread.
+The hold time is counted in samples. Missing samples are therefore no evidence, and a replayed recording gives the same
+events as the live sensor. The module uses no clock and no thread.
 """
 
 from collections.abc import Sequence
@@ -40,10 +40,10 @@ class Bound:
 
     axis: str
     letter: str
-    limit: float  # SI unit of letter and axis
-    upper: bool  # True for an upper limit, False for a lower limit
+    limit: float  # SI unit of the coefficient on this axis
+    upper: bool  # True for an upper limit, False for a lower one
     hold_s: float
-    times_model: float | None = None  # factor on the model's coefficient from which the limit was computed
+    times_model: float | None = None  # limit as a multiple of the coefficient of the noise model
 
     @property
     def place(self) -> str:
@@ -59,12 +59,12 @@ class _Measured:
     lo: float
     hi: float
 
-    def beyond(self, bound: Bound) -> bool:
+    def is_beyond(self, bound: Bound) -> bool:
         """Return True if the interval is beyond the limit."""
         return self.lo > bound.limit if bound.upper else self.hi < bound.limit
 
-    def back(self, bound: Bound) -> bool:
-        """Return True if the value is back within the limit."""
+    def is_back(self, bound: Bound) -> bool:
+        """Return True if the value is within the limit."""
         if not bound.upper:
             return self.value >= bound.limit
         return (self.value if isfinite(self.value) else self.hi) <= bound.limit
@@ -79,14 +79,14 @@ class _State:
 
 
 class LimitMonitor:
-    """State of all limits of one device.
+    """Monitor of all limits of one device.
 
     Parameters
     ----------
     limits : sequence of Limit
         Limits from the settings of the device.
     model : NoiseModel or None
-        Model in force, for limits relative to it.
+        Noise model of the device, for limits that are relative to the model.
 
     Raises
     ------
@@ -99,23 +99,23 @@ class LimitMonitor:
 
     @property
     def limits_crossed_now(self) -> tuple[str, ...]:
-        """Limits that are crossed now, for example ``gz N``."""
+        """Axis and letter of each crossed limit, for example ``gz N``."""
         return tuple(bound.place for bound, state in self.states.items() if state.crossed)
 
     def copy_states_from(self, other: "LimitMonitor") -> None:
-        """Copy the states of the limits that ``other`` has as well."""
+        """Copy the states of all limits that both monitors have."""
         for bound in self.states:
             self.states[bound] = other.states.get(bound, self.states[bound])
 
     def check_estimate(self, estimate: Estimate) -> list[Event]:
-        """Test all limits against a new estimate, and return the resulting events."""
+        """Compare a new estimate with all limits, and return the resulting events."""
         events = (self._test_bound(bound, state, estimate) for bound, state in self.states.items())
         return [event for event in events if event is not None]
 
     def _test_bound(self, bound: Bound, state: _State, estimate: Estimate) -> Event | None:
-        """Test one limit against an estimate; return an event if its state changes."""
+        """Compare an estimate with one limit; return an event if the state of the limit changes."""
         seen = _measured(bound, estimate)
-        if not (seen.back(bound) if state.crossed else seen.beyond(bound)):
+        if not (seen.is_back(bound) if state.crossed else seen.is_beyond(bound)):
             state.since = None
             return None
         if state.since is None:
@@ -128,7 +128,7 @@ class LimitMonitor:
 
 
 def read_model_in_force(device: Device) -> NoiseModel | None:
-    """Read the model in force of a device; return None if it has none.
+    """Read the noise model with which a device is compared; return None if none is configured.
 
     Raises
     ------
@@ -144,14 +144,14 @@ def read_model_in_force(device: Device) -> NoiseModel | None:
 
 
 def make_bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound]:
-    """Return a bound for each axis of each limit.
+    """Return one bound for each axis of each limit.
 
     Parameters
     ----------
     limits : sequence of Limit
         Limits from the settings of a device.
     model : NoiseModel or None
-        Model in force.
+        Noise model of the device.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def make_bounds(limits: Sequence[Limit], model: NoiseModel | None) -> list[Bound
 
 
 def _measured(bound: Bound, estimate: Estimate) -> _Measured:
-    """Return the coefficient of a bound from an estimate."""
+    """Return the coefficient of an estimate to which a limit applies."""
     table, at = estimate.coefficients, (SYMBOLS.index(bound.letter), AXES.index(bound.axis))
     if Status(int(table.status[at])) == Status.UNESTIMATED:
         return _Measured(float("nan"), float("nan"), float("nan"))
@@ -190,7 +190,7 @@ def _measured(bound: Bound, estimate: Estimate) -> _Measured:
 
 
 def _event(bound: Bound, seen: _Measured, crossed: bool, t_ns: int, since_ns: int) -> Event:
-    """Return the event for a limit that was crossed or is back."""
+    """Return the event ``limit_crossed`` or ``limit_back``."""
     what = {"value": seen.value, "lo": seen.lo, "hi": seen.hi, "limit": bound.limit}
     kind = LIMIT_CROSSED if crossed else LIMIT_BACK
     return Event(
@@ -199,7 +199,7 @@ def _event(bound: Bound, seen: _Measured, crossed: bool, t_ns: int, since_ns: in
 
 
 def _sigma(bound: Bound, seen: _Measured) -> float | None:
-    """Return the distance of value and limit in standard errors; None for an upper bound."""
+    """Return the distance between value and limit in standard errors; None for an upper bound."""
     if not isfinite(seen.value):
         return None
     error = (seen.value - seen.lo if seen.value > bound.limit else seen.hi - seen.value) / Z95

@@ -1,4 +1,4 @@
-"""Log level of the process, which a reload can change while loggers are in use."""
+"""Log level of the process. A reload can change the level of existing loggers."""
 
 import logging
 

@@ -1,10 +1,10 @@
 """Prometheus metrics over HTTP: the newest values of each device, if ``[metrics] listen`` is set.
 
-The main loop stores the newest health and estimate of each device and continues. A thread of the server answers each
-scrape from the stored values, so a scrape does not delay the main loop. A scrape that hangs is ended after TIMEOUT_S.
-If MAX_SCRAPES scrapes are active, the next one is rejected. If the port is in use, the output reports it and retries.
+The main loop stores the newest health and estimate of each device. For each scrape, a server thread answers with the
+stored values, so a scrape does not delay the main loop. A scrape that hangs is ended after TIMEOUT_S. While MAX_SCRAPES
+scrapes are active, further scrapes are rejected. If the port is in use, the status says so, and the server tries again.
 
-All values are in SI units. A coefficient with an upper bound only has ``hi`` and no value. A coefficient that could not
+All values are in SI units. A coefficient with only an upper bound has ``hi`` and no value. A coefficient that could not
 be estimated has no entry.
 """
 
@@ -49,47 +49,45 @@ _GYRO_UNITS: Final = ", ".join(
     f"{symbol} {gyro_and_accel_units(term)[symbol][0]}" for symbol, term in STANDARD_TERMS.items()
 )
 UNITS: Final = f"gyroscopes {_GYRO_UNITS}; accelerometers with m/s for rad"
-"""Text about the units of the coefficients."""
+"""Units of the coefficients, for the descriptions."""
 
 Rows = Mapping[tuple[str, ...], float | None]
-"""Values of one metric by the values of its labels; None if unknown."""
+"""Values of one metric by label values; None if unknown."""
 Numbers = Callable[[Health], float | None]
 """Function that reads one value from the health of a device."""
 
 COUNTERS: Final[dict[str, tuple[str, Numbers]]] = {
     "received": ("Samples received", lambda one: one.received),
     "lost": ("Samples missing on the wire", lambda one: one.lost),
-    "bad": ("Samples rejected: failed check, impossible value", lambda one: one.bad),
+    "bad": ("Samples rejected because of a failed check or an impossible value", lambda one: one.bad),
     "overflowed": ("Samples overwritten before they were used", lambda one: one.overflowed),
-    "repeated": ("Samples that came twice and were left out", lambda one: one.repeated),
-    "late": ("Samples that came after their place had passed", lambda one: one.late),
+    "repeated": ("Repeated samples, which were discarded", lambda one: one.repeated),
+    "late": ("Samples that arrived too late and were discarded", lambda one: one.late),
 }
 """Counters ``imu_monitor_samples_<name>_total`` for each device: description and value."""
 GAUGES: Final[dict[str, tuple[str, Numbers]]] = {
-    "sample_rate_hertz": ("Measured rate of samples", lambda one: one.rate_hz),
-    "uptime_seconds": ("Since the device was started", lambda one: one.uptime_s),
+    "sample_rate_hertz": ("Measured sample rate", lambda one: one.rate_hz),
+    "uptime_seconds": ("Time since the device was started", lambda one: one.uptime_s),
     "moving": ("1 while the device is moved", lambda one: float(one.moving)),
-    "limits_crossed": ("Limits of the user that are passed now", lambda one: float(len(one.crossed))),
+    "limits_crossed": ("Number of crossed user limits", lambda one: float(len(one.crossed))),
 }
 """Gauges ``imu_monitor_<name>`` for each device: description and value."""
 
 
 class MetricsOutput(Output):
-    """Output that keeps the newest values and serves them.
-
-    The parameters of the output methods are described in ``monitor.daemon.output.Output``.
+    """Output that stores the newest values and serves them to Prometheus.
 
     Parameters
     ----------
     settings : Metrics
-        Address to listen on. Port 0 stands for any free port.
+        Address of the server. Port 0 selects a free port.
     """
 
     def __init__(self, settings: Metrics) -> None:
         self._settings = settings
         self.state = "starting"
         self.port = 0
-        """Port of the server; 0 while it does not listen."""
+        """Port of the server; 0 while the server does not listen."""
         self._healths: dict[str, Health] = {}
         self._estimates: dict[str, Estimate] = {}
         self._events: Counter[tuple[str, str]] = Counter()
@@ -120,7 +118,7 @@ class MetricsOutput(Output):
             del self._events[key]
 
     def start(self) -> None:
-        """Start the server in a thread. It reports errors in ``state`` and tries again."""
+        """Start the server in a thread. ``state`` shows errors, after which the server tries again."""
         self._thread.start()
 
     def close(self) -> None:
@@ -135,18 +133,18 @@ class MetricsOutput(Output):
     # --- called by the registry of the client library
 
     def collect(self) -> "Iterator[Metric]":
-        """Yield all metrics at one moment."""
+        """Yield all metrics of the present moment."""
         healths, estimates = dict(self._healths), dict(self._estimates)
         yield from _device_metrics(healths)
         yield from _process_metrics(healths)
         yield from _coefficient_metrics(estimates)
-        told: Rows = {key: float(count) for key, count in dict(self._events).items()}
-        yield _metric("events", "Events told", ("device", "kind"), told, counter=True)
+        counts: Rows = {key: float(count) for key, count in dict(self._events).items()}
+        yield _metric("events", "Number of events", ("device", "kind"), counts, counter=True)
 
     # --- server thread
 
     def _run(self) -> None:
-        """Serve scrapes until closed, and retry while the port cannot be used."""
+        """Serve scrapes until the output is closed, and retry while the port cannot be used."""
         try:
             from prometheus_client import CollectorRegistry
         except ImportError:
@@ -170,9 +168,9 @@ class MetricsOutput(Output):
 
 
 class _Server(socketserver.ThreadingTCPServer):
-    """Server with one thread for each scrape.
+    """Server with one thread per scrape.
 
-    The server class of http.server is not used, because it first asks the network for the name of this machine.
+    The server class of http.server is not used, because it asks the network for the name of this machine.
     """
 
     allow_reuse_address = True
@@ -186,7 +184,7 @@ class _Server(socketserver.ThreadingTCPServer):
         super().__init__(address, _make_handler(registry))
 
     def get_request(self) -> Any:
-        """Accept the next connection; if there are no file descriptors left, pause before the next attempt."""
+        """Accept the next connection. After an error, such as too few file descriptors, pause before the next one."""
         try:
             return super().get_request()
         except OSError:
@@ -212,11 +210,11 @@ class _Server(socketserver.ThreadingTCPServer):
             self._free.release()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Ignore the error of a connection that its client has closed."""
+        """Ignore the error of a connection that the client has closed."""
 
 
 def _make_handler(registry: "CollectorRegistry") -> "type[MetricsHandler]":
-    """Return a handler that serves the metrics of a registry at PATH only, within TIMEOUT_S."""
+    """Return a handler that serves the metrics of a registry at PATH, with the time limit TIMEOUT_S."""
     from prometheus_client import MetricsHandler
 
     class Handler(MetricsHandler):
@@ -240,11 +238,11 @@ def _device_metrics(healths: Mapping[str, Health]) -> "Iterator[Metric]":
     for name, (words, number) in GAUGES.items():
         yield _metric(name, words, ("device",), {(device,): number(one) for device, one in healths.items()})
     states: Rows = {(device, state): float(one.state == state) for device, one in healths.items() for state in STATES}
-    yield _metric("state", "1 for the state that the device is in", ("device", "state"), states)
+    yield _metric("state", "1 for the present state of the device", ("device", "state"), states)
     latencies: dict[tuple[str, ...], float | None] = {}
     for device, one in healths.items():
         latencies |= {(device, "0.5"): one.latency_p50_s, (device, "0.99"): one.latency_p99_s}
-    words = "Receipt to published, over the last second"
+    words = "Latency from reception to publication, over the last second"
     yield _metric("latency_seconds", words, ("device", "quantile"), latencies)
 
 
@@ -266,8 +264,8 @@ def _coefficient_metrics(estimates: Mapping[str, Estimate]) -> "Iterator[Metric]
     """Yield the metrics of the noise coefficients."""
     for name, words in (
         ("value", "of the window"),
-        ("lo", "lower end of its 95 % interval"),
-        ("hi", "upper end of its 95 % interval, or the one-sided 95 % bound where there is no value"),
+        ("lo", "lower end of the 95 % interval"),
+        ("hi", "upper end of the 95 % interval, or the one-sided 95 % bound if there is no value"),
     ):
         rows: Rows = {
             (device, axis, letter): float(getattr(one.coefficients, name)[row, column])
@@ -288,7 +286,7 @@ def _metric(
     rows: Rows,
     counter: bool = False,
 ) -> "Metric":
-    """Return one metric with its labels. Unknown values have no row."""
+    """Return one metric. Unknown values are left out."""
     from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 
     kind = CounterMetricFamily if counter else GaugeMetricFamily

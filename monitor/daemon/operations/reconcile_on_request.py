@@ -1,15 +1,14 @@
-"""Reconciliation of the live window: answers ``command/reconcile`` with the command that also reads recordings.
+"""Reconciliation of the live window on request: answers the zenoh query ``command/reconcile``.
 
-A request consists of a copy of the window and a zenoh query. The result is an answer to the query, and an event of the
-device. For each query, a thread writes the samples as a recording into a temporary folder and runs ``imu-monitor
-reconcile`` on it in a child process. It then passes the JSON of the child on. The child has a low priority and is
-killed after TIMEOUT_S. Nothing waits for it. A fit takes seconds to minutes, and in this process it would delay every
-sample. Each device has at most one reconciliation at a time.
+For each query, a thread writes a copy of the window as a recording into a temporary folder. A child process then runs
+``imu-monitor reconcile`` on this recording. The thread answers the query with the JSON result of the child process, and
+the device publishes an event. The child process has a low priority and is killed after TIMEOUT_S. It is a separate
+process, because a fit takes seconds to minutes and would delay every sample. Each device has at most one reconciliation
+at a time.
 
 The query cannot choose the folder of the report, because anyone on the network may send a query. The report is kept in
-a new folder inside the device's ``reconcile_folder``, or not at all. The possible answers are a result with ``exit`` 0,
-a result with ``exit`` 3 if the data do not support an answer, and an error in one line. A result with ``exit`` 3 states
-the reason.
+a new folder inside the device's ``reconcile_folder``, if this folder is configured. The answer is a result with
+``exit`` 0, a result with ``exit`` 3 and a reason if the data do not support an answer, or an error in one line.
 """
 
 import contextlib
@@ -39,27 +38,25 @@ COMMAND: Final = (*PROGRAM, "reconcile")
 TIMEOUT_S: Final = 900.0
 """Time after which the child process is killed."""
 NICENESS_INCREASE: Final = 10
-"""Increase of the child's niceness over the daemon's. An unprivileged process cannot lower the niceness of its
-children.
-"""
+"""Difference between the niceness of the child process and the niceness of the daemon."""
 LARGEST_NICENESS: Final = 19
 SEED: Final = 1
 """Seed of the simulated recordings."""
 DONE: Final = 0
 """Exit status of a successful reconciliation."""
 NO_ANSWER: Final = 3
-"""Exit status if the data do not support an answer. The result states the reason."""
+"""Exit status if the data do not support an answer."""
 JOIN_TIMEOUT_S: Final = 3.0
 """Longest wait for a thread when the service ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """Copy of a window that is to be reconciled."""
+    """Copy of a window to reconcile."""
 
     device: str
     unix_s: float  # time of the newest sample
-    samples: int  # number of samples received up to the newest one
+    samples: int  # number of received samples up to the newest one
     window: WindowSnapshot
     temperature_c: Floats  # [n] of the samples in the window
     model: Path | None  # model under test
@@ -75,12 +72,12 @@ class Finished:
 
 
 class Reconciler:
-    """Runner of the reconciliations of all devices.
+    """Runs the reconciliations of all devices.
 
     Parameters
     ----------
     program : sequence of str, optional
-        Command that is run, before the path of the recording and the options.
+        Beginning of the command line. The path of the recording and the options are appended.
     limit_s : float, optional
         Time in seconds after which the command is killed.
     """
@@ -94,7 +91,7 @@ class Reconciler:
         self._closing = threading.Event()
 
     def start(self, job: Job, command: Command) -> None:
-        """Start a reconciliation and return at once. The command is refused while another one runs for the device.
+        """Start a reconciliation and return at once. A second query for the same device is refused.
 
         Parameters
         ----------
@@ -121,7 +118,7 @@ class Reconciler:
         return found
 
     def close(self) -> None:
-        """Kill the running reconciliations and refuse their queries."""
+        """Kill the running reconciliations, and refuse their queries."""
         self._closing.set()
         for child in list(self._children.values()):
             _kill(child)
@@ -143,20 +140,14 @@ class Reconciler:
         self._finished.put(Finished(job.device, format_result(result, status)))
 
     def _reconcile(self, job: Job) -> tuple[dict[str, Any], int, str | None]:
-        """Return the JSON result, the exit status and the folder of the report, or None if the report is not kept.
-
-        Raises
-        ------
-        RuntimeError
-            If the command gave no result.
-        """
+        """Return the JSON result, the exit status, and the folder of the report; None if the report is not kept."""
         with tempfile.TemporaryDirectory(prefix="imu-monitor-") as temporary:
             path, folder = Path(temporary) / f"{job.device}.npz", Path(temporary) / "report"
             if job.folder is not None:
                 stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(job.unix_s))
                 folder = job.folder / f"{job.device}-{stamp}"
                 folder.mkdir(parents=True, exist_ok=True)
-            write_window(path, job)
+            _write_window(path, job)
             options = ["--out", str(folder), "--json", "-", "--seed", str(SEED)]
             if job.model is not None:
                 options += ["--model", str(job.model)]
@@ -167,7 +158,7 @@ class Reconciler:
         try:
             result = msgspec.json.decode(output, type=dict[str, Any])
         except msgspec.DecodeError as error:
-            raise RuntimeError(f"reconcile gave no result that can be read: {error}") from error
+            raise RuntimeError(f"the result of reconcile cannot be read: {error}") from error
         return result, status, None if job.folder is None else str(folder)
 
     def _run_child(self, device: str, arguments: list[str]) -> tuple[int, bytes, bytes]:
@@ -178,13 +169,13 @@ class Reconciler:
         try:
             with contextlib.suppress(ProcessLookupError):
                 os.setpriority(os.PRIO_PROCESS, child.pid, min(os.nice(0) + NICENESS_INCREASE, LARGEST_NICENESS))
-            if self._closing.is_set():  # the child was started while ``close`` killed the others
+            if self._closing.is_set():  # ``close`` was called while the child was started
                 _kill(child)
             output, errors = child.communicate(timeout=self._limit_s)
         except subprocess.TimeoutExpired:
             _kill(child)
             child.communicate()
-            raise RuntimeError(f"reconcile was ended after {self._limit_s:g} s") from None
+            raise RuntimeError(f"reconcile was killed after {self._limit_s:g} s") from None
         finally:
             del self._children[device]
         if self._closing.is_set():
@@ -192,16 +183,8 @@ class Reconciler:
         return child.returncode, output, errors
 
 
-def write_window(path: Path, job: Job) -> None:
-    """Write a window as a recording with its measured axes, its temperature and its rate.
-
-    Parameters
-    ----------
-    path : Path
-        File to write, in the format of ``numpy.savez``.
-    job : Job
-        Window to write.
-    """
+def _write_window(path: Path, job: Job) -> None:
+    """Write the measured axes, the temperature and the sample rate of a window as a recording."""
     values = job.window.values()
     columns = {axis: values[:, i] for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()}
     if not np.isnan(job.temperature_c).all():

@@ -1,12 +1,12 @@
 """Notification of systemd by datagrams on NOTIFY_SOCKET: ready, status, watchdog, reloading and stopping.
 
-Without that variable nothing is sent, and the service behaves the same. A datagram that cannot be sent is dropped. In
-that case the watchdog of systemd acts.
+Without the variable NOTIFY_SOCKET, no message is sent. A datagram that cannot be sent is dropped. The watchdog of
+systemd acts if too many messages are missing.
 
-``alive`` sends WATCHDOG=1. The main loop calls it, and it sends the message only while every reader of a sensor makes
-progress. A reader makes progress if it reads, times out or tries to open its link. If the main loop hangs or a reader
-is stuck in a driver, the messages stop, and systemd restarts the service. A missing device does not stop them, because
-its reader tries again and again. The protocol is described in sd_notify(3) and sd_watchdog_enabled(3).
+The main loop calls ``send_watchdog``, which sends WATCHDOG=1 while every reader makes progress. A reader makes progress
+if it reads, times out or tries to open the link. If the main loop hangs or a reader is stuck in a driver, the watchdog
+messages stop, and systemd restarts the service. The reader of a missing device also makes progress, because it tries to
+open the link. The protocol is described in sd_notify(3) and sd_watchdog_enabled(3).
 """
 
 import contextlib
@@ -17,12 +17,9 @@ from collections.abc import Mapping, MutableMapping
 from typing import Final
 
 MIN_STUCK_S: Final = 20.0
-"""Shortest time without progress after which a reader counts as stuck.
-
-Pauses between two attempts last 5 s, and an attempt may wait for a network host.
-"""
+"""Minimum time without progress after which a reader counts as stuck. An attempt may wait for a network host."""
 BEATS_PER_TIMEOUT: Final = 3.0
-"""Number of watchdog messages in the time after which systemd restarts the service."""
+"""Number of watchdog messages per watchdog timeout of systemd."""
 VARIABLES: Final = ("NOTIFY_SOCKET", "WATCHDOG_USEC", "WATCHDOG_PID")
 """Environment variables of the protocol."""
 
@@ -33,7 +30,7 @@ class SystemdNotifier:
     Parameters
     ----------
     address : str, optional
-        Address of the socket, a path or "@name". With "" nothing is sent.
+        Address of the socket, a path or "@name". If it is "", no message is sent.
     watchdog_s : float, optional
         Watchdog timeout of systemd in seconds. None if the watchdog is off.
     stuck_s : float, optional
@@ -43,7 +40,7 @@ class SystemdNotifier:
 
     def __init__(self, address: str = "", watchdog_s: float | None = None, stuck_s: float | None = None) -> None:
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
-        self._watchdog_s = watchdog_s
+        self.watchdog_s = watchdog_s
         self._stuck_s = stuck_s or max(MIN_STUCK_S, 0.5 * (watchdog_s or 0.0))
         self._said = ""
         self.ready_sent = False
@@ -52,26 +49,21 @@ class SystemdNotifier:
 
     @classmethod
     def from_environment(cls, environment: MutableMapping[str, str]) -> "SystemdNotifier":
-        """Create a unit from the environment, and remove its variables, because they are not meant for child processes.
+        """Create a notifier from the environment, and remove the variables, which child processes must not see.
 
         Examples
         --------
         >>> environment = {"NOTIFY_SOCKET": "/run/notify", "WATCHDOG_USEC": "60000000", "HOME": "/"}
-        >>> SystemdNotifier.from_environment(environment).watched, environment
-        (True, {'HOME': '/'})
+        >>> SystemdNotifier.from_environment(environment).watchdog_s, environment
+        (60.0, {'HOME': '/'})
         """
         address, usec, pid = (environment.pop(name, "") for name in VARIABLES)
         watched = usec.isdecimal() and int(usec) > 0 and pid in ("", str(os.getpid()))
         known = address.startswith(("/", "@"))
         return cls(address if known else "", int(usec) / 1e6 if known and watched else None)
 
-    @property
-    def watched(self) -> bool:
-        """True if the watchdog of systemd is on."""
-        return self._watchdog_s is not None
-
     def ready(self) -> None:
-        """Report that the service has started or has finished a reload."""
+        """Send the message that the service has started or has finished a reload."""
         self.ready_sent = True
         self._send("READY=1")
 
@@ -83,11 +75,11 @@ class SystemdNotifier:
             self._send(f"STATUS={line}")
 
     def reloading(self) -> None:
-        """Report that a reload has begun; ``ready`` ends it."""
+        """Send the message that a reload has begun. ``ready`` reports the end of the reload."""
         self._send(f"RELOADING=1\nMONOTONIC_USEC={time.monotonic_ns() // 1000}")
 
     def stopping(self) -> None:
-        """Report that the service is stopping."""
+        """Send the message that the service is stopping."""
         self._send("STOPPING=1")
 
     def send_watchdog(self, turns: Mapping[str, int], now_s: float) -> list[str]:
@@ -110,13 +102,13 @@ class SystemdNotifier:
             for name, count in turns.items()
         }
         stuck = [name for name, (_, since_s) in self._turns.items() if now_s - since_s > self._stuck_s]
-        if self._watchdog_s is not None and not stuck and now_s >= self._next_beat_s:
-            self._next_beat_s = now_s + self._watchdog_s / BEATS_PER_TIMEOUT
+        if self.watchdog_s is not None and not stuck and now_s >= self._next_beat_s:
+            self._next_beat_s = now_s + self.watchdog_s / BEATS_PER_TIMEOUT
             self._send("WATCHDOG=1")
         return stuck
 
     def _send(self, text: str) -> None:
-        """Send a datagram, if there is a socket."""
+        """Send a datagram if systemd provides a socket."""
         if not self._address:
             return
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as notify:

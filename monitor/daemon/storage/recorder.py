@@ -1,18 +1,17 @@
 """Recorder of the daemon: writes the decoded samples of each device, and optionally its raw bytes, to segment files.
 
-The reader threads put blocks and chunks into bounded queues (``RecordingTrack``). One thread appends them to segments
-twice a second, and flushes the files to disk once a second. It also packs finished segments. It deletes the oldest
-segments by age, and while the disk is too full. A slow disk therefore delays no sample.
+The reader threads put blocks and chunks into bounded queues (``RecordingTrack``). The recorder thread writes the queues
+to segment files twice a second, and flushes the files to disk once a second. The recorder thread also packs finished
+segments, and deletes segments that are too old or overfill the disk. A slow disk delays no sample.
 
-A full or read-only disk stops the recording, and an event reports it. The rest of the service continues. The recorder
-tries again every few seconds. After a crash, the newest segment can be read up to its last complete batch
-(``Recorder.find_recording_tail``), so that the daemon resumes from there.
+A full or read-only disk stops the recording, and an event reports the reason. The rest of the service continues. The
+recorder tries again every few seconds. After a crash, the newest segment can be read up to the last complete batch
+(``Recorder.find_recording_tail``), so the daemon can continue from the end of the recording.
 
-Only one process at a time records into a folder (``FolderLock``). While another process holds the lock, nothing is
-written or deleted, and ``state`` names that process. When it ends, this process continues. Rows that the other process
-has recorded are left out, and later rows are still in the queue. In every round the thread checks that its open file
-still has its name and size. If another program has deleted, renamed, replaced or truncated the file, the recorder
-begins a new one.
+Only one process at a time records into a folder (``FolderLock``). While another process holds the lock, this process
+does not write or delete, and ``state`` names the other process. When the other process ends, this process continues
+with the rows that are not recorded yet. In every round, the recorder thread checks the name and the size of the open
+file. If another program has deleted, renamed, replaced or truncated the file, the recorder begins a new file.
 """
 
 import threading
@@ -35,16 +34,15 @@ from monitor.daemon.storage.recording_track import RETRY_S, Opening, RecorderEve
 from monitor.settings.loading import Storage
 
 WRITE_INTERVAL_S: Final = 0.5
-"""Interval between two batches of a device: the most that a crash loses. A power failure loses up to SYNC_INTERVAL_S.
-"""
+"""Interval between two batches. A crash loses at most this time, a power failure at most SYNC_INTERVAL_S."""
 SYNC_INTERVAL_S: Final = 1.0
 """Interval between two flushes of the files to disk."""
 DELETE_INTERVAL_S: Final = 30.0
 """Interval between two checks for segments to delete."""
 MAX_PACKING_S: Final = 0.1
-"""Longest time for packing in one round, so that batches are written in between."""
+"""Longest time for packing in one round, so that batches are written in time."""
 FOLDER_IN_USE_ADVICE: Final = "end it, or choose another folder in [storage]"
-"""Second half of the message about a folder that another process uses."""
+"""Advice in the message about a folder that another process uses."""
 
 
 class Recorder:
@@ -53,11 +51,11 @@ class Recorder:
     Parameters
     ----------
     storage : Storage
-        Folder, limits of age and disk use, and segment length.
+        Folder, segment length, and limits of age and disk use.
     origins : sequence of SegmentMetadata
         Recordings to write, each with its device and kind.
     opening : callable, optional
-        Opens a segment. Tests pass functions that simulate slow and broken disks.
+        Opens a segment. Tests simulate slow and broken disks with this function.
     """
 
     def __init__(
@@ -66,9 +64,9 @@ class Recorder:
         self._storage = storage
         self._opening = opening
         self._events: deque[RecorderEvent] = deque(maxlen=1000)
-        # several threads iterate over the tracks: the dictionary is replaced, never changed in place
+        # several threads iterate over the dictionary, so it is replaced and never changed in place
         self._tracks: dict[tuple[str, str], RecordingTrack] = {}
-        self._lock = threading.Lock()  # of the replacement of the dictionary
+        self._lock = threading.Lock()  # protects the replacement of the dictionary
         self._states: dict[str, DaemonState] = {}
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -90,19 +88,19 @@ class Recorder:
             self._tracks = {**self._tracks, **{(track.origin.device, track.origin.kind): track for track in more}}
 
     def remove_device(self, device: str) -> None:
-        """Stop recording a device after its queue has been written. ``is_recording`` then returns False."""
+        """Stop to record a device as soon as its queue has been written. ``is_recording`` then returns False."""
         for track in self._tracks.values():
             track.leaving |= track.origin.device == device
 
     def is_recording(self, device: str) -> bool:
-        """Return True while a device is recorded, or its queue is not written yet."""
+        """Return True while a device is recorded or its queue is not yet written."""
         return any(name == device for name, _ in self._tracks)
 
     @property
     def state(self) -> str:
         """Status message: ``ok``, or a description of the problem."""
         if self._thread.ident is not None and not self._thread.is_alive() and not self._closing.is_set():
-            return "recording ended by a fault of the program"
+            return "the recording ended because of an error in the program"
         if self._lock_failure:
             return self._lock_failure
         troubles = sorted({track.trouble for track in self._tracks.values() if track.trouble})
@@ -132,15 +130,15 @@ class Recorder:
             self._thread.join(timeout_s)
 
     def find_recording_tail(self, device: str) -> RecordingTail | None:
-        """Return the end of a device's recording from before this start, or None if there is nothing to resume from.
+        """Return the end of the existing recording of a device, or None if there is no recording to continue.
 
-        This method must be called before anything is written.
+        This method must be called before new rows are written.
         """
         track = self._tracks.get((device, "samples"))
         if track is None:
             return None
         if self._thread.ident is None:
-            self._acquire_folder()  # with the lock, no other process adds to the segments that are found now
+            self._acquire_folder()  # the lock prevents that another process adds segments
         return find_tail(track.origin, track.folder)
 
     # --- called by the reader threads
@@ -183,7 +181,7 @@ class Recorder:
             track.enqueue(moved, not self._other_process)
 
     def set_estimate_state(self, device: str, state: DaemonState) -> None:
-        """Set the state of the estimate that is recorded with the rows of a device from now on.
+        """Set the state of the estimate that is recorded with the next rows of a device.
 
         Parameters
         ----------
@@ -195,7 +193,7 @@ class Recorder:
         self._states[device] = state
 
     def is_queue_filling(self, device: str) -> bool:
-        """Return True if a replayed recording should wait, because the queue of its device is filling up."""
+        """Return True if a replayed recording should wait, because the queue of the device is filling up."""
         track = self._tracks.get((device, "samples"))
         return track is not None and not self._lock_failure and track.is_queue_filling_up
 
@@ -208,7 +206,7 @@ class Recorder:
             locked = self._acquire_folder()
             closing = self._closing.wait(WRITE_INTERVAL_S)
             for key, track in self._tracks.items():
-                leaving = track.leaving  # read before the queue: nothing is added after it has been set
+                leaving = track.leaving  # read before the queue, which receives no rows after ``leaving`` is set
                 if locked:
                     self._note = track.close_if_file_changed() or self._note
                     track.write_queued_rows(self._states.get(track.origin.device, DaemonState()), self._disk_full)
@@ -229,7 +227,7 @@ class Recorder:
             self._tracks = {other: track for other, track in self._tracks.items() if other != key}
 
     def _acquire_folder(self) -> bool:
-        """Take the lock on the folder, or check that it is still held; return False if nothing may be written."""
+        """Take the lock on the folder, or check that the lock is still held; return False without the lock."""
         if self._lock_failure and time.monotonic() - self._lock_failed_s < RETRY_S:
             return False
         try:
@@ -246,7 +244,7 @@ class Recorder:
         return not reason
 
     def _suspend(self, reason: str) -> None:
-        """Close all files and write nothing until the lock is held again."""
+        """Close all files until the lock is held again."""
         self._packing = None
         self._finished.clear()
         for track in self._tracks.values():
@@ -256,7 +254,7 @@ class Recorder:
         self._lock_failure, self._lock_failed_s = reason, time.monotonic()
 
     def _resume(self) -> None:
-        """Continue to record, without the rows that another process has recorded in the meantime."""
+        """Continue to record, without the rows that another process has recorded."""
         for track in self._tracks.values():
             if self._other_process:
                 track.drop_recorded_rows()
@@ -281,10 +279,10 @@ class Recorder:
             except StopIteration:
                 self._packing = None
             except (RecordingError, ConfigError, OSError):
-                self._packing = None  # the segment stays unpacked: it is larger, but can still be read
+                self._packing = None  # an unpacked segment is larger, but can be read
 
     def _delete_old(self) -> None:
-        """Delete segments that are too old, and the oldest segments while the disk is too full."""
+        """Delete segments that are too old. If the disk is too full, delete the oldest segments."""
         if time.monotonic() - self._delete_checked_s < (RETRY_S if self._disk_full else DELETE_INTERVAL_S):
             return
         self._delete_checked_s = time.monotonic()
@@ -299,7 +297,7 @@ class Recorder:
 def segment_metadata(
     device: str, axes: AxisMap, kind: segment.Kind = "samples", carrier: str = "", decoder: str = ""
 ) -> SegmentMetadata:
-    """Return the description of a device's segments.
+    """Return the metadata of the segments of a device.
 
     Parameters
     ----------

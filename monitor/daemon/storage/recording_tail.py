@@ -1,4 +1,4 @@
-"""End of an existing recording, from which the daemon resumes after a restart."""
+"""End of an existing recording, from which the daemon continues after a restart."""
 
 from collections import deque
 from collections.abc import Iterator
@@ -19,7 +19,7 @@ class RecordingTail:
     newest: SegmentPiece
 
     def pieces(self, span_s: float) -> Iterator[SegmentPiece]:
-        """Yield the last ``span_s`` seconds of the recording, oldest first, as far as the mounting is the same."""
+        """Yield the pieces of the last ``span_s`` seconds with the same axis mounting, oldest first."""
         begin_ns = int(self.newest.samples.t_ns[-1]) - round(span_s * 1e9)
         for path in self._segments_since(begin_ns):
             for piece in segment.read_samples(path):
@@ -27,7 +27,7 @@ class RecordingTail:
                     yield piece
 
     def _segments_since(self, begin_ns: int) -> list[Path]:
-        """Return the newest segments with the same axis mounting, back to the one that contains ``begin_ns``."""
+        """Return the segments with the same axis mounting that contain samples after ``begin_ns``."""
         chosen: deque[Path] = deque()
         for path in reversed(self.paths):
             try:
@@ -45,14 +45,14 @@ class RecordingTail:
 
 
 def find_tail(origin: SegmentMetadata, folder: Path) -> RecordingTail | None:
-    """Return the end of the recording in a folder, or None if there is nothing to resume from.
+    """Return the end of the recording in a folder, or None if there is no recording to continue.
 
     Files that are not valid segments are skipped and left in place.
 
     Parameters
     ----------
     origin : SegmentMetadata
-        Description of the recording. A recording with another axis mounting is not resumed.
+        Metadata of the recording. A recording with another axis mounting is not continued.
     folder : Path
         Folder of the segments.
     """

@@ -1,8 +1,7 @@
 """Recording of one device: a bounded queue, and the segment file to which the queue is written.
 
-The reader thread of the device fills the queue. The thread of the recorder calls all other methods. If writing fails,
-the rows stay in the queue as long as the queue has space. Rows that do not fit are counted, and leave a gap in the
-recording.
+The reader thread of the device fills the queue. The recorder thread calls all other methods. If a write fails, the rows
+stay in the queue while the queue has space. Rows that do not fit are counted and leave a gap in the recording.
 """
 
 import contextlib
@@ -27,18 +26,17 @@ from monitor.settings.loading import Storage
 RETRY_S: Final = 5.0
 """Interval between two attempts to record after an error."""
 MAX_QUEUE_BYTES: Final = 16_000_000
-"""Capacity of the queue of one device: three minutes of samples at 1 kHz."""
+"""Capacity of the queue of one device, three minutes of samples at 1 kHz."""
 TIME_RESOLUTION_NS: Final = 1000
 """Upper bound of the resolution of Unix times in a recording."""
 MAX_SAME_SAMPLE_NS: Final = 500_000_000
-"""Two rows with the same counter value are the same sample, received by two processes, if their times differ by less.
-"""
+"""Largest time difference of two rows with the same counter value that count as the same sample."""
 SAMPLE_BYTES: Final = 80
 """Memory that one sample occupies in a queue."""
 CHUNK_OVERHEAD_BYTES: Final = 100
 """Memory that a chunk occupies in a queue, in addition to its bytes."""
 RAW_FOLDER: Final = "raw"
-"""Name of the folder for raw bytes, inside the folder of a device."""
+"""Name of the folder for raw bytes in the folder of a device."""
 
 Opening = Callable[[Path, SegmentMetadata], SingleSegmentWriter]
 """Function that opens a new segment."""
@@ -46,7 +44,7 @@ Opening = Callable[[Path, SegmentMetadata], SingleSegmentWriter]
 
 @dataclass(frozen=True, slots=True)
 class RecorderEvent:
-    """Event in the recording of a device."""
+    """Event about the recording of a device."""
 
     device: str
     kind: str  # recording_stopped | recording_back
@@ -95,15 +93,15 @@ class RecordingTrack:
         self.trouble = ""
         """Reason why recording has stopped; empty while it works."""
         self.leaving = False
-        """True if the device was removed. Its queue is written, and then the track is deleted."""
+        """True if the device was removed. The track is deleted when the queue has been written."""
         self._segment_s = storage.segment_s
         self._opening = opening
         self._events = events
         self._finished = finished
-        self._lock = threading.Lock()  # of the queue; held only briefly, because the reader thread waits for it
+        self._lock = threading.Lock()  # protects the queue; held briefly, because the reader thread waits for the lock
         self._queue: deque[SampleBlock | Chunk] = deque()  # with Unix times
         self._queue_bytes = 0
-        self._dropped = 0  # rows that were dropped before the oldest in the queue, missing samples included
+        self._dropped = 0  # dropped and missing rows before the oldest row in the queue
         self._taken: list[SampleBlock | Chunk] = []  # taken from the queue and being written
         self._writer: SingleSegmentWriter | None = None
         self._begin_s = 0.0  # Unix time of the open segment's first row
@@ -115,25 +113,19 @@ class RecordingTrack:
     # --- queue
 
     @property
-    def has_unwritten_rows(self) -> bool:
-        """True if rows are not written yet."""
-        return bool(self._queue or self._taken)
-
-    @property
     def is_queue_filling_up(self) -> bool:
-        """True if the queue is filling up."""
+        """True if more than a quarter of the queue is in use."""
         return self._queue_bytes > MAX_QUEUE_BYTES // 4
 
     def enqueue(self, entries: Sequence[SampleBlock | Chunk], count_dropped: bool) -> None:
-        """Append to the queue, and drop the oldest entries if the queue is full.
+        """Append entries to the queue. If the queue is full, drop the oldest entries.
 
         Parameters
         ----------
         entries : sequence of SampleBlock or Chunk
             Entries with Unix times.
         count_dropped : bool
-            True if dropped rows count as missing in the recording. While another process records, they do not: missing
-            rows are found after the other process has ended.
+            True if dropped rows count as missing in the recording. False while another process records these rows.
         """
         with self._lock:
             self._queue.extend(entries)
@@ -147,7 +139,7 @@ class RecordingTrack:
                     self.missed += rows
 
     def drop_recorded_rows(self) -> None:
-        """Drop queued rows that are already in the folder; missing rows after these become a gap of the recording."""
+        """Drop queued rows that another process has recorded; rows missing after these rows become a gap."""
         newest = self._find_newest_row()
         with self._lock:
             waiting = [*self._taken, *self._queue]
@@ -163,7 +155,7 @@ class RecordingTrack:
             self._queue_bytes = sum(_size(one) for one in waiting)
 
     def _take_queue(self) -> None:
-        """Take the queue for writing; rows that were dropped before it become a gap of the recording."""
+        """Move the queue to the rows to be written; rows that were dropped become a gap in the recording."""
         with self._lock:
             self._taken = list(self._queue)
             self._queue.clear()
@@ -190,14 +182,14 @@ class RecordingTrack:
     # --- segment file
 
     def write_queued_rows(self, state: DaemonState, disk_full: str) -> None:
-        """Append the queue to the segment. If that fails, the rows wait, as far as the queue has space.
+        """Append the queued rows to the segment. After an error, the rows stay in memory for the next attempt.
 
         Parameters
         ----------
         state : DaemonState
             State of the estimate that is recorded with the rows.
         disk_full : str
-            Message if the disk is too full to write; else empty.
+            Message if the disk is too full; else "".
         """
         if disk_full:
             self._report_failure(disk_full)
@@ -244,15 +236,12 @@ class RecordingTrack:
             self._finished.append(writer.path)
 
     def suspend(self) -> None:
-        """Close the open segment, because another process may create segments in the folder."""
+        """Close the open segment while another process may create segments in the folder."""
         self.close_segment(pack=False)
         self._number = None
 
     def close_if_file_changed(self) -> str:
-        """Close a file that another program has changed; return a message about the change, or "".
-
-        The next row begins a new file.
-        """
+        """Close a file that another program has changed; return a message, or "" if the file is unchanged."""
         writer = self._writer
         change = "" if writer is None else writer.describe_external_change()
         if writer is None or not change:
@@ -262,7 +251,7 @@ class RecordingTrack:
             writer.close_changed_file()
         except OSError as error:
             change = f"{change} ({error.strerror or error})"
-        known = segment.list_segments(self.folder)  # files of another program may be among them, and are not packed
+        known = segment.list_segments(self.folder)  # not packed, because some may belong to another program
         self._number = max(self._number or 0, segment.parse_segment_number(known[-1]) if known else 0)
         note = f"{writer.path} {change} during recording, with {self._rows} rows in it; a new file is begun"
         self.queue_event("recording_stopped", note)
@@ -270,7 +259,7 @@ class RecordingTrack:
         return note
 
     def _append(self, state: DaemonState) -> None:
-        """Append the taken rows to the open segment, and begin a new segment if the present one has its full length."""
+        """Append rows to the open segment, or to a new segment if the open segment has its full length."""
         begin_s = _time_s(self._taken[0])
         if self._writer is not None and begin_s - self._begin_s >= self._segment_s:
             self.close_segment()
@@ -315,11 +304,11 @@ class RecordingTrack:
         self._events.append(RecorderEvent(self.origin.device, kind, text))
 
     def report_continuation(self) -> None:
-        """Queue an event that the recording continues."""
+        """Queue the event that the recording continues."""
         self.queue_event("recording_back", f"recording continues; {self.missed} rows are missing in it")
 
     def _report_failure(self, reason: str) -> None:
-        """Store the reason why recording has stopped, and queue an event if it had worked until now."""
+        """Store the reason why the recording has stopped. For the first failure, queue an event."""
         if not self.trouble:
             self.queue_event("recording_stopped", reason)
         self.trouble = reason
@@ -327,12 +316,12 @@ class RecordingTrack:
 
 
 def stopped_text(path: Path, error: OSError) -> str:
-    """Return the message for a recording that an error of the file system has stopped.
+    """Return the message that an error of the file system has stopped the recording.
 
     Parameters
     ----------
     path : Path
-        File or folder that the error concerns.
+        File or folder of the error.
     error : OSError
         Error of the file system.
     """
@@ -342,8 +331,8 @@ def stopped_text(path: Path, error: OSError) -> str:
 def _time_of(newest: _NewestRow, waiting: Sequence[SampleBlock | Chunk]) -> int:
     """Return the time of a recorded row on the clock of the queued rows, in Unix nanoseconds.
 
-    Two processes give a sample times that differ by some ms. The device's counter identifies the sample. If no queued
-    row has the same counter value, the recorded time is returned.
+    The times that two processes give the same sample differ by some milliseconds, so the sample is identified by the
+    counter of the device. If no queued row has the same counter value, the recorded time is returned.
     """
     for one in waiting if newest.tick != NO_TICK else ():
         if isinstance(one, SampleBlock):
@@ -354,7 +343,7 @@ def _time_of(newest: _NewestRow, waiting: Sequence[SampleBlock | Chunk]) -> int:
 
 
 def _rows_after(one: SampleBlock | Chunk, t_ns: int) -> list[SampleBlock | Chunk]:
-    """Return the rows later than a time: a whole block, a part of it, or nothing."""
+    """Return the rows later than a time: the whole block, a part of the block, or no block."""
     if isinstance(one, Chunk):
         return [one] if one.t_ns > t_ns else []
     later = np.flatnonzero(one.t_ns > t_ns + TIME_RESOLUTION_NS)
@@ -362,7 +351,7 @@ def _rows_after(one: SampleBlock | Chunk, t_ns: int) -> list[SampleBlock | Chunk
 
 
 def _size(one: SampleBlock | Chunk) -> int:
-    """Return the memory that a block or chunk occupies in a queue, in bytes."""
+    """Return the memory of a queued block or chunk in bytes."""
     if isinstance(one, SampleBlock):
         return SAMPLE_BYTES * len(one)
     return CHUNK_OVERHEAD_BYTES + len(one.data) + len(one.attachment)

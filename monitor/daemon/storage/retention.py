@@ -1,4 +1,4 @@
-"""Retention of recordings: deletes the oldest segments by age, and while the disk is too full."""
+"""Deletion of old segments: by age, and when the disk is too full."""
 
 import shutil
 from collections import deque
@@ -10,15 +10,15 @@ from typing import Final
 from drivers.recordings import segment
 
 MIN_KEPT_SEGMENTS: Final = 2
-"""Number of newest segments in a folder that are never deleted, because the window is rebuilt from them."""
+"""Number of newest segments in a folder that are never deleted, because they are needed to rebuild the window."""
 
 
 def delete_old_segments(folders: Sequence[Path], keep_s: float, segment_s: float) -> None:
-    """Delete segments that ended more than ``keep_s`` before the newest of their folder began.
+    """Delete segments that ended more than ``keep_s`` seconds before the start of the newest segment in the folder.
 
-    Two measures of age must agree: the times in the file names, and the number of later segments times ``segment_s``.
-    With the first alone, a host clock that is set wrong once would delete a year of data. With the second alone, many
-    short segments would count as old.
+    The age is the smaller of two measures: the difference of the times in the file names, and ``segment_s`` times the
+    number of later segments. File names alone are not safe, because a wrong host clock could make all segments look
+    old. The number of segments alone is not safe, because segments may be short.
 
     Parameters
     ----------
@@ -32,9 +32,8 @@ def delete_old_segments(folders: Sequence[Path], keep_s: float, segment_s: float
     for folder in folders:
         known = segment.list_segments(folder)
         for at, (path, after) in enumerate(pairwise(known[: 1 - MIN_KEPT_SEGMENTS])):
-            by_name_s = segment.parse_segment_start_s(known[-1]) - segment.parse_segment_start_s(
-                after
-            )  # a segment ends where the next begins
+            end_s = segment.parse_segment_start_s(after)  # a segment ends where the next begins
+            by_name_s = segment.parse_segment_start_s(known[-1]) - end_s
             by_number_s = (len(known) - 1 - at) * segment_s
             if min(by_name_s, by_number_s) > keep_s:
                 _delete(path)
@@ -46,7 +45,7 @@ def delete_until_free(folder: Path, folders: Sequence[Path], max_used_share: flo
     Parameters
     ----------
     folder : Path
-        Folder whose disk is measured. Nothing is done if it does not exist.
+        Folder whose disk is measured. If the folder does not exist, no segment is deleted.
     folders : sequence of Path
         Folders of segments.
     max_used_share : float
@@ -55,7 +54,7 @@ def delete_until_free(folder: Path, folders: Sequence[Path], max_used_share: flo
     Returns
     -------
     str
-        "" if the share is not exceeded any more, else a message with the reason.
+        "" if at most ``max_used_share`` is in use, else a message with the reason.
     """
     if not folder.is_dir():
         return ""
@@ -74,7 +73,7 @@ def delete_until_free(folder: Path, folders: Sequence[Path], max_used_share: flo
 
 
 def _delete(path: Path) -> None:
-    """Delete a file. A directory with the name of a segment is left in place."""
+    """Delete a file. A directory with the name of a segment is not deleted."""
     if not path.is_dir() or path.is_symlink():
         path.unlink(missing_ok=True)
 

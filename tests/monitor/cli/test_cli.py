@@ -154,7 +154,7 @@ WRONG_FILES = {
         CAN.format('{ file = "canmod_gp", signals = { gx = "ImuData.AngularRateX" } }'),
         'did you mean "canmod_gps"?',
     ),
-    "bad unit": (VIRTUAL + 'window = "3 parsec"\n', '"3 parsec" is no duration; write seconds, or "90s"'),
+    "bad unit": (VIRTUAL + 'window = "3 parsec"\n', '"3 parsec" is not a duration; write seconds, or "90s"'),
     "window too short": (VIRTUAL + "rate = 100.0\nwindow = 0.1\n", "are 10 samples; possible are 100 to 10000000"),
     "window too long": (VIRTUAL + 'rate = 100.0\nwindow = "2d"\n', "are 17280000 samples; possible are 100 to"),
     "window too long at any rate": (VIRTUAL + 'window = "1e9 s"\n', "1e+09 s; at most 3.456e+06 s"),
@@ -166,8 +166,8 @@ WRONG_FILES = {
     "empty tau": (VIRTUAL + "tau = []\n", "tau: none of [] s lies between one sample and 1800 s, half the window"),
     "tau beyond the window": (VIRTUAL + "window = 10.0\ntau = [1000.0]\n", "tau: none of [1000.0] s lies between"),
     "tau below a sample": (VIRTUAL + "rate = 100.0\ntau = [0.001]\n", "tau: none of [0.001] s lies between"),
-    "bad rate of fits": (VIRTUAL + 'refit = "10 hz"\n', '"10 hz" is no rate; write "10 Hz" or "every sample"'),
-    "no rate of fits": (VIRTUAL + 'refit = "0 Hz"\n', '"0 Hz" is no rate; write "10 Hz" or "every sample"'),
+    "bad rate of fits": (VIRTUAL + 'refit = "10 hz"\n', '"10 hz" is not a rate; write "10 Hz" or "every sample"'),
+    "no rate of fits": (VIRTUAL + 'refit = "0 Hz"\n', '"0 Hz" is not a rate; write "10 Hz" or "every sample"'),
     "unknown axis": (
         VIRTUAL + 'axes = { gz = "-gw" }\n',
         'gz = "-gw": expected two axes of the same kind out of gx gy gz ax ay az',
@@ -177,8 +177,11 @@ WRONG_FILES = {
         'viewer.mode: "nativ"; possible are native, auto, none, web, or a file ending in .rrd',
     ),
     "bad port": (VIRTUAL + "[viewer]\nport = 99999\n", "viewer.port: 99999 is outside the supported range 0 to 65535"),
-    "bad size": (VIRTUAL + '[viewer]\nmemory = "lots"\n', 'viewer.memory: "lots" is no size; write "256MiB"'),
-    "bad endpoint": (VIRTUAL + '[zenoh]\nlisten = ["7450"]\n', 'zenoh.listen[0]: "7450" is no endpoint; write "tcp/'),
+    "bad size": (VIRTUAL + '[viewer]\nmemory = "lots"\n', 'viewer.memory: "lots" is not a size; write "256MiB"'),
+    "bad endpoint": (
+        VIRTUAL + '[zenoh]\nlisten = ["7450"]\n',
+        'zenoh.listen[0]: "7450" is not an endpoint; write "tcp/',
+    ),
     "no zenoh file": (VIRTUAL + '[zenoh]\nconfig = "x.json5"\n', "x.json5: no such file"),
     "client of nobody": (VIRTUAL + '[zenoh]\nmode = "client"\n', "zenoh.connect: empty, but a client needs a router"),
     "bad log level": (VIRTUAL + '[log]\nlevel = "loud"\n', "log.level: "),
@@ -246,11 +249,11 @@ def test_check_tells_what_is_wrong_with_models_beside_all_else(call: Call) -> No
         'device b: driver.link: "sereal"; possible are serial, ',
         "device c: driver.seed: ",
         'log.level: "loud"; possible are ',
-        'device a: "gz" is no effect',
+        'device a: "gz" is not an effect',
         "device a: ",  # and the file of the model
         "device b: limit of R: times_model = 2, but the model in force has no R on gz",
         "device c: ",
-        'device c: "gz" is no effect',
+        'device c: "gz" is not an effect',
         'device c: effect "gz.sinusoidal:amplitude=1,frequency=60": ',
     ]
     lines = said.err.splitlines()
@@ -351,9 +354,9 @@ WRONG_ARGUMENTS = {
     "bad picture": (("analyze", "x.csv", "--plot", "x.pdf"), "--plot: x.pdf: a name ending in .png or .html is needed"),
     "bad window": (
         ("analyze", "x.csv", "--window", "soon"),
-        '--window: "soon" is no duration; write seconds, or "90s"',
+        '--window: "soon" is not a duration; write seconds, or "90s"',
     ),
-    "no window": (("analyze", "x.csv", "--window", "0"), '--window: "0" is no duration'),
+    "no window": (("analyze", "x.csv", "--window", "0"), '--window: "0" is not a duration'),
     "infinite rate": (("analyze", "x.csv", "--rate", "inf"), "--rate: inf Hz is outside the supported range"),
     "no format": (("export", "x.toml"), "Missing option '--format'"),
     "unknown format": (("export", MODEL, "--format", "gtsam"), 'unknown format "gtsam"; possible are kalibr,'),
@@ -382,13 +385,13 @@ WRONG_ARGUMENTS = {
     ),
     "no sensor": (("demo", "--sensor", "consumer-mem"), '--sensor: no model "consumer-mem"'),
     "no such effect": (("demo", "--effect", "gz.sinusodal:amplitude=1"), 'did you mean "sinusoidal"?'),
-    "no effect": (("demo", "--effect", "vibration"), '--effect: "vibration" is no effect; write axis.effect:'),
+    "no effect": (("demo", "--effect", "vibration"), '--effect: "vibration" is not an effect; write axis.effect:'),
     "effect too fast": (("demo", "--effect", "gz.sinusoidal:amplitude=1,frequency=60"), "below 50 Hz"),
-    "bad time of an effect": (("demo", "--effect-at", "soon"), '--effect-at: "soon" is no duration'),
+    "bad time of an effect": (("demo", "--effect-at", "soon"), '--effect-at: "soon" is not a duration'),
     "no model": (simulating("nothing.toml"), 'no model "nothing.toml", neither a file nor one of those shipped'),
     "nearest model": (simulating("consumer-mem"), 'did you mean "consumer-mems"?'),
-    "no length": (simulating("consumer-mems", "--seconds", "0"), '--seconds: "0" is no duration'),
-    "length in words": (simulating("consumer-mems", "--seconds", "soon"), '--seconds: "soon" is no duration'),
+    "no length": (simulating("consumer-mems", "--seconds", "0"), '--seconds: "0" is not a duration'),
+    "length in words": (simulating("consumer-mems", "--seconds", "soon"), '--seconds: "soon" is not a duration'),
     "no rate of samples": (simulating("consumer-mems", "--rate", "0"), "--rate: 0 Hz is outside the supported range"),
     "negative seed": (simulating("consumer-mems", "--seed", "-1"), "--seed: -1 is outside the supported range"),
     "nothing to write": (("simulate", "consumer-mems", "--seconds", "1"), "Missing option '--out'"),
@@ -1291,8 +1294,12 @@ def test_history_of_a_span_and_a_step_by_its_configuration(call: Call, histories
         ((), 2, "CONFIG.toml or a folder is needed"),
         (("{kept}",), 2, "choose one with --device: bench-1, bench-2"),
         (("{kept}", "--device", "bench-3"), 2, 'did you mean "bench-'),
-        (("{kept}", "--device", "bench-1", "--from", "-1h"), 3, "nothing in that time; kept are 2025-11-21 00:00:00"),
-        (("{kept}", "--from", "soon"), 2, '--from: "soon" is no time'),
+        (
+            ("{kept}", "--device", "bench-1", "--from", "-1h"),
+            3,
+            "no results in this time range; stored are 2025-11-21 00:00:00",
+        ),
+        (("{kept}", "--from", "soon"), 2, '--from: "soon" is not a time'),
         (("{kept}", "--from", "2025-11-22", "--to", "2025-11-21"), 2, "is not after --from"),
         (("{kept}", "--axis", "g"), 2, "possible are gx, gy"),
         (("{kept}", "--plot", "h.pdf"), 2, "ending in .png"),
@@ -1316,7 +1323,7 @@ def test_a_view_of_what_is_not_kept_is_refused(call: Call, tmp_path: Path) -> No
     said = call("run", "c.toml", "--history", "1d")
     assert said.status == 2
     assert said.only_line() == "imu-monitor: --history: there is no history to show; set folder in [storage]\n"
-    assert "no duration" in call("run", "c.toml", "--history", "long").only_line()
+    assert "not a duration" in call("run", "c.toml", "--history", "long").only_line()
 
 
 def test_history_without_storage_is_said(call: Call, tmp_path: Path) -> None:
@@ -1350,7 +1357,7 @@ def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path
     told, kept = json.loads(said.out), json.loads(there.out)
     assert (told["axes"], told["start"]) == (kept["axes"], kept["start"])
     assert nothing.status == 3
-    assert "nothing in that time" in nothing.only_line()
+    assert "no results in this time range" in nothing.only_line()
 
 
 # --- errors that nobody foresaw

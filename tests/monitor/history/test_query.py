@@ -31,7 +31,7 @@ def test_all_at_once_in_any_order_and_a_range_keeps_its_semicolon() -> None:
         ("letter=X", 'letter: "X"'),
         ("what=coefficient", 'did you mean "coefficients"'),
         ("_time=yesterday", "_time"),
-        ("step=often", "no duration"),
+        ("step=often", "not a duration"),
         ("step=0", "above 0"),
         ("step=1u", "1 s and more"),
         ("a" * 2000, "at most"),

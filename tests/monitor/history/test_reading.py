@@ -94,7 +94,7 @@ def test_numbers_that_are_not_wanted_are_not_there(long: tuple[Path, list[Histor
 
 
 def test_where_there_is_nothing_it_is_said_with_what_there_is(long: tuple[Path, list[HistoryRow]]) -> None:
-    with pytest.raises(NotReady, match=r"nothing in that time; kept are 2025-10-15 00:\d\d"):
+    with pytest.raises(NotReady, match=r"no results in this time range; stored are 2025-10-15 00:\d\d"):
         read(long[0], TimeRange(T0 - 30 * DAY_S, T0 - 29 * DAY_S))
     with open_history(long[0]) as reader, pytest.raises(NotReady, match="nobody: no history yet"):
         past.read_history(reader, "nobody", None)

@@ -261,7 +261,7 @@ def test_what_is_not_a_history_is_said_and_left_alone(tmp_path: Path) -> None:
             assert str(path) in str(error.value)
             assert "\n" not in str(error.value)
         assert path.read_bytes() == before
-    with pytest.raises(RecordingError, match="nothing is in it"):
+    with pytest.raises(RecordingError, match="the history is still empty"):
         rows_in(empty)
     with pytest.raises(RecordingError, match="no such file"):
         rows_in(tmp_path / "absent")

@@ -43,15 +43,15 @@ def count(path: Path) -> tuple[int, int]:
 
 def fill(writer: HistoryWriter, n: int, first: int = 0) -> None:
     for i in range(first, first + n):
-        writer.put_row("a", row(T0 + 60 * i, RNG))
-        writer.put_event("a", StoredEvent(T0 + 60.0 * i, "moved", "x"))
+        writer.queue_item("a", row(T0 + 60 * i, RNG))
+        writer.queue_item("a", StoredEvent(T0 + 60.0 * i, "moved", "x"))
 
 
 def test_what_is_handed_over_is_in_the_file_at_the_end(tmp_path: Path) -> None:
     path = tmp_path / "h.sqlite"
     with started(path) as writer:
         fill(writer, 100)
-        writer.put_row("a", None)
+        writer.queue_item("a", None)
     assert (writer.state, writer.written) == ("ok", 200)
     assert not path.with_name("h.sqlite-wal").exists()
     assert count(path) == (100, 100)
@@ -98,7 +98,7 @@ def test_no_more_than_some_files_are_moved_aside(tmp_path: Path, monkeypatch: py
             replace(path, b"rubbish" * (i + 1000))
             if i < 2:
                 wait_for(lambda i=i: len(aside(path)) == i + 1)
-        wait_for(lambda: "2 such files are kept already" in writer.state)
+        wait_for(lambda: "2 such files exist already" in writer.state)
         assert path.read_bytes().startswith(b"rubbish")
         for one in aside(path):
             one.unlink()
@@ -265,10 +265,10 @@ def test_a_queue_that_is_full_drops_and_counts(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr(writers, "RETRY_S", 0.05)
     with started(folder / "h.sqlite") as writer:
         fill(writer, 40)
-        wait_for(lambda: "trying again (30 results not kept)" in writer.state)
+        wait_for(lambda: "trying again (30 results not stored)" in writer.state)
         folder.unlink()
         wait_for(lambda: writer.written == 50)
-        wait_for(lambda: writer.state == "ok, but 30 results not kept")
+        wait_for(lambda: writer.state == "ok, but 30 results not stored")
     assert count(folder / "h.sqlite") == (25, 25)
 
 

@@ -38,7 +38,8 @@ def test_usual_modes_are_well(folder: Path, mode: int) -> None:
     path = made(folder / "a.toml", VIRTUAL, mode)
     assert file_permissions.explain_untrusted_file(path) == ""
     assert file_permissions.describe_exposed_secret(path) == ""
-    config, wrong = loading.read(path)
+    reading = loading.examine(path)
+    config, wrong = reading.config, reading.wrong
     assert wrong == []
     assert config is not None
     assert config.warnings == ()
@@ -91,9 +92,9 @@ def test_a_private_key_that_a_zenoh_file_names_is_looked_at_too(folder: Path) ->
 def test_a_zenoh_file_that_anyone_may_change_or_that_zenoh_refuses_is_wrong(folder: Path) -> None:
     zenoh = made(folder / "z.json5", SECRET, 0o602)
     path = made(folder / "a.toml", VIRTUAL + '[zenoh]\nconfig = "z.json5"\n', 0o644)
-    assert "zenoh.config: anyone on this machine may change it" in loading.read(path)[1][0]
+    assert "zenoh.config: anyone on this machine may change it" in loading.examine(path).wrong[0]
     with pytest.raises(ConfigError, match="anyone on this machine may change it"):
         client_configurations((), zenoh)
     made(zenoh, SECRET.replace('"hunter2"', '"hunter2" x'), 0o600)
-    (line,) = loading.read(path)[1]
+    (line,) = loading.examine(path).wrong
     assert line == f"{path}: zenoh.config: {zenoh}: line 1, column 54: expected boolean or null"

@@ -17,9 +17,9 @@ from monitor.settings.loading import (
     WINDOW_SAMPLES,
     VirtualTable,
     check_viewer_mode,
+    examine,
     load,
     parse_rate_as_period,
-    read,
     seconds,
 )
 
@@ -29,7 +29,8 @@ DRIVER = 'driver = { link = "serial", port = "/dev/null", decoder = "vectornav_a
 def wrong(tmp_path, text):
     path = tmp_path / "my.toml"
     path.write_text(text, "utf-8")
-    config, lines = read(path)
+    reading = examine(path)
+    config, lines = reading.config, reading.wrong
     assert (config is None) == bool(lines)
     assert all(line.startswith(f"{path}: ") and "\n" not in line for line in lines)
     return [line.removeprefix(f"{path}: ") for line in lines]
@@ -82,7 +83,7 @@ CASES = {
     ),
     "limit held for nothing": (
         device() + LIMIT + 'axes = "gz"\nletter = "N"\nabove = 1.0\nhold = "often"',
-        ['device a: limit[0].hold: "often" is no duration'],
+        ['device a: limit[0].hold: "often" is not a duration'],
     ),
     "hook on nothing": (
         device() + HOOK + 'on = []\nkey = "x"',
@@ -99,7 +100,7 @@ CASES = {
     "hook that does nothing": (device() + HOOK + 'on = ["*"]', ["hook[0]: nothing to do; add command or key"]),
     "hook by a name": (
         device() + HOOK + 'on = ["*"]\ncommand = ["mail"]',
-        ['hook[0].command: "mail" is no path; write where the program is, e.g. "/usr/bin/mail"'],
+        ['hook[0].command: "mail" is not a path; write the path of the program, e.g. "/usr/bin/mail"'],
     ),
     "hook that is not there": (device() + HOOK + 'on = ["*"]\ncommand = ["/none/x"]', ["/none/x: no such file"]),
     "hook that is no program": (
@@ -116,7 +117,7 @@ CASES = {
     ),
     "metrics nowhere": (
         device() + '[metrics]\nlisten = "9464"',
-        ['metrics.listen: "9464" is no host and port; write "127.0.0.1:9464"'],
+        ['metrics.listen: "9464" is not a host and port; write "127.0.0.1:9464"'],
     ),
     "unknown key": (device("windw = 60.0"), ['device a: windw: unknown key; did you mean "window"?']),
     "unknown table": ("[zenho]\n" + device(), ['zenho: unknown key; did you mean "zenoh"?']),
@@ -187,7 +188,7 @@ CASES = {
         device(driver='driver = { link = "serial", decoder = "stim300" }'),
         ["device a: driver.port: missing"],
     ),
-    "window that is no duration": (device('window = "1 week"'), ['device a: window: "1 week" is no duration']),
+    "window that is not a duration": (device('window = "1 week"'), ['device a: window: "1 week" is not a duration']),
     "window too short": (
         device("rate = 100\nwindow = 0.5"),
         ["50 samples; possible are 100 to 10000000: 1 to 100000 s"],
@@ -205,8 +206,11 @@ CASES = {
     ),
     "impossible tau": (device("rate = 100\nwindow = 60\ntau = [100.0]"), ["device a: tau: none of [100.0] s lies"]),
     "no tau at all": (device("rate = 100\ntau = []"), ["device a: tau: "]),
-    "refit": (device('refit = "often"'), ['device a: refit: "often" is no rate; write "10 Hz" or "every sample"']),
-    "publish": (device('publish = "0 Hz"'), ['device a: publish: "0 Hz" is no rate; write "10 Hz" or "every block"']),
+    "refit": (device('refit = "often"'), ['device a: refit: "often" is not a rate; write "10 Hz" or "every sample"']),
+    "publish": (
+        device('publish = "0 Hz"'),
+        ['device a: publish: "0 Hz" is not a rate; write "10 Hz" or "every block"'],
+    ),
     "axes": (
         device('axes = { gx = "up" }'),
         ['device a: axes: gx = "up": expected two axes of the same kind out of gx gy gz ax ay az'],
@@ -254,7 +258,7 @@ CASES = {
     ),
     "viewer's history": (
         device() + '[viewer]\nhistory = "soon"',
-        ['viewer.history: "soon" is no duration'],
+        ['viewer.history: "soon" is not a duration'],
     ),
     "viewer's memory": (device() + "[viewer]\nmemory = 3", ["viewer.memory: expected text in quotes, got 3"]),
     "zenoh's mode": (device() + '[zenoh]\nmode = "pear"', ['zenoh.mode: "pear"; possible are peer, ']),
@@ -530,7 +534,8 @@ def test_paths_are_relative_to_the_file(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("path", sorted(CONFIG_FOLDER.glob("*.toml")), ids=lambda path: path.name)
 def test_examples_are_right(path):
-    config, lines = read(path)
+    reading = examine(path)
+    config, lines = reading.config, reading.wrong
     assert [line for line in lines if "no such file" not in line] == []
     assert config is not None or lines
 
@@ -565,7 +570,7 @@ def test_durations(text, value):
 
 @pytest.mark.parametrize("text", ["", "h", "1w", "-1h", "0s", "1.2.3s", "1 h 3 min", "1H", "nan"])
 def test_words_that_are_no_durations(text):
-    with pytest.raises(ConfigError, match="no duration"):
+    with pytest.raises(ConfigError, match="not a duration"):
         seconds(text)
 
 
@@ -576,7 +581,7 @@ def test_rates(text, value):
 
 @pytest.mark.parametrize("text", ["", "10", "10hz", "0 Hz", "-1 Hz", "1.1.1 Hz"])
 def test_words_that_are_no_rates(text):
-    with pytest.raises(ConfigError, match="no rate"):
+    with pytest.raises(ConfigError, match="not a rate"):
         parse_rate_as_period(text, "always")
 
 
@@ -620,7 +625,7 @@ def test_the_model_in_force_is_a_file_beside_the_configuration_or_a_name_of_the_
     (one,) = load(path).devices
     assert (one.model, one.reconcile_folder) == (None, None)
     path.write_text(device('model = "bmi08"'))
-    assert read(path)[1][0].endswith('did you mean "bmi088"?')
+    assert examine(path).wrong[0].endswith('did you mean "bmi088"?')
 
 
 @pytest.mark.parametrize(
@@ -643,7 +648,7 @@ def test_the_interval_that_is_held_against_temperature(tmp_path, text, found):
     [
         (
             'thermal_interval = "none"',
-            'thermal_interval: "none" is no duration; write seconds, or "90s", "30min", "1h", "2d", or "off"',
+            'thermal_interval: "none" is not a duration; write seconds, or "90s", "30min", "1h", "2d", or "off"',
         ),
         ("rate = 10.0\nthermal_interval = 0.5", "thermal_interval: 0.5 s; possible are 0.8 s (8 samples) to 1 d"),
         ('thermal_interval = "2d"', "thermal_interval: 2 d is outside the supported range 1 µs to 1 d"),
@@ -653,7 +658,7 @@ def test_the_interval_that_is_held_against_temperature(tmp_path, text, found):
 def test_an_interval_that_cannot_be_says_why(tmp_path, text, says):
     path = tmp_path / "my.toml"
     path.write_text(device(text))
-    (line,) = read(path)[1]
+    (line,) = examine(path).wrong
     assert says in line
 
 

@@ -60,7 +60,7 @@ class Rig:
         self.blocks: list[SampleBlock] = []
         self.pushed_s: list[float] = []
         clock = SampleClock(decoder.timing, 100.0)
-        self.driver = Driver("v", self.imu.link, decoder, clock, self._push, silence_s=silence_s)
+        self.driver = Driver("v", self.imu.port.link, decoder, clock, self._push, silence_s=silence_s)
         self.counts = self.driver.counts
         self._thread = threading.Thread(target=self.driver.run, daemon=True)
         self.kinds: list[str] = []
@@ -76,7 +76,7 @@ class Rig:
         self.pushed_s.append(time.monotonic())
 
     def __enter__(self) -> "Rig":
-        self.imu.plug()
+        self.imu.port.plug()
         self._thread.start()
         self.wait(lambda: is_open(self.imu))
         self.imu.start()

@@ -33,14 +33,14 @@ class Rig:
         self.imu = SimulatedDevice(VirtualTable(model=MODEL, seed=3, speed=speed), decoder)
         self.blocks = []
         self.driver = Driver(
-            "v", self.imu.link, decoder, SampleClock(decoder.timing, self.imu.rate_hz), self.blocks.append
+            "v", self.imu.port.link, decoder, SampleClock(decoder.timing, self.imu.rate_hz), self.blocks.append
         )
         self.allowed = allowed
         self.thread = threading.Thread(target=self.driver.run, daemon=True)
 
     def __enter__(self):
         follow_reader(self.imu, self.driver, lambda: self.allowed)
-        self.imu.plug()
+        self.imu.port.plug()
         self.thread.start()
         self.wait(lambda: is_open(self.imu))
         self.imu.start()
@@ -76,13 +76,13 @@ def test_a_pulled_cable_and_back():
     with Rig(allowed=50) as rig:
         counts, truth = rig.driver.counts, rig.imu.fault_counts
         rig.wait(lambda: truth.sample_count == counts.received == 50)  # nothing is on the way when the cable is pulled
-        rig.imu.unplug()
+        rig.imu.port.unplug()
         rig.wait(lambda: rig.driver.state == "lost")
         assert not rig.imu.port.path.exists()
         rig.allowed = 100
         rig.wait(lambda: truth.dropped == 50)  # half a second at 100 Hz
         assert counts.received == 50
-        rig.imu.plug()
+        rig.imu.port.plug()
         rig.allowed = 150
         rig.wait(lambda: rig.driver.state == "running")
         rig.wait(lambda: truth.sample_count == 150 and counts.received == 100)
@@ -108,10 +108,10 @@ def test_plugging_twice_and_pulling_twice_is_harmless_and_leaves_nothing_open():
     rig = Rig()
     files = set(os.listdir("/dev/fd"))
     for _ in range(20):
-        rig.imu.plug()
-        rig.imu.plug()
-        rig.imu.unplug()
-        rig.imu.unplug()
+        rig.imu.port.plug()
+        rig.imu.port.plug()
+        rig.imu.port.unplug()
+        rig.imu.port.unplug()
     assert set(os.listdir("/dev/fd")) <= files  # what an earlier test left may have been closed meanwhile
     rig.imu.stop()
 

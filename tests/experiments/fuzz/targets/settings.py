@@ -103,7 +103,8 @@ def configured(text: bytes) -> None:
     """Read a configuration, and look at all of it."""
     path = room() / "a.toml"
     path.write_bytes(text)
-    config, wrong = loading.read(path)
+    reading = loading.examine(path)
+    config, wrong = reading.config, reading.wrong
     assert (config is None) == bool(wrong)
     assert len(wrong) < LINES_AT_MOST
     for line in wrong:

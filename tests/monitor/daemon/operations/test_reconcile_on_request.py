@@ -133,9 +133,9 @@ def test_no_answer_is_an_answer_too() -> None:
         ("sys.exit('first\\nmodel.toml: gz: unknown effect')", "model.toml: gz: unknown effect"),
         ("sys.exit(1)", "reconcile ended with status 1"),
         ("os.kill(os.getpid(), 9)", "reconcile ended with status -9"),
-        ("print('[1, 2')", "reconcile gave no result that can be read: "),
-        ("print('[1, 2]')", "reconcile gave no result that can be read: "),
-        ("pass", "reconcile gave no result that can be read: "),
+        ("print('[1, 2')", "the result of reconcile cannot be read: "),
+        ("print('[1, 2]')", "the result of reconcile cannot be read: "),
+        ("pass", "the result of reconcile cannot be read: "),
     ],
 )
 def test_a_failure_is_an_error_in_one_line(text: str, error: str) -> None:
@@ -163,7 +163,7 @@ def test_too_long_is_ended_with_all_that_it_started(tmp_path: Path) -> None:
     """
     for limit_s in (1.5, 6.0, 24.0, 96.0):  # a loaded machine may need longer to start the grandchild
         asked, _ = run(text, limit_s=limit_s)
-        assert asked.errors == [f"reconcile was ended after {limit_s:g} s"]
+        assert asked.errors == [f"reconcile was killed after {limit_s:g} s"]
         if (tmp_path / "pid").exists():
             break
     pid = int((tmp_path / "pid").read_text())

@@ -94,10 +94,10 @@ def test_nobody_to_tell_is_no_trouble(tmp_path: Path) -> None:
         unit = SystemdNotifier.from_environment({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000000"})
         unit.ready()
         assert unit.send_watchdog({"a": 1}, 1.0) == []
-    assert not SystemdNotifier.from_environment({"WATCHDOG_USEC": "1000000"}).watched
+    assert SystemdNotifier.from_environment({"WATCHDOG_USEC": "1000000"}).watchdog_s is None
     assert not SystemdNotifier.from_environment(
         {"NOTIFY_SOCKET": "/x", "WATCHDOG_USEC": "1000000", "WATCHDOG_PID": "1"}
-    ).watched
+    ).watchdog_s
 
 
 def test_a_socket_that_nobody_reads_holds_nothing_up(tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def written(folder: Path) -> list[segment.SegmentPiece]:
 
 def all_written(keeper: Recorder) -> None:
     """Wait until the recorder has written all that it was given."""
-    wait_for(lambda: not any(track.has_unwritten_rows for track in keeper._tracks.values()))
+    wait_for(lambda: not any(track._queue or track._taken for track in keeper._tracks.values()))
 
 
 @pytest.fixture(autouse=True)
