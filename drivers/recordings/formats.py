@@ -1,4 +1,4 @@
-"""Table of the recording formats by file suffix, with their readers and writers."""
+"""Readers and writers of the recording formats by file suffix."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ from drivers.recordings.table import OpenWriter, Table, describe_content
 
 @dataclass(frozen=True, slots=True)
 class Format:
-    """Functions that read, write and measure files of one format."""
+    """Functions of one recording format."""
 
     read: Callable[[Path], Table]
     open_writer: OpenWriter
     count_rows: Callable[[Path], int]
-    """Return the number of rows of a file without reading the samples. The exceptions are those of ``read``."""
+    """Function that returns the number of rows without reading the samples. The exceptions are those of ``read``."""
 
 
 FORMATS: Final[Mapping[str, Format]] = {
@@ -39,11 +39,11 @@ FORMATS: Final[Mapping[str, Format]] = {
     ".feather": Format(read_ipc, open_ipc_writer, count_ipc_rows),
     ".arrows": Format(read_ipc, partial(open_ipc_writer, stream=True), count_ipc_rows),
 }
-"""Formats of recordings by suffix."""
+"""Recording formats by suffix."""
 
 
 def find_format(path: Path) -> Format:
-    """Return the format for the suffix of a path. Raise ConfigError if no format of recordings has the suffix."""
+    """Return the recording format for the suffix of a path. Raise ConfigError if the suffix is unknown."""
     suffix = _suffix(path)
     if not suffix:
         raise ConfigError(
@@ -53,11 +53,11 @@ def find_format(path: Path) -> Format:
 
 
 def is_recording(path: Path) -> bool:
-    """Return True if a format of recordings has the suffix of a path. The file itself is not opened."""
+    """Return True if the suffix of a path is the suffix of a recording format. The file is not opened."""
     return _suffix(path) in FORMATS
 
 
 def _suffix(path: Path) -> str:
-    """Return the suffix of a path if it is one of FORMATS, otherwise ""."""
+    """Return the suffix of a path if FORMATS contains the suffix, otherwise ""."""
     name = path.name.lower()
     return next((suffix for suffix in FORMATS if name.endswith(suffix)), "")

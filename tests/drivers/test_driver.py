@@ -332,7 +332,7 @@ def test_the_status_of_a_device_whose_can_frames_are_all_late_names_the_window()
     rig = can_rig(range(500))
     assert rig.driver.state == "waiting"
     assert rig.driver.text.startswith("loopback: ")
-    assert rig.driver.text.endswith(f" bytes and no sample in them; {APART}")
+    assert rig.driver.text.endswith(f" bytes without a sample; {APART}")
 
 
 def test_times_follow_what_the_link_brings():
