@@ -60,7 +60,7 @@ class Conflict(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
-class ReadContext:
+class _ReadContext:
     """Context of a validation by ``check_table``. Settings that Python code creates are validated without a context."""
 
     folder: Path | None  # folder of the configuration file; None if the existence of files is not checked
@@ -140,20 +140,6 @@ class TableCheckResult(Generic[Model]):
             self.problems.append(Problem(place, text))
 
 
-def read_settings(kind: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> Model:
-    """Convert a table to settings. The parameters are those of ``check_table``.
-
-    Raises
-    ------
-    ConfigError
-        If the table contains mistakes. The error has one line for each mistake.
-    """
-    checked = check_table(kind, table, folder)
-    if checked.problems or checked.value is None:
-        raise ConfigError(*map(str, checked.problems))
-    return checked.value
-
-
 def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> TableCheckResult[Model]:
     """Convert a table to settings, and find all mistakes in the table.
 
@@ -172,7 +158,7 @@ def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None
     repaired = copy.deepcopy(dict(table))
     for _ in range(MAX_PASSES):
         try:
-            checked.value = kind.model_validate(repaired, context=ReadContext(folder), by_alias=True, by_name=False)
+            checked.value = kind.model_validate(repaired, context=_ReadContext(folder), by_alias=True, by_name=False)
         except ValidationError as error:
             details = error.errors(include_url=False)
             found = [problem for one in details for problem in _problems(kind, one, checked)]

@@ -153,7 +153,7 @@ class BlockBuilder:
         bad_before = np.zeros(n, np.int64) if bad_before is None else bad_before
         ticks = np.full(n, NO_TICK, np.int64) if ticks is None else ticks
         temperature_c = np.full(n, np.nan) if temperature_c is None else _valid_temperatures(temperature_c)
-        good = are_plausible(values)
+        good = _find_plausible(values)
         carried, self._missing = self._missing, bad_after
         if n and good.all() and not bad_before.any():  # the usual case
             self.bad += bad_after
@@ -176,7 +176,7 @@ class BlockBuilder:
         ]
 
 
-def are_plausible(values: Floats) -> NDArray[np.bool_]:
+def _find_plausible(values: Floats) -> NDArray[np.bool_]:
     """Return a mask [n] of the plausible samples among ``values`` [n, 6].
 
     A plausible sample has at least one measured axis, and every measured value is within the range of MEMS IMUs.
@@ -217,9 +217,10 @@ class Frames:
         bad_before = np.diff(rejected_at, prepend=0)
         return Frames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at], after)
 
-    def stack_bytes(self, rows: Sequence[int]) -> Bytes:
+    def stack_bytes(self, rows: Ints) -> Bytes:
         """Return the bytes of frames of equal length as an array [n, length] of uint8."""
-        return np.frombuffer(b"".join([self.data[i] for i in rows]), np.uint8).reshape(len(rows), -1)
+        data = self.data if rows.size == len(self.data) else [self.data[i] for i in rows.tolist()]
+        return np.frombuffer(b"".join(data), np.uint8).reshape(rows.size, -1)
 
 
 NEED_MORE: Final = 0
@@ -414,9 +415,11 @@ class FrameStreamDecoder(ABC):
     ) -> tuple[list[SampleBlock], int | None]:
         """Return the samples with at least one measured axis, and the index of the frame with the last sample."""
         rows = np.flatnonzero(~np.isnan(values).all(axis=1))
-        kept = frames.select_frames(rows.tolist())
+        if rows.size < len(values):
+            frames = frames.select_frames(rows.tolist())
+            values, temperature_c, ticks = values[rows], temperature_c[rows], ticks[rows]
         blocks = self._builder.build_plausible_blocks(
-            kept.t_ns, values[rows], temperature_c[rows], ticks[rows], kept.bad_before, kept.bad_after
+            frames.t_ns, values, temperature_c, ticks, frames.bad_before, frames.bad_after
         )
         return blocks, int(rows[-1]) if rows.size else None
 
@@ -428,16 +431,19 @@ class FrameStreamDecoder(ABC):
 Key = TypeVar("Key", bound=Hashable)
 
 
-def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, list[int]]]:
-    """Yield each distinct key together with the indices at which the key occurs.
+def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, Ints]]:
+    """Yield each distinct key together with the indices [k] at which the key occurs.
 
     >>> list(group_indices("aba"))
-    [('a', [0, 2]), ('b', [1])]
+    [('a', array([0, 2])), ('b', array([1]))]
     """
-    groups: dict[Key, list[int]] = {}
-    for i, key in enumerate(keys):
-        groups.setdefault(key, []).append(i)
-    yield from groups.items()
+    distinct = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    if len(distinct) == 1:  # the usual case
+        yield keys[0], np.arange(len(keys))
+        return
+    groups = np.array([distinct[key] for key in keys])
+    for key, i in distinct.items():
+        yield key, np.flatnonzero(groups == i)
 
 
 def nan_to_infinity(values: Floats) -> Floats:

@@ -23,7 +23,7 @@ import numpy as np
 from pydantic import Field
 
 from drivers.decoders import base
-from drivers.sample import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, SampleBlock, Timing
+from drivers.sample import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.settings_model import SettingsModel
 
 SYNC: Final = b"\xfa\xff\x36"
@@ -192,16 +192,15 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         return base.chunk_per_sample(frames, samples.t_ns)
 
 
-def _group_by_layout(frames: base.Frames) -> Iterator[tuple[Layout | None, list[int], base.Bytes]]:
+def _group_by_layout(frames: base.Frames) -> Iterator[tuple[Layout | None, Ints, base.Bytes]]:
     """Yield each layout with the indices and the bytes [k, length] of its packets. An invalid layout is None."""
     for _, rows in base.group_indices([len(packet) for packet in frames.data]):
-        packets = frames.stack_bytes(rows)
-        at = np.array(rows)
+        packets, at = frames.stack_bytes(rows), rows
         while at.size:
             layout = _parse_layout(packets[0].tobytes())
             compared = list(layout.header_offsets) if layout else slice(None)
             same = (packets[:, compared] == packets[0, compared]).all(axis=1)
-            yield layout, at[same].tolist(), packets[same]
+            yield layout, at[same], packets[same]
             at, packets = at[~same], packets[~same]
 
 

@@ -53,7 +53,7 @@ def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterato
     """
     try:
         if suffix == ".blf":
-            reader = ValidatingBlfReader(cast("BinaryIO", _BoundedReader(stream)))
+            reader = _ValidatingBlfReader(cast("BinaryIO", _BoundedReader(stream)))
             yield from _data_frames(iter(reader), channel, lambda: None)
         else:
             lines = _BoundedLineReader(stream)
@@ -166,7 +166,7 @@ class _BoundedReader:
         return self._stream.read(size)
 
 
-class ValidatingBlfReader(can.BLFReader):
+class _ValidatingBlfReader(can.BLFReader):
     """BLF reader that rejects too large objects, and empty objects, which python-can would read forever."""
 
     def __iter__(self) -> Generator[can.Message, None, None]:

@@ -155,7 +155,7 @@ class ReplayLink(PolledLink):
             self._next = next(self._items, None)
         except (ValueError, *DAMAGE_ERRORS) as error:
             self._next = None
-            self.notes += (f"The file is truncated or damaged at this point: {describe_error(error)}.",)
+            self.notes += (f"The file is cut off or damaged at this point: {describe_error(error)}.",)
 
     def _close_source(self) -> None:
         items, self._items, self._next = self._items, None, None

@@ -15,17 +15,8 @@ import numpy as np
 
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import open_regular
-from drivers.recordings import memory_check
+from drivers.recordings import memory_check, table
 from drivers.recordings.arrow_message_sizes import check_buffer_sizes, count_buffers, iter_batch_sizes
-from drivers.recordings.table import (
-    BATCH_ROWS,
-    PARTIAL_SUFFIX,
-    AppendColumns,
-    Table,
-    check_column_count,
-    choose_columns,
-    describe_content,
-)
 
 METADATA_KEY: Final = b"imu-monitor"
 """Key in the schema metadata of a segment that the daemon has recorded."""
@@ -52,12 +43,12 @@ def import_pyarrow(path: Path) -> Any:
     try:
         import pyarrow as pa
     except ImportError as error:
-        whole = Path(str(path).removesuffix(PARTIAL_SUFFIX))
+        whole = Path(str(path).removesuffix(table.PARTIAL_SUFFIX))
         raise ConfigError(f'{whole}: {whole.suffix} needs pyarrow: pip install "imu-monitor[arrow]"') from error
     return pa
 
 
-def read_parquet(path: Path) -> Table:
+def read_parquet(path: Path) -> table.Table:
     """Read the known columns of a Parquet file.
 
     Raises
@@ -82,8 +73,8 @@ def count_parquet_rows(path: Path) -> int:
 def _check_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, str], int]:
     """Check the limits, and return the columns to read and the number of rows."""
     metadata = file.metadata
-    check_column_count(path, metadata.num_columns)
-    chosen = choose_columns(path, file.schema_arrow.names, notes)
+    table.check_column_count(path, metadata.num_columns)
+    chosen = table.choose_columns(path, file.schema_arrow.names, notes)
     _check_types(path, file.schema_arrow, chosen)
     rows = int(metadata.num_rows)
     stated = sum(metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
@@ -113,11 +104,11 @@ def _open_parquet(path: Path) -> Iterator[Any]:
         except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
             raise RecordingError(
                 f"{path}: is no complete Parquet file ({first_line(error)}); its index is at the end, "
-                f"so a file that is cut off cannot be read{describe_content(path)}"
+                f"so a file that is cut off cannot be read{table.describe_content(path)}"
             ) from error
 
 
-def read_ipc(path: Path) -> Table:
+def read_ipc(path: Path) -> table.Table:
     """Read the known columns of an Arrow file or stream. If the file is truncated, read the complete batches.
 
     An Arrow file is an Arrow stream between two magic words, so a file is read like a stream.
@@ -135,7 +126,9 @@ def read_ipc(path: Path) -> Table:
     with open_regular(path) as file:
         schema = _ipc_schema(path, file)
         own = METADATA_KEY in (schema.metadata or {})
-        chosen = choose_columns(path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes)
+        chosen = table.choose_columns(
+            path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes
+        )
         count, _ = _check_ipc(path, start, schema, chosen)
         if not _has_end_mark(path, start > 0):
             notes.append("The file has no end mark; it is cut off and was read up to the cut.")
@@ -182,11 +175,11 @@ def _ipc_schema(path: Path, file: Any) -> Any:
     try:
         file.seek(_ipc_start(path))
         schema = pa.ipc.open_stream(file).schema
-        check_column_count(path, len(schema))
+        table.check_column_count(path, len(schema))
         schema.names, schema.metadata  # noqa: B018 - raises for names that are not UTF-8
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
-            f"{path}: is no Arrow IPC file or stream ({first_line(error)}){describe_content(path)}"
+            f"{path}: is no Arrow IPC file or stream ({first_line(error)}){table.describe_content(path)}"
         ) from error
     return schema
 
@@ -230,11 +223,11 @@ def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
             raise RecordingError(f"{path}: {key} contains {type_}, expected numbers{unit}")
 
 
-def _float_table(path: Path, table: Any, chosen: Mapping[str, str], notes: list[str]) -> Table:
+def _float_table(path: Path, data: Any, chosen: Mapping[str, str], notes: list[str]) -> table.Table:
     """Return the chosen columns of a pyarrow table as float64. Null values become NaN."""
     float64 = import_pyarrow(path).float64()
-    columns = {name: table.column(key).cast(float64, safe=False).to_numpy() for name, key in chosen.items()}
-    return Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes)
+    columns = {name: data.column(key).cast(float64, safe=False).to_numpy() for name, key in chosen.items()}
+    return table.Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes)
 
 
 def first_line(error: Exception) -> str:
@@ -243,7 +236,7 @@ def first_line(error: Exception) -> str:
 
 
 @contextmanager
-def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[AppendColumns]:
+def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
     """Write a Parquet file with the default compression. Each call of the yielded function writes one row group."""
     pa = import_pyarrow(path)
     from pyarrow import parquet
@@ -254,12 +247,12 @@ def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[AppendColu
 
 
 @contextmanager
-def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> Iterator[AppendColumns]:
+def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> Iterator[table.AppendColumns]:
     """Write an Arrow file (Feather version 2), or an Arrow stream if ``stream`` is True."""
     pa = import_pyarrow(path)
     schema = _float_schema(pa, names)
     with (pa.ipc.new_stream if stream else pa.ipc.new_file)(str(path), schema) as file:
-        yield lambda columns: file.write_table(pa.table(dict(columns), schema), max_chunksize=BATCH_ROWS)
+        yield lambda columns: file.write_table(pa.table(dict(columns), schema), max_chunksize=table.BATCH_ROWS)
 
 
 def _float_schema(pa: Any, names: Sequence[str]) -> Any:

@@ -26,17 +26,7 @@ import numpy as np
 
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular
-from drivers.recordings import memory_check
-from drivers.recordings.table import (
-    BATCH_ROWS,
-    EXAMPLE_HEADER,
-    AppendColumns,
-    Columns,
-    Table,
-    check_column_count,
-    choose_columns,
-    describe_content,
-)
+from drivers.recordings import memory_check, table
 from drivers.sample import AXES, Floats
 
 READ_BYTES: Final = 1 << 20
@@ -69,7 +59,7 @@ class _BadLines:
         self.count += 1
 
 
-def read_csv(path: Path) -> Table:
+def read_csv(path: Path) -> table.Table:
     """Read the known columns of a plain or gzip CSV file. If the file is truncated, read the complete lines.
 
     Raises
@@ -87,9 +77,9 @@ def read_csv(path: Path) -> Table:
         head = _find_header(path, texts)
         if head is None:
             what = notes[-1] if notes else "It has no line at all."
-            raise RecordingError(f"{path}: has not one complete line, expected {EXAMPLE_HEADER}. {what}")
+            raise RecordingError(f"{path}: has not one complete line, expected {table.EXAMPLE_HEADER}. {what}")
         names = _column_names(path, head)
-        chosen = choose_columns(path, names, notes, f" in line {head.number}")
+        chosen = table.choose_columns(path, names, notes, f" in line {head.number}")
         use = [names.index(name) for name in chosen.values()]
         parts = list(_parse_pieces(path, head, texts, names, use, bad))
     rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
@@ -100,7 +90,7 @@ def read_csv(path: Path) -> Table:
     if not len(rows):
         what = f". {notes[-1]}" if notes else ""
         raise RecordingError(f"{path}: has a header line but no complete line of samples after it{what}")
-    return Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
+    return table.Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
 
 
 def count_csv_rows(path: Path) -> int:
@@ -213,7 +203,7 @@ def _find_header(path: Path, texts: Iterator[bytes]) -> _Header | None:
             if size > MAX_PREAMBLE_BYTES:
                 raise RecordingError(
                     f"{path}: has no header line within its first {number} lines, only comments and blank lines; "
-                    f"expected {EXAMPLE_HEADER} within {MAX_PREAMBLE_BYTES} bytes"
+                    f"expected {table.EXAMPLE_HEADER} within {MAX_PREAMBLE_BYTES} bytes"
                 )
     if comment is None and number:
         return _Header(b"", number, b"", number + 1)
@@ -230,7 +220,8 @@ def _column_names(path: Path, head: _Header) -> list[str]:
     """Return the column names in a header line. Raise RecordingError if the line is not a header."""
     if b"\0" in head.line or not head.line:
         raise RecordingError(
-            f"{path}: is no CSV text, expected a first line such as {EXAMPLE_HEADER}{describe_content(path)}"
+            f"{path}: is no CSV text, expected a first line such as {table.EXAMPLE_HEADER}"
+            f"{table.describe_content(path)}"
         )
     text = head.line.decode("utf-8", errors="replace")
     for separator, word in ((";", "semicolons"), ("\t", "tabs")):
@@ -238,12 +229,12 @@ def _column_names(path: Path, head: _Header) -> list[str]:
             raise RecordingError(
                 f"{path}: the columns of line {head.number} are separated by {word}; separate them by commas"
             )
-    check_column_count(path, text.count(",") + 1)
+    table.check_column_count(path, text.count(",") + 1)
     names = [name.strip(' \t"') for name in _split_fields(text)]
     if all(_parse_number(name) is not None for name in names):
         raise RecordingError(
             f"{path}: the header line is missing: line {head.number} consists of numbers; "
-            f"expected a header line such as {EXAMPLE_HEADER}"
+            f"expected a header line such as {table.EXAMPLE_HEADER}"
         )
     return names
 
@@ -330,7 +321,7 @@ def _parse_number(field: str) -> float | None:
 
 
 @contextmanager
-def open_csv_writer(path: Path, names: Sequence[str], packed: bool = False) -> Iterator[AppendColumns]:
+def open_csv_writer(path: Path, names: Sequence[str], packed: bool = False) -> Iterator[table.AppendColumns]:
     """Write a CSV file with one header line and one line per sample. A missing value is written as ``nan``.
 
     If ``packed`` is True, the file is compressed with gzip. The gzip header has no time stamp, so that equal data give
@@ -343,10 +334,10 @@ def open_csv_writer(path: Path, names: Sequence[str], packed: bool = False) -> I
         file = stack.enter_context(io.TextIOWrapper(raw, "ascii", newline=""))
         file.write(",".join(names) + "\n")
 
-        def append(columns: Columns) -> None:
+        def append(columns: table.Columns) -> None:
             """Append rows. ``repr`` gives the shortest text from which the same float64 can be read."""
-            for start in range(0, columns[names[0]].size, BATCH_ROWS):
-                fields = [map(repr, columns[name][start : start + BATCH_ROWS].tolist()) for name in names]
+            for start in range(0, columns[names[0]].size, table.BATCH_ROWS):
+                fields = [map(repr, columns[name][start : start + table.BATCH_ROWS].tolist()) for name in names]
                 file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))
 
         yield append

@@ -7,16 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.errors import ConfigError
-from drivers.recordings.arrow_format import (
-    count_ipc_rows,
-    count_parquet_rows,
-    open_ipc_writer,
-    open_parquet_writer,
-    read_ipc,
-    read_parquet,
-)
-from drivers.recordings.csv_format import count_csv_rows, open_csv_writer, read_csv
-from drivers.recordings.npz_format import count_npz_rows, open_npz_writer, read_npz
+from drivers.recordings import arrow_format, csv_format, npz_format
 from drivers.recordings.table import OpenWriter, Table, describe_content
 
 
@@ -31,13 +22,15 @@ class Format:
 
 
 FORMATS: Final[Mapping[str, Format]] = {
-    ".csv": Format(read_csv, open_csv_writer, count_csv_rows),
-    ".csv.gz": Format(read_csv, partial(open_csv_writer, packed=True), count_csv_rows),
-    ".npz": Format(read_npz, open_npz_writer, count_npz_rows),
-    ".parquet": Format(read_parquet, open_parquet_writer, count_parquet_rows),
-    ".arrow": Format(read_ipc, open_ipc_writer, count_ipc_rows),
-    ".feather": Format(read_ipc, open_ipc_writer, count_ipc_rows),
-    ".arrows": Format(read_ipc, partial(open_ipc_writer, stream=True), count_ipc_rows),
+    ".csv": Format(csv_format.read_csv, csv_format.open_csv_writer, csv_format.count_csv_rows),
+    ".csv.gz": Format(csv_format.read_csv, partial(csv_format.open_csv_writer, packed=True), csv_format.count_csv_rows),
+    ".npz": Format(npz_format.read_npz, npz_format.open_npz_writer, npz_format.count_npz_rows),
+    ".parquet": Format(arrow_format.read_parquet, arrow_format.open_parquet_writer, arrow_format.count_parquet_rows),
+    ".arrow": Format(arrow_format.read_ipc, arrow_format.open_ipc_writer, arrow_format.count_ipc_rows),
+    ".feather": Format(arrow_format.read_ipc, arrow_format.open_ipc_writer, arrow_format.count_ipc_rows),
+    ".arrows": Format(
+        arrow_format.read_ipc, partial(arrow_format.open_ipc_writer, stream=True), arrow_format.count_ipc_rows
+    ),
 }
 """Recording formats by suffix."""
 

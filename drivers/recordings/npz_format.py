@@ -28,17 +28,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular
-from drivers.recordings import memory_check
-from drivers.recordings.table import (
-    ALIASES,
-    COLUMNS,
-    AppendColumns,
-    Columns,
-    Table,
-    check_column_count,
-    choose_columns,
-    describe_content,
-)
+from drivers.recordings import memory_check, table
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
@@ -56,7 +46,7 @@ MAX_DEFLATE_RATIO: Final = 1032
 NUMERIC_KINDS: Final = "fiu"
 """Characters of ``numpy.dtype.kind`` for the types that a column may have."""
 NPY_MAGIC: Final = b"\x93NUMPY"
-KNOWN_KEYS: Final = frozenset((*COLUMNS, *ALIASES, "fs"))
+KNOWN_KEYS: Final = frozenset((*table.COLUMNS, *table.ALIASES, "fs"))
 NPY_HEADER: Final = re.compile(
     rb"\x93NUMPY\x01\x00..{'descr': '(?P<kind>[<>|](?:f[248]|[iu][1248]))', 'fortran_order': (?:False|True), "
     rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
@@ -102,10 +92,10 @@ def count_npz_rows(path: Path) -> int:
         if not _has_index(path, file):
             return 0  # the number of rows of a truncated archive is checked during reading
         with _open_archive(path, file) as archive:
-            return _check_columns(path, archive, choose_columns(path, _array_names(archive), []))
+            return _check_columns(path, archive, table.choose_columns(path, _array_names(archive), []))
 
 
-def read_npz(path: Path) -> Table:
+def read_npz(path: Path) -> table.Table:
     """Read the known arrays of a .npz file. If the file is truncated, read the values before the truncation.
 
     Raises
@@ -119,11 +109,11 @@ def read_npz(path: Path) -> Table:
     with _BoundedFile(path) as file:
         if _has_index(path, file):
             with _open_archive(path, file) as archive:
-                chosen = choose_columns(path, _array_names(archive), notes)
+                chosen = table.choose_columns(path, _array_names(archive), notes)
                 _check_columns(path, archive, chosen)
                 with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite
                     columns = {n: _read_array(path, archive, key).astype(np.float64) for n, key in chosen.items()}
-                return Table(columns, _read_fs(path, archive, notes), notes)
+                return table.Table(columns, _read_fs(path, archive, notes), notes)
     arrays, cut = _recover_arrays(path)
     if not arrays:
         raise RecordingError(f"{path}: is damaged or cut off before its first number")
@@ -136,7 +126,7 @@ def _has_index(path: Path, file: IO[bytes]) -> bool:
     """Return True if a zip archive has an index, False if the archive is truncated. Raise an error for other files."""
     if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
         raise RecordingError(
-            f"{path}: is no .npz file, which is a zip archive with one array per column{describe_content(path)}"
+            f"{path}: is no .npz file, which is a zip archive with one array per column{table.describe_content(path)}"
         )
     file.seek(0)
     complete = zipfile.is_zipfile(file)
@@ -265,9 +255,11 @@ def _single_number(fs: NDArray[Any], notes: list[str]) -> float | None:
 # --- archives without an index -------------------------------------------------------------------
 
 
-def _table_of_recovered(path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, notes: list[str]) -> Table:
+def _table_of_recovered(
+    path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, notes: list[str]
+) -> table.Table:
     """Return the arrays of a truncated file as a ``Table``. Pad the truncated column with NaN."""
-    chosen = choose_columns(path, list(arrays), notes)
+    chosen = table.choose_columns(path, list(arrays), notes)
     columns = {}
     for name, key in chosen.items():
         if arrays[key].ndim != 1:
@@ -278,7 +270,7 @@ def _table_of_recovered(path: Path, arrays: Mapping[str, NDArray[Any]], cut: str
         column = columns[short]
         n = max(other.size for other in columns.values())
         columns[short] = np.concatenate([column, np.full(n - column.size, np.nan)])
-    return Table(columns, _single_number(arrays["fs"], notes) if "fs" in arrays else None, notes)
+    return table.Table(columns, _single_number(arrays["fs"], notes) if "fs" in arrays else None, notes)
 
 
 def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
@@ -293,7 +285,7 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
         at = data.find(LOCAL_MAGIC)
         while 0 <= at <= len(data) - LOCAL_HEADER.size:
             members += 1
-            check_column_count(path, members)
+            table.check_column_count(path, members)
             _, _, flags, method, _, _, _, packed, _, name_size, extra_size = LOCAL_HEADER.unpack_from(data, at)
             start = at + LOCAL_HEADER.size + name_size
             key = data[start - name_size : start].decode("utf-8", errors="replace").removesuffix(".npy")
@@ -385,7 +377,7 @@ def _read_up_to_cut(
 
 
 @contextmanager
-def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[AppendColumns]:
+def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
     """Write a compressed .npz file.
 
     The arrays of an archive must be written one after the other. The columns are therefore first written to unnamed
@@ -394,7 +386,7 @@ def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[AppendColumns]
     with ExitStack() as stack:
         collected = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}
 
-        def append(columns: Columns) -> None:
+        def append(columns: table.Columns) -> None:
             """Append rows to the temporary files."""
             for name, file in collected.items():
                 file.write(np.ascontiguousarray(columns[name]).data)

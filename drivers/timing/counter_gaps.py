@@ -42,7 +42,7 @@ class CounterGaps:
     """
 
     def __init__(self, counter: CounterTimedFormat, timeline: ArrivalTimeline, events: EventRateLimiter) -> None:
-        self.typical_step = TypicalStep()
+        self.typical_step = _TypicalStep()
         self.clock_line = ArrivalRegression()
         """Fitted line of device time against sample index. The line has no points if the tick length is unknown."""
         self._counter = counter
@@ -190,7 +190,7 @@ class CounterGaps:
         return lasted_s > max(arrived_s - (arrived_s if taken_s is None else taken_s), 0.0) + JUMP_S
 
 
-class TypicalStep:
+class _TypicalStep:
     """Typical step of a counter, which is the mean of all steps near the median of the recent steps."""
 
     def __init__(self) -> None:
