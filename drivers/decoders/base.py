@@ -92,17 +92,17 @@ class RecentRejection:
     """Reason for the last rejected frame. The reason is kept until HINT_FRAMES good frames have followed."""
 
     def __init__(self) -> None:
-        self._text = ""
+        self._reason = ""
         self._good_frames = HINT_FRAMES
 
     @property
     def rejection_reason(self) -> str:
         """Reason for the last rejected frame; "" if no frame was rejected recently."""
-        return self._text if self._good_frames < HINT_FRAMES else ""
+        return self._reason if self._good_frames < HINT_FRAMES else ""
 
-    def note_rejection(self, text: str) -> None:
+    def note_rejection(self, reason: str) -> None:
         """Store the reason for a rejected frame."""
-        self._text, self._good_frames = text, 0
+        self._reason, self._good_frames = reason, 0
 
     def count_good_frames(self, frames: int = 1) -> None:
         """Add frames to the number of good frames since the last rejected frame."""
@@ -378,7 +378,25 @@ class FrameBuffer:
         return arrived
 
 
-class FrameStreamDecoder(ABC):
+class RejectingDecoder:
+    """Base class of decoders that reject frames and implausible samples."""
+
+    def __init__(self) -> None:
+        self._builder = BlockBuilder()
+        self._rejection = RecentRejection()
+
+    @property
+    def bad(self) -> int:
+        """Number of rejected frames and implausible samples."""
+        return self._builder.bad
+
+    @property
+    def recent_problem(self) -> str:
+        """Reason for the last rejected frame; "" if no frame was rejected recently."""
+        return self._rejection.rejection_reason
+
+
+class FrameStreamDecoder(RejectingDecoder, ABC):
     """Base class of decoders that find frames in a byte stream.
 
     A subclass defines ``encode``, ``timing`` and ``_decode``. The parameters are those of ``FrameBuffer``.
@@ -387,13 +405,8 @@ class FrameStreamDecoder(ABC):
     carrier: ClassVar[str] = "bytes"
 
     def __init__(self, sync: bytes, match: FrameMatcher, longest: int) -> None:
+        super().__init__()
         self._buffer = FrameBuffer(sync, match, longest)
-        self._builder = BlockBuilder()
-
-    @property
-    def bad(self) -> int:
-        """Number of rejected frames and implausible samples."""
-        return self._builder.bad
 
     @property
     def recent_problem(self) -> str:

@@ -22,7 +22,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.decoders.base import BlockBuilder, Decoder, RecentRejection
+from drivers.decoders.base import Decoder, RejectingDecoder
 from drivers.errors import DecodeError
 from drivers.sample import NO_TICK, Chunk, Floats, SampleBlock, SenderTimedFormat, Timing
 from drivers.settings_model import SettingsModel
@@ -62,15 +62,14 @@ class _Message:
     little: bool
 
 
-class Ros2ImuDecoder:
+class Ros2ImuDecoder(RejectingDecoder):
     """Decoder and encoder of ``sensor_msgs/msg/Imu`` messages."""
 
     carrier: ClassVar[str] = "messages"
 
     def __init__(self) -> None:
+        super().__init__()
         self.timing: Timing = SenderTimedFormat()
-        self._rejection = RecentRejection()
-        self._builder = BlockBuilder()
         self._lost_in_builder = 0  # lost messages that the builder has counted as bad
         self._lost = 0  # messages lost before the next message
         self._sequence: int | None = None
@@ -81,11 +80,6 @@ class Ros2ImuDecoder:
     def bad(self) -> int:
         """Number of rejected messages and of implausible samples."""
         return self._builder.bad - self._lost_in_builder
-
-    @property
-    def recent_problem(self) -> str:
-        """Reason for the last rejected message; "" if no message was rejected recently."""
-        return self._rejection.rejection_reason
 
     def reset(self) -> None:
         """Forget the last sequence number, so that the next message reveals no loss."""

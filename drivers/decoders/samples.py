@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Final
 
-from drivers.decoders.base import BlockBuilder, Decoder, RecentRejection
+from drivers.decoders.base import Decoder, RejectingDecoder
 from drivers.errors import DecodeError
 from drivers.sample import Chunk, SampleBlock, SenderTimedFormat, Timing
 from drivers.settings_model import SettingsModel
@@ -24,15 +24,14 @@ class Settings(SettingsModel):
     """Settings of the decoder, which has no options."""
 
 
-class SamplesDecoder:
+class SamplesDecoder(RejectingDecoder):
     """Decoder and encoder of sample messages."""
 
     carrier: ClassVar[str] = "messages"
 
     def __init__(self) -> None:
+        super().__init__()
         self.timing: Timing = SenderTimedFormat()
-        self._rejection = RecentRejection()
-        self._builder = BlockBuilder()
         self._rejected = 0  # messages
         self._received: int | None = None  # total number of samples according to the last message
         self._lost = 0  # samples missing before the next block
@@ -42,11 +41,6 @@ class SamplesDecoder:
     def bad(self) -> int:
         """Number of rejected messages and of implausible samples."""
         return self._rejected + self._builder.bad
-
-    @property
-    def recent_problem(self) -> str:
-        """Reason for the last rejected message; "" if no message was rejected recently."""
-        return self._rejection.rejection_reason
 
     def reset(self) -> None:
         """Forget the total number of samples, so that the next message reveals no loss."""

@@ -113,12 +113,13 @@ class Settings(SettingsModel):
     )
 
 
-class TextDecoder:
+class TextDecoder(base.RejectingDecoder):
     """Decoder and encoder of lines of numbers."""
 
     carrier: ClassVar[str] = "bytes"
 
     def __init__(self, settings: Settings) -> None:
+        super().__init__()
         self._settings = settings
         self._column = {name: i for i, name in enumerate(settings.columns) if name != SKIP}
         self._wanted = frozenset(self._column.values())
@@ -127,19 +128,7 @@ class TextDecoder:
         self.timing: Timing = _timing(settings)
         self._comment = settings.comment.encode()
         self._delimiter = settings.delimiter.encode()
-        self._builder = base.BlockBuilder()
-        self._rejection = base.RecentRejection()
         self.reset()
-
-    @property
-    def bad(self) -> int:
-        """Number of unreadable lines and implausible samples."""
-        return self._builder.bad
-
-    @property
-    def recent_problem(self) -> str:
-        """Reason for the last rejected line; "" if no line was rejected recently."""
-        return self._rejection.rejection_reason
 
     def reset(self) -> None:
         """Discard an incomplete line. The next line may be incomplete, as after opening the link."""

@@ -227,10 +227,10 @@ def read_metadata(path: Path) -> SegmentMetadata:
 
 
 def read_last_piece(path: Path) -> SegmentPiece | None:
-    """Read the last piece of a segment that is no longer written; None if the segment is empty.
+    """Return the last piece of a segment that has ended; None if the segment is empty.
 
-    The file is mapped into memory, so that the other batches are not read. The function raises RecordingError if the
-    file is not a segment.
+    The file is mapped into memory, so that the other batches are not read. Raise RecordingError if the file is not a
+    segment.
     """
     last = deque(_read_batches(path, "samples", mapped=True), maxlen=1)
     pieces = [piece for batch in last for piece in _split_batch(*batch)]
