@@ -1,15 +1,14 @@
 """Masking of passwords in text for logs, status and error messages.
 
-Two kinds of secrets are masked. The first is the password of a URL (``scheme://user:password@host``). The second is the
-value after a word such as ``password`` and a colon or an equals sign, as in configuration files and zenoh endpoints.
-File names are not secrets. The module does no I/O.
+Two kinds of secrets are masked: the password of a URL (``scheme://user:password@host``), and the value of a key such as
+``password`` in a configuration file or a zenoh endpoint. File names are not secrets. The module does no I/O.
 """
 
 import re
 from typing import Final
 
 MASK: Final = "***"
-# One character of the scheme suffices. A pattern for the whole scheme would take quadratic time.
+# The pattern matches at most the last character of the scheme. A pattern for the whole scheme takes quadratic time.
 _URL_PASSWORD: Final = re.compile(r"([a-z0-9+.-]:?//?[^/\s:@\"']*):[^/\s@\"']+@", re.IGNORECASE)
 _NAMED_SECRET: Final = re.compile(
     r"""(["']?\b\w*(?:password|passwd|passphrase|secret|token|private_key_base64)["']?\s*[:=]\s*)"""

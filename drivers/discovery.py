@@ -1,4 +1,4 @@
-"""Discovery of plug-in modules by listing a package, and suggestions for misspelled names."""
+"""Discovery of the modules in a package, and suggestions for misspelled names."""
 
 import importlib
 import pkgutil
@@ -52,7 +52,9 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
 
 
 def format_suggestion(word: str, known: Sequence[str]) -> str:
-    """Return the end of an error message about an unknown word.
+    """Return a suggestion to append to an error message about an unknown word.
+
+    The text suggests the most similar known word, or lists all known words if none is similar.
 
     Parameters
     ----------
@@ -61,17 +63,15 @@ def format_suggestion(word: str, known: Sequence[str]) -> str:
     known
         All known words.
 
-    Returns
-    -------
-    str
-        A question that suggests the most similar known word. If no known word is similar, a list of all known words.
+    >>> format_suggestion("serail", ("can", "serial"))
+    '; did you mean "serial"?'
     """
     close = get_close_matches(word, known, n=1, cutoff=0.5)
     return f'; did you mean "{close[0]}"?' if close else f"; known are {', '.join(known)}"
 
 
 def format_choices(word: str, known: Sequence[str]) -> str:
-    """Return the end of an error message about an unknown word: all known words, beginning with the most similar word.
+    """Return the known words to append to an error message about an unknown word, the most similar word first.
 
     Parameters
     ----------

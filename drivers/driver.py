@@ -1,9 +1,9 @@
-"""Driver of one device: reads bytes from its link, decodes them and gives each sample its time.
+"""Driver of one device: reads bytes from a link, decodes the bytes and assigns a time to each sample.
 
-``Driver.step`` performs one pass: read, decode, time-stamp, pass on. ``Driver.run`` repeats it in a thread of its own.
-If a link cannot be opened, is lost or falls silent, the driver closes it and reports an event. It then opens the link
-again after pauses of growing length, until the driver is stopped or a replay has ended. A fault of one device does not
-affect the others.
+``Driver.step`` reads, decodes, time-stamps and passes on samples once. ``Driver.run`` repeats ``step`` in the thread of
+the device. If a link cannot be opened, is lost or falls silent, the driver closes the link and reports an event. The
+driver then tries to open the link again, with growing pauses, until the driver is stopped or a replay has ended. A
+fault of one device does not affect other devices.
 """
 
 import threading
@@ -22,17 +22,17 @@ from drivers.sample import AXES, Chunk, Event, SampleBlock, SenderTimedFormat, m
 from drivers.timing.sample_clock import SampleClock
 
 READ_TIMEOUT_S: Final = 0.2
-"""Longest wait of one read for the first byte."""
+"""Longest time that one read waits for the first byte."""
 MIN_RETRY_PAUSE_S: Final = 0.1
 """Pause before the first attempt to open a lost link again. The pause doubles with each attempt."""
 MAX_RETRY_PAUSE_S: Final = 5.0
 """Longest pause between two attempts to open a link."""
 MAX_UNDECODED_BYTES: Final = 2000
-"""Received bytes without a sample after which the status names the probable cause, a wrong baud rate or decoder."""
+"""Number of bytes without a sample after which the status names a probable cause, such as a wrong baud rate."""
 MIN_UNDECODED_S: Final = 3.0
-"""A running device is lost if its bytes hold no sample for this time and for ten sample periods."""
+"""A running device counts as lost if no sample can be decoded for this time and for ten sample periods."""
 MAX_QUEUED_EVENTS: Final = 1000
-"""Events kept until they are taken. Older ones are dropped."""
+"""Maximum number of events in the queue. If the queue is full, the oldest event is dropped."""
 LOSS_REPORT_INTERVAL_S: Final = 1.0
 """Shortest time between two events about lost samples."""
 
@@ -41,16 +41,16 @@ State = Literal["waiting", "running", "lost", "ended"]
 
 @dataclass(frozen=True, slots=True)
 class AxisMap:
-    """Mapping of the axes of the sensor to the axes of the output, according to how the sensor is mounted.
+    """Mapping of sensor axes to output axes, according to the mounting of the sensor.
 
-    Column i of the output is sign[i] times column source[i] of the decoded samples.
+    Column i of the output is ``sign[i]`` times column ``source[i]`` of the decoded samples.
     """
 
     source: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     sign: tuple[float, ...] = (1.0,) * 6
 
     def map_axes(self, samples: SampleBlock) -> SampleBlock:
-        """Return the samples on the axes of the configuration."""
+        """Return the samples with sensor axes mapped to output axes."""
         if self == AxisMap():
             return samples
         values = samples.values[:, self.source] * np.array(self.sign)
@@ -59,12 +59,12 @@ class AxisMap:
 
 @dataclass(slots=True)
 class Counts:
-    """Numbers of samples of one device since the start: received + bad + lost = sent."""
+    """Sample counts of one device since the start. received + bad + lost is the number of samples sent."""
 
     received: int = 0
     bad: int = 0
     lost: int = 0
-    late: int = 0  # part of the lost samples: the decoder left them out because frames arrived too late
+    late: int = 0  # number of lost samples that the decoder dropped because frames arrived too late
 
 
 class Driver:
@@ -79,15 +79,15 @@ class Driver:
     decoder
         Decoder of the wire format.
     clock
-        Sample clock, which gives each sample its time.
+        Sample clock, which assigns a time to each sample.
     push
-        Called with each block of samples after it has been time-stamped. It must not block.
+        Function that receives each time-stamped block of samples. The function must not block.
     axes
-        Mapping of the axes according to the mounting. None if the axes are not changed.
+        Mapping of sensor axes to output axes. None if the axes are not changed.
     silence_s
         Time without a byte in s after which the link is opened again; 0 = never.
     keep
-        Called with the received chunks before they are decoded, to record the raw bytes. It must not block.
+        Function that receives the chunks before decoding, to record the raw bytes. The function must not block.
     """
 
     def __init__(
@@ -108,7 +108,7 @@ class Driver:
         self.counts = Counts()
         self.state: State = "waiting"
         self.text = f"waiting for {link.name}"
-        self.iterations = 0  # number of reads and attempts to open; it does not increase while the driver is blocked
+        self.iterations = 0  # number of reads and attempts to open the link; constant while the driver is blocked
         self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, SenderTimedFormat)
         self.first_t_ns: int | None = None
         """Time of the first sample since the start; None before the first sample."""
@@ -120,7 +120,7 @@ class Driver:
         self._stop = threading.Event()
         self._undecoded_bytes = 0
         self._counts_late = decoder if isinstance(decoder, LateFrameCountingDecoder) else None
-        self._left_out_reported = 0  # samples left out by the decoder that have been reported as gaps
+        self._reported_drops = 0  # number of samples dropped by the decoder that have been reported as missing
         self._last_data_s = 0.0
         self._last_sample_s = 0.0
         self._newest_t_ns = 0
@@ -129,29 +129,29 @@ class Driver:
 
     @property
     def late_frames_hint(self) -> str:
-        """Delay of the late frames of a sample and how to correct it; "" if no frame has been late for a while."""
+        """Message with the delay of late frames and the remedy; "" if no frame has been late recently."""
         return self._counts_late.late_frames_hint if self._counts_late else ""
 
     def take_events(self) -> list[Event]:
-        """Return the events since the last call, oldest first."""
+        """Remove all events from the queue and return them, oldest first."""
         return [self._events.popleft() for _ in range(len(self._events))]
 
     def stop(self) -> None:
-        """Ask ``run`` to end. A read that is waiting is ended, too."""
+        """End ``run``, and close the link so that a waiting read ends."""
         self._stop.set()
         self.link.close()
 
     def run(self) -> None:
-        """Read until the driver is stopped. This method is called in a thread of the device."""
+        """Read until the driver is stopped or a replay has ended. The thread of the device calls this method."""
         try:
             self._run()
         except Exception as error:
-            # a bug: the thread ends with the exception, and the status shows the fault
+            # a bug in the program: the status shows the error, and the thread ends
             self.state, self.text = "lost", f"the reader ended because of a bug in the program: {error!r}"
             raise
 
     def _run(self) -> None:
-        """Open the link and read from it. Repeat both after an error until the driver is stopped or a replay ends."""
+        """Open the link and read until the driver is stopped or a replay ends. Reopen the link after an error."""
         pause_s = MIN_RETRY_PAUSE_S
         while not self._stop.is_set():
             received = self.counts.received
@@ -197,43 +197,43 @@ class Driver:
             return
         self._last_sample_s, self._undecoded_bytes = self._last_data_s, 0
         for one in samples:
-            # missing samples were left out by the decoder, or were sent in messages that did not arrive
-            left_out = min(one.lost, self._left_out() - self._left_out_reported)
-            self._left_out_reported += left_out
+            # the missing samples were dropped by the decoder, or were sent in messages that did not arrive
+            dropped = min(one.lost, self._decoder_drops() - self._reported_drops)
+            self._reported_drops += dropped
             for stamped in self.clock.assign_times(one):
-                self._count(stamped, left_out)
+                self._count_samples(stamped, dropped)
                 self._push(self._axes.map_axes(stamped))
-                left_out = 0  # they are missing before the first row
-        self._count_left_out()
+                dropped = 0  # the dropped samples are missing before the first block only
+        self._count_decoder_drops()
         self._report_lost()
         self._events.extend(self.clock.take_events())
         if self.state != "running":
             self._handle_recovery()
 
-    def _left_out(self) -> int:
-        """Return the number of samples that the decoder has left out because they were bad or late."""
+    def _decoder_drops(self) -> int:
+        """Return the number of samples that the decoder has dropped because they were bad or late."""
         return self.decoder.bad + (self._counts_late.dropped_late_samples if self._counts_late else 0)
 
-    def _count_left_out(self) -> None:
+    def _count_decoder_drops(self) -> None:
         """Update the counts of bad and late samples."""
         self.counts.bad = self.decoder.bad
         if self._counts_late:
             self.counts.lost += self._counts_late.dropped_late_samples - self.counts.late
             self.counts.late = self._counts_late.dropped_late_samples
 
-    def _count(self, stamped: SampleBlock, left_out: int) -> None:
-        """Count the samples of a block and those missing before it, apart from samples that the decoder left out."""
+    def _count_samples(self, stamped: SampleBlock, dropped: int) -> None:
+        """Count the samples in a block and the lost samples before the block, except samples that were dropped."""
         if self.first_t_ns is None:
             self.first_t_ns = int(stamped.t_ns[0])
         self.counts.received += len(stamped)
         self._newest_t_ns = int(stamped.t_ns[-1])
         if stamped.lost:
-            self.counts.lost += max(0, stamped.lost - left_out)
+            self.counts.lost += max(0, stamped.lost - dropped)
             self._unreported_samples += stamped.lost
             self._unreported_gaps += 1
 
     def _report_lost(self) -> None:
-        """Report missing samples, at most once a second, so that a bad line does not hide other events."""
+        """Report missing samples at most once per second, so that a bad connection does not hide other events."""
         if not self._unreported_samples or time.monotonic() - self._last_report_s < LOSS_REPORT_INTERVAL_S:
             return
         places = "" if self._unreported_gaps == 1 else f" in {self._unreported_gaps} places"
@@ -248,15 +248,15 @@ class Driver:
             raise LinkLost(f"{self.link.name} silent for {silent_s:.1f} s")
 
     def _check_undecoded(self, size: int) -> None:
-        """Report a device whose bytes hold no samples."""
-        self._count_left_out()
+        """Report a device that sends bytes from which no samples can be decoded."""
+        self._count_decoder_drops()
         self._undecoded_bytes += size
         mute_s = self._last_data_s - self._last_sample_s
         patience_s = max(MIN_UNDECODED_S, 10.0 / (self.clock.rate_hz or 10.0))
         if self._undecoded_bytes < MAX_UNDECODED_BYTES or (self.state == "running" and mute_s < patience_s):
             return
         why = self.decoder.recent_problem or "wrong baud rate, or another protocol than the configured one"
-        self.text = f"{self.link.name}: {self._undecoded_bytes} bytes and no sample in them; {why}"
+        self.text = f"{self.link.name}: {self._undecoded_bytes} bytes without a sample; {why}"
         if self.state == "running":
             self._event("link_lost", self.text)
             self.state = "lost"
@@ -269,19 +269,19 @@ class Driver:
         self.state, self.text = "running", ""
 
     def _handle_link_error(self, error: LinkError) -> None:
-        """Report a lost link, close it and reset the decoder."""
+        """Report a lost link, close the link and reset the decoder."""
         if self.state == "running":
             self._event("link_lost", str(error))
             self.state = "lost"
         self.text = f"{error}; trying again"
         self.link.close()
         self.decoder.reset()
-        self._left_out_reported = self._left_out()
+        self._reported_drops = self._decoder_drops()
         self.clock.note_link_closed()
 
     def _event(self, kind: str, text: str) -> None:
         """Queue an event."""
-        # the present time in the epoch of the samples
+        # the present time, on the clock of the sample times
         t_ns = self._newest_t_ns if self.times_are_unix else time.monotonic_ns()
         self._events.append(Event(kind, t_ns, text))
 
@@ -292,12 +292,12 @@ def parse_axis_map(table: dict[str, str]) -> AxisMap:
     Parameters
     ----------
     table
-        Signed axis of the sensor for each axis of the output.
+        Sensor axis with an optional sign, by output axis.
 
     Raises
     ------
     ConfigError
-        If an axis is not one of AXES, or if a gyroscope axis is mapped to an accelerometer axis or the reverse.
+        If an axis is unknown, or if a gyroscope axis is mapped to an accelerometer axis or the reverse.
     """
     source, sign = list(range(6)), [1.0] * 6
     wrong = []

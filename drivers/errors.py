@@ -1,37 +1,34 @@
 """Exception classes of the project. Most classes also inherit from the matching built-in exception.
 
     ImuError
-      ConfigError(ValueError)        only while starting; the service refuses to start
+      ConfigError(ValueError)        invalid settings; the service refuses to start
       LinkError(OSError)
-        LinkUnavailable              cannot be opened (no port, library or permission); opening is retried
-        LinkLost                     was open and failed; opening is retried with growing pauses
-        LinkEnded                    the replayed source has ended; not retried
-      DecodeError(ValueError)        concerns one frame; ``feed`` counts it and continues
-      RecordingError(ValueError)     the file is not a recording, or it is empty
+        LinkUnavailable              the link cannot be opened (port, library or permission); opening is retried
+        LinkLost                     the open link has failed; opening is retried with growing pauses
+        LinkEnded                    the replayed file has ended; not retried
+      DecodeError(ValueError)        one frame is invalid; ``feed`` counts the frame and continues
+      RecordingError(ValueError)     the file is not a recording, or the file is empty
       NotReady                       too few samples for a result
 
-Links turn exceptions of vendor libraries into these classes, with ``from``. Any other exception from a module that does
-no I/O is a bug.
+Links convert the exceptions of vendor libraries to these classes and keep the original exception as the cause. If a
+module without I/O raises any other exception, the program has a bug.
 """
 
 from typing import Final
 
 MAX_TEXT_CHARACTERS: Final = 2000
-"""Maximum length of the text of an error in characters. The text may quote received data."""
+"""Maximum length of an error text in characters. The limit is needed because an error may quote received data."""
 
 
 class ImuError(Exception):
-    """Base class of all exceptions that this project raises on purpose.
-
-    The text is one line without control characters.
-    """
+    """Base class of the exceptions of this project. The error text is one line without control characters."""
 
     def __str__(self) -> str:
         return format_one_line(super().__str__())
 
 
 def format_one_line(text: str) -> str:
-    """Return the text in one line without control characters, cut after MAX_TEXT_CHARACTERS characters.
+    """Replace control characters by blanks, and shorten the text to MAX_TEXT_CHARACTERS characters.
 
     >>> format_one_line("no key \\x1b[2J\\nhere")
     'no key  [2J here'
@@ -41,12 +38,12 @@ def format_one_line(text: str) -> str:
 
 
 def describe_error(error: Exception) -> str:
-    """Return the text of an exception in one line. The text of an OSError is the reason without the path."""
+    """Return the text of an exception in one line. For an OSError, the text is the reason without the path."""
     return " ".join(str(getattr(error, "strerror", None) or error).split())
 
 
 class ConfigError(ImuError, ValueError):
-    """An invalid setting or option. The text names the file, key or line, and the values that would be valid.
+    """Invalid setting or option. The text names the file, the key or the line, and the valid values.
 
     Parameters
     ----------
@@ -71,11 +68,11 @@ class LinkError(ImuError, OSError):
 
 
 class LinkUnavailable(LinkError):
-    """The link cannot be opened now. Opening is tried again."""
+    """A link cannot be opened. The driver tries again later."""
 
 
 class LinkLost(LinkError):
-    """An open link has failed. The link is opened again."""
+    """An open link has failed. The driver opens the link again."""
 
 
 class LinkEnded(LinkError):

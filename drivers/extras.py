@@ -1,4 +1,4 @@
-"""Check of the optional packages of an installation extra."""
+"""Check that the optional packages of an installation extra are installed."""
 
 import importlib.util
 from collections.abc import Mapping

@@ -1,7 +1,7 @@
-"""Safe opening and reading of files whose names come from a configuration, a folder or the command line.
+"""Safe opening and reading of files whose names users or folders provide.
 
-``open_regular`` opens regular files only. For a FIFO, a socket, a device or a directory, the function raises a one-line
-error and never blocks. ``read_small_file`` reads a complete small file, such as a configuration, a model or a CAN
+``open_regular`` opens regular files only. If the path is a FIFO, a socket, a device or a directory, the function raises
+an error and never blocks. ``read_small_file`` reads a complete small file, such as a configuration, a model or a CAN
 database.
 """
 
@@ -12,10 +12,7 @@ from pathlib import Path
 from typing import IO, Final
 
 MAX_BYTES: Final = 32_000_000
-"""Maximum size of a file that ``read_small_file`` accepts.
-
-The largest CAN databases of whole vehicles have some megabytes.
-"""
+"""Maximum size of a file for ``read_small_file``. CAN databases of complete vehicles have a few megabytes."""
 FILE_KINDS: Final = {
     stat.S_IFIFO: "a FIFO",
     stat.S_IFSOCK: "a socket",
@@ -23,21 +20,21 @@ FILE_KINDS: Final = {
     stat.S_IFCHR: "a character device",
     stat.S_IFBLK: "a block device",
 }
-"""Names of the kinds of files that are not regular, for error messages."""
+"""Names of file types other than regular files, for error messages."""
 
 
 def expand_user(name: str) -> Path:
-    """Return the path for a name that may begin with ``~`` for the home folder of an existing user."""
+    """Return a path in which a leading ``~`` or ``~user`` is replaced by the home folder."""
     return Path(os.path.expanduser(name))
 
 
 def real_path(path: Path) -> Path:
-    """Return the absolute path with symbolic links followed. pathlib would raise an error for a loop of links."""
+    """Return the absolute path without symbolic links. Unlike ``Path.resolve``, accept a loop of links."""
     return Path(os.path.realpath(path))
 
 
 def is_file(path: Path) -> bool:
-    """Return True if the path is an existing file. Return False for an invalid name, where pathlib may raise."""
+    """Return True if the path is an existing file. Unlike ``Path.is_file``, return False for an invalid name."""
     return os.path.isfile(path)
 
 
@@ -52,7 +49,7 @@ def open_regular(path: Path) -> IO[bytes]:
     Returns
     -------
     IO[bytes]
-        Buffered binary file. Its descriptor is closed when another program is executed.
+        Buffered binary file. Child processes do not inherit the descriptor.
 
     Raises
     ------
@@ -60,7 +57,7 @@ def open_regular(path: Path) -> IO[bytes]:
         If the file cannot be opened, or is not a regular file. ``strerror`` gives the reason without the path.
     """
     check_regular(path)  # check before opening, since opening a device may have side effects
-    # the file may have been replaced since: open without blocking, and check again
+    # the file may have been replaced after the check, so open without blocking and check again
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     try:
         _check_mode(path, os.fstat(descriptor).st_mode)
@@ -73,7 +70,7 @@ def open_regular(path: Path) -> IO[bytes]:
 def check_regular(path: Path) -> None:
     """Check that a path is a regular file, before a library opens the file.
 
-    The check does not open the file, since closing a second descriptor would drop the locks that SQLite holds on it.
+    The check does not open the file, since closing a second descriptor would release the locks of SQLite on the file.
 
     Raises
     ------
@@ -88,7 +85,7 @@ def check_regular(path: Path) -> None:
 
 
 def check_folder_or_absent(path: Path) -> None:
-    """Raise OSError if a path is neither a folder nor absent. ``strerror`` names the kind of file."""
+    """Raise OSError if the path exists and is not a folder. ``strerror`` names the type of the file."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -106,8 +103,8 @@ def read_small_file(path: Path, *, pipe: bool = False) -> bytes:
     path
         Name of the file.
     pipe
-        True if a pipe may be read as well, such as ``/dev/stdin`` or ``<(command)`` on the command line. Opening and
-        reading a pipe wait for the writer of the pipe.
+        True if the path may also be a pipe, such as ``/dev/stdin`` or ``<(command)``. Reading then waits for the
+        program that writes to the pipe.
 
     Returns
     -------

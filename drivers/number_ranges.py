@@ -1,12 +1,12 @@
-"""Quantities: kinds of numbers from users and files, each with its unit and supported range.
+"""Units and supported ranges of the numbers that users and files provide.
 
-Numbers enter the program through command-line options, keys of configuration and model files, and recordings. Each of
-these entry points checks its numbers against one of the quantities below. The code behind them therefore never meets a
-value that overflows, divides by zero or asks for more memory than exists. The ranges are wider than those of any known
-sensor or use. They are narrow enough that products, squares and quotients of the numbers stay finite.
+Numbers enter the program through command-line options, keys of configuration and model files, and recordings. The
+program checks each number against one of the ranges below, so that no later computation overflows, divides by zero or
+exceeds the memory. The ranges are wider than the values of any known sensor or application. Products, squares and
+quotients of numbers within the ranges are finite.
 
-A field of a settings model names its quantity in its type: ``Annotated[float, RATE_HZ]``. pydantic then checks the
-number with ``NumberRange.check``.
+The type of a field in a settings model names the range: ``Annotated[float, RATE_HZ]``. pydantic then checks the number
+with ``NumberRange.check``.
 """
 
 from collections.abc import Callable
@@ -31,14 +31,14 @@ PREFIXED_UNITS: Final = ("Hz", "bit/s", "byte/s", "byte")
 PREFIXES: Final = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
 """Factors and names of the prefixes, largest first."""
 MAX_WRITTEN_INTEGER: Final = 1 << 64
-"""Largest integer that is written in a message. A larger one is described, since it may have thousands of digits."""
+"""Largest integer that a message quotes. A larger integer may have thousands of digits."""
 MAX_QUOTED_CHARACTERS: Final = 60
-"""Maximum number of characters of a wrong value that a message quotes."""
+"""Maximum number of characters of a value that a message quotes."""
 
 
 @dataclass(frozen=True, slots=True)
 class NumberRange:
-    """Kind of number with its unit and supported range. Both ends are included.
+    """Unit and supported range of a number. The range includes both limits.
 
     >>> RATE_HZ.check(200.0)
     200.0
@@ -50,7 +50,7 @@ class NumberRange:
     unit: str  # "" for a number without a unit
     low: float
     high: float
-    zero: bool = False  # True if 0 is supported as well, with a special meaning
+    zero: bool = False  # True if 0 is supported as well and has a special meaning
     signed: bool = False  # True if the range applies to the absolute value
 
     def check(self, value: Number) -> Number:
@@ -59,7 +59,7 @@ class NumberRange:
         Raises
         ------
         ConfigError
-            The value is not a number or is outside the supported range. The text names value, unit and range.
+            If the value is NaN or outside the supported range. The text states the value and the range.
         """
         if self.supports(value):
             return value
@@ -71,7 +71,7 @@ class NumberRange:
         return self.low <= size <= self.high or (self.zero and value == 0)
 
     def format_range(self) -> str:
-        """Return the supported range with its unit.
+        """Return the supported range and the unit as text.
 
         >>> DURATION_S.format_range(), SILENCE_S.format_range()
         ('1 µs to 36525 d', '1 ms to 36525 d, or 0')
@@ -83,7 +83,7 @@ class NumberRange:
         return f"{ends}, or 0" if self.zero else ends
 
     def __get_pydantic_core_schema__(self, source: Any, handler: "GetCoreSchemaHandler") -> "CoreSchema":
-        """Return the schema of pydantic for a field with the type ``Annotated[float, self]``."""
+        """Return the pydantic schema of a field with the type ``Annotated[float, self]``."""
         from pydantic_core import ValidationError, core_schema
 
         kind = "a whole number" if source is int else "a number"
@@ -101,24 +101,24 @@ class NumberRange:
 # --- time and rates
 
 RATE_HZ: Final = NumberRange("Hz", 1e-3, 1e6)
-"""Sample rate: from a sample in a quarter of an hour to far above the fastest vibration sensors (about 30 kHz)."""
+"""Sample rate, from about one sample per quarter of an hour to far above the fastest vibration sensors (30 kHz)."""
 EFFECT_FREQUENCY_HZ: Final = NumberRange("Hz", 1e-12, 1e6, zero=True)
-"""Frequency of a spectral line or of random events in a noise model; 0: none."""
+"""Frequency of a spectral line or of random events in a noise model; 0 = none."""
 UPDATE_RATE_HZ: Final = NumberRange("Hz", 1e-6, 1e6)
 """Rate at which results are published."""
 DURATION_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S)
-"""Duration: from one period of the highest sample rate to a century."""
+"""Duration, from one period of the highest sample rate to a century."""
 AVERAGING_TIME_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S)
 """Averaging time τ of the Allan variance."""
 DELAY_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S, zero=True)
-"""Time after a start; 0 is the start itself."""
+"""Time after a start; 0 = at the start."""
 SILENCE_S: Final = NumberRange("s", 1e-3, 36_525.0 * DAY_S, zero=True)
-"""Time without data after which the program reacts; 0: never."""
+"""Time without data after which the program reacts; 0 = never."""
 RUN_TIME_S: Final = NumberRange("s", 0.1, 36_525.0 * DAY_S)
-"""Time after which a command ends by itself."""
+"""Time after which a command ends automatically."""
 JITTER_S: Final = NumberRange("s", 0.0, 0.5)
 READ_TIMEOUT_S: Final = NumberRange("s", 1e-4, 0.1)
-"""Time that a read of a serial port may wait. A port without ``cancel_read`` is closed after at most this time."""
+"""Longest wait of one read from a serial port. Closing a port without ``cancel_read`` may take this time."""
 TICK_S: Final = NumberRange("s", 1e-12, DAY_S)
 """Length of one count of a device clock."""
 
@@ -138,43 +138,43 @@ POSITIVE_SHARE: Final = NumberRange("", 1e-6, 1.0)
 PERCENT: Final = NumberRange("%", 1.0, 100.0)
 SEED: Final = NumberRange("", 0, (1 << 63) - 1)
 SAMPLE_COUNT: Final = NumberRange("samples", 1, 10_000_000_000)
-"""Length of a simulated recording."""
+"""Number of samples of a simulated recording."""
 COUNTER_MODULUS: Final = NumberRange("counts", 2, 1 << 62)
 """Number of counts after which a device counter starts again at 0."""
 COUNTER_STEP: Final = NumberRange("counts", 1e-9, 1 << 62)
-"""Counts of a device counter from one sample to the next."""
+"""Increase of a device counter from one sample to the next."""
 SOURCE_ADDRESS: Final = NumberRange("", 0, 255)
 """Source address of SAE J1939."""
 HEADER_LINES: Final = NumberRange("lines", 0, 1_000_000)
 ALARMS_PER_DAY: Final = NumberRange("a day", 1e-6, 1e4, zero=True)
-"""Rate of false alarms; 0: detection is off."""
+"""Rate of false alarms per day; 0 = detection is off."""
 REPLAY_SPEED: Final = NumberRange("times", 1e-3, 1e6)
 """Speed of a replay relative to real time."""
 SIMULATION_SPEED: Final = NumberRange("times", 1e-3, 1e4)
 RATE_RATIO: Final = NumberRange("", 1e-3, 1e3)
-"""True sample rate divided by the stated one."""
+"""True sample rate divided by the stated sample rate."""
 CLOCK_RATIO: Final = NumberRange("", 0.5, 2.0)
 INFLATION: Final = NumberRange("", 1.0, 1e6)
 SCALE: Final = NumberRange("", 1e-15, 1e15, signed=True)
-"""Factor from the numbers of a device to a unit."""
+"""Factor that converts the raw numbers of a device to a unit."""
 NOISE_RATIO: Final = NumberRange("times", 1e-6, 1e6)
-"""Ratio of two amounts of noise."""
+"""Ratio of two noise levels."""
 
 # --- what a sensor measures
 
 FULL_SCALE: Final = NumberRange("", 1e-3, 1e6)
 """Full scale of a sensor, in g or °/s."""
 COEFFICIENT: Final = NumberRange("", 1e-30, 1e30)
-"""Noise coefficient in an SI unit. The range is far beyond every sensor, and squares and quotients stay finite."""
+"""Noise coefficient in SI units. The range exceeds the values of any sensor; squares and quotients are finite."""
 PARAMETER: Final = NumberRange("", 1e-30, 1e30, zero=True, signed=True)
 """Parameter of a noise model in SI units."""
 FIT_NUMBER: Final = NumberRange("", 0.0, 1e30, signed=True)
-"""Number of a fitted model that was written to a file."""
+"""Number in the file of a fitted model."""
 TEMPERATURE_C: Final = NumberRange("°C", -273.15, 2_000.0)
 
 
 def format_value(value: object) -> str:
-    """Return a value as TOML writes it. A list or table is named, and a long text is cut.
+    """Return a value in TOML syntax. Long text is shortened, and a list or a table is replaced by a description.
 
     >>> format_value(True), format_value("x"), format_value([1, 2])
     ('true', '"x"', 'a list')
@@ -192,7 +192,7 @@ def format_value(value: object) -> str:
 
 
 def _number_text(value: float, unit: str) -> str:
-    """Return a number with its unit.
+    """Return a number and its unit as text.
 
     >>> _number_text(2e6, "Hz"), _number_text(0.25, "s"), _number_text(172_800.0, "s"), _number_text(10**400, "")
     ('2 MHz', '250 ms', '2 d', 'an integer of more than 64 bits')

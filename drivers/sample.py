@@ -1,7 +1,8 @@
 """Data types that modules exchange: ``Chunk`` (received bytes), ``SampleBlock`` (decoded samples) and ``Event``.
 
-All values are in SI units: rad/s and m/s². Temperatures are in °C. ``t_ns`` is the monotonic clock of the host in
-nanoseconds. If the source brings its own times, ``t_ns`` is Unix time instead. ``ticks`` is the counter of the device.
+All values are in SI units: rad/s and m/s². Temperatures are in °C. ``t_ns`` is a time in nanoseconds on the monotonic
+clock of the host. If the source provides Unix times, ``t_ns`` is Unix time instead. ``ticks`` are the values of the
+device counter.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 AXES: Final = ("gx", "gy", "gz", "ax", "ay", "az")
-"""Axis order of every array with six columns: gyroscopes in rad/s, accelerometers in m/s²."""
+"""Axes in the order of the columns of every array with six columns: gyroscopes, then accelerometers."""
 
 NS_PER_S: Final = 1e9
 """Nanoseconds per second."""
@@ -28,22 +29,22 @@ EXTENDED_ID: Final = 1 << 31
 """Flag of a CAN address with a 29-bit identifier."""
 
 ANY_SOURCE: Final = 1 << 30
-"""Flag of a CAN address to receive. Only the J1939 parameter group has to match, whatever the source address is."""
+"""Flag of a CAN address that matches every frame with the same J1939 parameter group, from any source address."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Bytes as a link received them, with their arrival time."""
+    """Bytes that a link has received, with their arrival time."""
 
     data: bytes
-    t_ns: int  # host monotonic time of arrival, or Unix time if the link replays recorded times
+    t_ns: int  # arrival time on the monotonic clock of the host, or recorded Unix time if the link replays a file
     address: int = 0  # CAN identifier; bit 31 set for 29-bit identifiers
-    attachment: bytes = b""  # data that the transport sent along with the payload (zenoh)
+    attachment: bytes = b""  # additional data of a zenoh message
 
 
 @dataclass(frozen=True, slots=True)
 class SampleBlock:
-    """Consecutive samples of one device, n ≥ 1. ``lost`` samples are missing just before the first sample."""
+    """One or more consecutive samples of one device. ``lost`` samples are missing just before the first sample."""
 
     t_ns: Ints  # [n]
     values: Floats  # [n, 6] in AXES order, rad/s and m/s²; NaN = not measured
@@ -55,7 +56,7 @@ class SampleBlock:
         return int(self.t_ns.size)
 
     def __getitem__(self, rows: slice) -> "SampleBlock":
-        """Return some samples of the block. ``lost`` is kept only if the first sample is included."""
+        """Return a range of samples. ``lost`` is kept if the range includes the first sample, otherwise set to 0."""
         first = rows.indices(len(self))[0]
         return SampleBlock(
             self.t_ns[rows],
@@ -98,12 +99,12 @@ def make_block(
 
 @dataclass(frozen=True, slots=True)
 class ArrivalTimedFormat:
-    """Timing of a wire format without a counter: sample times are estimated from arrival times by regression."""
+    """Wire format without a counter. Sample times are estimated from arrival times by regression."""
 
 
 @dataclass(frozen=True, slots=True)
 class CounterTimedFormat:
-    """Timing of a wire format whose frames carry a counter.
+    """Wire format whose frames contain a device counter.
 
     ``modulus`` is the number of counts after which the counter starts again at 0. ``tick_s`` is the length of one count
     in seconds, or None if the counter counts samples.
@@ -115,7 +116,7 @@ class CounterTimedFormat:
 
 @dataclass(frozen=True, slots=True)
 class SenderTimedFormat:
-    """Timing of a wire format whose payload carries Unix times. ``Chunk.t_ns`` is not used."""
+    """Wire format whose messages contain the Unix times of the samples. ``Chunk.t_ns`` is not used."""
 
 
 Timing = ArrivalTimedFormat | CounterTimedFormat | SenderTimedFormat
@@ -140,24 +141,24 @@ EVENT_KINDS: Final = (
     "recording_stopped",
     "recording_back",
 )
-"""Allowed values of ``Event.kind``. A hook can be configured for each of them."""
+"""Allowed values of ``Event.kind``. A hook can be configured for each kind of event."""
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Event of a device, such as a lost link or a noise change, with time, size and significance."""
+    """Event of a device, such as a lost link or a change of the noise."""
 
     kind: str  # one of EVENT_KINDS
     t_ns: int
     text: str
     axis: str | None = None
-    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # by coefficient, e.g. value and limit
+    values: Mapping[str, Mapping[str, float]] = field(default_factory=dict)  # such as value and limit, by coefficient
     since_ns: int | None = None  # time at which the condition began
     sigma: float | None = None  # significance in standard errors
 
 
 def concatenate_blocks(blocks: Sequence[SampleBlock]) -> SampleBlock:
-    """Concatenate blocks into one. The ``lost`` counts of all blocks are added up before the first sample."""
+    """Concatenate blocks into one block, whose ``lost`` is the sum over all blocks."""
     return make_block(
         np.concatenate([b.t_ns for b in blocks]),
         np.concatenate([b.values for b in blocks]),
@@ -168,7 +169,7 @@ def concatenate_blocks(blocks: Sequence[SampleBlock]) -> SampleBlock:
 
 
 def merge_contiguous_blocks(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
-    """Join blocks between which no samples are missing. A new block begins only where samples are missing."""
+    """Concatenate consecutive blocks, so that a new block begins only where samples are missing."""
     edges = [*(i for i, one in enumerate(blocks) if i == 0 or one.lost), len(blocks)]
     return [blocks[a] if b - a == 1 else concatenate_blocks(blocks[a:b]) for a, b in pairwise(edges)]
 
@@ -176,8 +177,8 @@ def merge_contiguous_blocks(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
 def seconds_to_ns(seconds: Floats) -> Ints:
     """Convert seconds [n] to whole nanoseconds [n].
 
-    Integer part and fraction are converted separately. The error is only the resolution of Unix seconds as float64,
-    which is 0.24 µs.
+    Integer part and fraction are converted separately, so that the conversion adds no rounding error. Unix seconds in
+    float64 have a resolution of 0.24 µs.
     """
     whole = np.floor(seconds)
     fraction = np.rint((seconds - whole) * 1e9)
@@ -186,7 +187,7 @@ def seconds_to_ns(seconds: Floats) -> Ints:
 
 
 def ns_to_seconds(t_ns: Ints) -> Floats:
-    """Convert nanoseconds [n] to seconds [n]. The resolution of Unix seconds as float64 is 0.24 µs."""
+    """Convert nanoseconds [n] to seconds [n]. Unix seconds in float64 have a resolution of 0.24 µs."""
     whole, rest = np.divmod(t_ns, 1_000_000_000)
     result: Floats = whole + rest * 1e-9
     return result

@@ -1,8 +1,8 @@
-"""Base class of the settings that are read from a configuration file, and the reader of one table of such a file.
+"""Base class of the settings in a configuration file, and validation of one table of the file.
 
-Each field of a model describes one key: its type with the supported range, its default, and its description. A field
-without a default, or with a default that turns a function off, also has an example. ``check_table`` finds all mistakes
-of a table at once. Each mistake is described in plain words, without names of Python types.
+Each field of a model describes one key by a type with the supported range, a default and a description. A field without
+a default, or with a default that turns a function off, also has an example. ``check_table`` finds all mistakes in a
+table at once, and describes each mistake without names of Python types.
 """
 
 import contextlib
@@ -33,7 +33,7 @@ from drivers.errors import ConfigError
 from drivers.number_ranges import format_value
 
 MAX_PASSES: Final = 4
-"""Maximum number of validations of a table. Each pass replaces the wrong values that the previous pass has found."""
+"""Maximum number of validations of a table. Wrong values are replaced after each validation."""
 EXPECTED: Final = {
     "float_type": "a number",
     "int_type": "a whole number",
@@ -45,39 +45,39 @@ EXPECTED: Final = {
     "dict_type": "a table",
     "model_type": "a table",
 }
-"""Description of the expected value, by type of a pydantic error."""
+"""Description of the expected value, by the type of the pydantic error."""
 
 T = TypeVar("T")
 Model = TypeVar("Model", bound="SettingsModel")
 
 
 class Conflict(NamedTuple):
-    """Mistake that concerns several keys of a table, or a key together with another part of the file."""
+    """Mistake in the combination of several keys."""
 
     key: str  # key that the message names; "" for the whole table
     text: str
-    others: tuple[str, ...] = ()  # further keys that the message depends on
+    others: tuple[str, ...] = ()  # other keys that the mistake depends on
 
 
 @dataclass(frozen=True, slots=True)
-class ReadContext:
-    """Context of the validation of a table from a file. Settings that Python code creates have no context."""
+class _ReadContext:
+    """Context of a validation by ``check_table``. Settings that Python code creates are validated without a context."""
 
     folder: Path | None  # folder of the configuration file; None if the existence of files is not checked
 
 
 class SettingsModel(BaseModel):
-    """Base class of all settings. Unknown keys are mistakes, and values are not converted to other types."""
+    """Base class of all settings. Unknown keys are errors, and values are not converted to other types."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", validate_by_name=True)
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield the mistakes that a single field does not show."""
+        """Yield the mistakes that concern a combination of keys."""
         return iter(())
 
     @model_validator(mode="after")
     def _refuse_conflicts(self, info: ValidationInfo) -> Self:
-        if info.context is None and (found := list(self.find_conflicts())):  # check_table collects them itself
+        if info.context is None and (found := list(self.find_conflicts())):  # check_table collects the conflicts
             raise ConfigError(*(f"{one.key}: {one.text}" for one in found))
         return self
 
@@ -89,7 +89,7 @@ class Problem(NamedTuple):
     text: str
 
     def nest_under(self, place: str) -> "Problem":
-        """Return the same problem for a table at ``place`` of a larger table."""
+        """Return the problem with the path ``place`` of the table put before the path of the key."""
         dot = "." if place and self.place and not self.place.startswith("[") else ""
         return Problem(f"{place}{dot}{self.place}", self.text)
 
@@ -98,14 +98,14 @@ class Problem(NamedTuple):
 
 
 class TableError(ConfigError):
-    """Mistakes in a table that a field converts to an object.
+    """Mistakes in the table of a field whose value is not a settings model.
 
     Parameters
     ----------
     problems
-        Mistakes with their places in the table.
+        Mistakes and the paths of their keys in the table.
     partial
-        Part of the object that can be checked further.
+        Object with the correct parts of the table, for further checks.
     """
 
     def __init__(self, problems: Sequence[Problem], partial: object = None) -> None:
@@ -118,16 +118,16 @@ class TableError(ConfigError):
 class TableCheckResult(Generic[Model]):
     """Result of ``check_table``."""
 
-    value: Model | None  # settings, with defaults or examples in place of wrong values; None if that is impossible
+    value: Model | None  # settings with defaults or examples in place of wrong values; None if they cannot be replaced
     problems: list[Problem] = field(default_factory=list)
-    partial: dict[str, object] = field(default_factory=dict)  # partial objects of wrong tables, by place
+    partial: dict[str, object] = field(default_factory=dict)  # ``TableError.partial`` by path of the table
 
     def is_sound(self, *places: str) -> bool:
-        """Return True if no problem was found in these keys, in their tables or in their subkeys."""
+        """Return True if no problem was found in these keys, their parent tables or their subkeys."""
         return not any(_nested(place, wrong.place) for place in places for wrong in self.problems)
 
     def add_problem(self, place: str, text: str) -> None:
-        """Add a problem, unless the value at its place is wrong by itself.
+        """Add a problem, unless a problem with the same key has been found before.
 
         Parameters
         ----------
@@ -140,48 +140,25 @@ class TableCheckResult(Generic[Model]):
             self.problems.append(Problem(place, text))
 
 
-def read_settings(kind: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> Model:
-    """Return the settings of a table.
-
-    Parameters
-    ----------
-    kind
-        Model of the table.
-    table
-        Keys and values, as TOML gives them.
-    folder
-        Folder at which relative paths begin. If it is None, files are not looked for.
-
-    Raises
-    ------
-    ConfigError
-        If the table has mistakes. There is one line for each mistake.
-    """
-    checked = check_table(kind, table, folder)
-    if checked.problems or checked.value is None:
-        raise ConfigError(*map(str, checked.problems))
-    return checked.value
-
-
 def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> TableCheckResult[Model]:
-    """Find all mistakes of a table.
+    """Convert a table to settings, and find all mistakes in the table.
 
-    Wrong values are replaced by defaults or examples, so that they do not hide other mistakes.
+    Wrong values are replaced by defaults or examples, so that one mistake does not hide another mistake.
 
     Parameters
     ----------
     kind
-        Model of the table.
+        Settings model of the table.
     table
-        Keys and values, as TOML gives them.
+        Keys and values from a TOML file.
     folder
-        Folder at which relative paths begin. If it is None, files are not looked for.
+        Folder to which relative paths refer. None if the existence of files is not checked.
     """
     checked: TableCheckResult[Model] = TableCheckResult(None)
     repaired = copy.deepcopy(dict(table))
     for _ in range(MAX_PASSES):
         try:
-            checked.value = kind.model_validate(repaired, context=ReadContext(folder), by_alias=True, by_name=False)
+            checked.value = kind.model_validate(repaired, context=_ReadContext(folder), by_alias=True, by_name=False)
         except ValidationError as error:
             details = error.errors(include_url=False)
             found = [problem for one in details for problem in _problems(kind, one, checked)]
@@ -195,19 +172,19 @@ def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None
 
 
 def fields_by_key(kind: type[SettingsModel]) -> dict[str, FieldInfo]:
-    """Return the fields of a model by the names of their keys in the file."""
+    """Return the fields of a model by their keys in the file."""
     return {found.alias or name: found for name, found in kind.model_fields.items()}
 
 
 def find_model(annotation: Any) -> type[SettingsModel] | None:
-    """Return the settings model within the type of a field; None if there is none."""
+    """Return the settings model that a type annotation contains; None if the annotation contains no model."""
     if isinstance(annotation, type) and issubclass(annotation, SettingsModel):
         return annotation
     return next((found for one in get_args(annotation) if (found := find_model(one))), None)
 
 
 def _problems(kind: type[SettingsModel], error: ErrorDetails, checked: TableCheckResult[Any]) -> Iterator[Problem]:
-    """Yield the problems that an error of pydantic stands for."""
+    """Convert one pydantic error to problems."""
     place = _format_place(error["loc"])
     cause = error.get("ctx", {}).get("error")
     if isinstance(cause, TableError):
@@ -223,7 +200,7 @@ def _problems(kind: type[SettingsModel], error: ErrorDetails, checked: TableChec
 
 
 def _describe(error: ErrorDetails) -> str:
-    """Describe a wrong value in plain words."""
+    """Describe a wrong value without the names of Python types."""
     value = error["input"]
     if error["type"] == "missing":
         return "missing"
@@ -234,7 +211,7 @@ def _describe(error: ErrorDetails) -> str:
 
 
 def _add_conflicts(checked: TableCheckResult[Any], value: object, place: str) -> None:
-    """Add the conflicts of a model and of all models in it."""
+    """Add the conflicts of a model and of all models that the fields contain."""
     if isinstance(value, SettingsModel):
         for one in value.find_conflicts():
             problem = Problem(one.key, one.text).nest_under(place)
@@ -249,10 +226,10 @@ def _add_conflicts(checked: TableCheckResult[Any], value: object, place: str) ->
 
 
 def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
-    """Replace a wrong or missing value so that the rest of the table can be checked."""
+    """Replace a wrong or missing value by a default or an example."""
     *path, last = [part for part in error["loc"] if part != "[key]"]
     found = _field_at(kind, error["loc"])[1]
-    with contextlib.suppress(LookupError):  # the repair of another error at this place has removed the value
+    with contextlib.suppress(LookupError):  # an earlier repair may have removed the value
         for part in path:
             table = table[part]
         if error["type"] == "model_type":
@@ -264,7 +241,7 @@ def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
 
 
 def _field_at(kind: type[SettingsModel], place: Sequence[str | int]) -> tuple[type[SettingsModel], FieldInfo | None]:
-    """Return the innermost model at a place, and the field of the last key; None if the model does not have the key."""
+    """Return the innermost model on a path of keys, and the field of the last key; None for an unknown key."""
     found = None
     for part in place:
         if found is not None:
@@ -275,7 +252,7 @@ def _field_at(kind: type[SettingsModel], place: Sequence[str | int]) -> tuple[ty
 
 
 def _format_place(place: Sequence[str | int]) -> str:
-    """Return a place as a path of keys.
+    """Format the location of a pydantic error as a path of keys.
 
     >>> _format_place(("device", 0, "tau", 1)), _format_place(("scale", "gw", "[key]"))
     ('device[0].tau[1]', 'scale.gw')
@@ -285,7 +262,7 @@ def _format_place(place: Sequence[str | int]) -> str:
 
 
 def _nested(one: str, other: str) -> bool:
-    """Return True if one of two places contains the other. The whole table counts as a place of its own."""
+    """Return True if two paths are equal, or if one path leads to a part of the other path's value."""
     short, long = sorted((one, other), key=len)
     return short == long or (bool(short) and long.startswith(short) and long[len(short)] in ".[")
 
@@ -294,19 +271,19 @@ def _nested(one: str, other: str) -> bool:
 
 
 ListOf = Annotated[tuple[T, ...], Strict(False)]
-"""List in the file, tuple in the model. The items keep their strict types."""
+"""List in the file that becomes a tuple in the model. The items are not converted to other types."""
 
 
 class ReadAs:
-    """Annotation of a field whose value in the file has another type than in the model.
+    """Annotation of a field whose value has different types in the file and in the model.
 
     Parameters
     ----------
     kind
         Type of the value in the file.
     convert
-        Function of the value and the folder of the file (None if there is no file). It returns the value of the model,
-        and it raises ConfigError for a value that cannot be converted.
+        Function that converts a value from the file. The arguments are the value and the folder of the file, or None if
+        there is no file. The function raises ConfigError if the value cannot be converted.
     """
 
     def __init__(self, kind: Any, convert: Callable[[Any, Path | None], Any]) -> None:
@@ -314,7 +291,7 @@ class ReadAs:
         self._convert = convert
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return the schema of the value in the file, with the conversion after it."""
+        """Return a schema that validates the value in the file and then converts the value."""
         converted = get_origin(source) or source
 
         def read(value: Any, inner: Callable[[Any], Any], info: ValidationInfo) -> Any:
@@ -326,12 +303,12 @@ class ReadAs:
 
 
 class WordOr:
-    """Annotation of a field that accepts words in addition to the values of a type.
+    """Annotation of a field that accepts certain words in addition to the values of a type.
 
     Parameters
     ----------
     words
-        Words with the values that they stand for.
+        Value of each word.
     kind
         Type of all other values.
     """
@@ -341,7 +318,7 @@ class WordOr:
         self._kind = kind
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return the schema of the type, with the words before it."""
+        """Return a schema that replaces a word by its value and validates any other value."""
 
         def read(value: Any, inner: Callable[[Any], Any], info: ValidationInfo) -> Any:
             if isinstance(value, str) and value in self._words:
@@ -352,14 +329,14 @@ class WordOr:
                 return inner(value)
             except ValidationError as error:
                 (first, *_) = error.errors(include_url=False)
-                if first["loc"]:  # an element is wrong, and its own message describes it
+                if first["loc"]:  # an item of a list is wrong, and the error describes the item
                     raise
                 raise ConfigError(self._describe(value, first)) from None
 
         return core_schema.with_info_wrap_validator_function(read, handler.generate_schema(self._kind))
 
     def _describe(self, value: object, error: ErrorDetails) -> str:
-        """Describe a value that is neither a word nor of the type."""
+        """Describe a value that is neither one of the words nor valid for the type."""
         cause = error.get("ctx", {}).get("error")
         text = str(cause) if isinstance(cause, ConfigError) else _describe(error)
         near = format_choices(str(value), tuple(self._words)).partition("are ")[2].split(", ")
@@ -370,7 +347,7 @@ class WordOr:
 
 
 def one_of(words: Sequence[str]) -> AfterValidator:
-    """Return a validator for a text that must be one of several words."""
+    """Return a validator that accepts only certain words."""
 
     def check(value: str) -> str:
         if value not in words:
@@ -381,7 +358,7 @@ def one_of(words: Sequence[str]) -> AfterValidator:
 
 
 def checked_by(check: Callable[[T], object]) -> AfterValidator:
-    """Return a validator that keeps the value, and that reports the ConfigError of a function."""
+    """Return a validator that calls ``check`` and returns the value unchanged. ``check`` may raise ConfigError."""
 
     def validate(value: T) -> T:
         check(value)
@@ -391,26 +368,26 @@ def checked_by(check: Callable[[T], object]) -> AfterValidator:
 
 
 def _existing_file(value: str, info: ValidationInfo) -> str:
-    """Return the path of a file that must exist."""
+    """Return the path of a file. Raise ConfigError if the file does not exist."""
     path = _beside(value, info)
-    if path is not None and not os.path.exists(path):  # False for a name that no file can have
+    if path is not None and not os.path.exists(path):  # unlike Path.exists, accepts an invalid name
         raise ConfigError(f"{path}: no such file")
     return value if path is None else str(path)
 
 
 def _file_or_name(value: str, info: ValidationInfo) -> str:
-    """Return the path of a file if it exists, otherwise the text."""
+    """Return the path of a file if the file exists, otherwise the unchanged text."""
     path = _beside(value, info)
     return value if path is None or not os.path.exists(path) else str(path)
 
 
 def _beside(value: str, info: ValidationInfo) -> Path | None:
-    """Return the path relative to the configuration file; None for an empty value or without a file."""
+    """Return the path in the folder of the configuration file; None if the value is empty or there is no folder."""
     folder = info.context.folder if info.context else None
     return folder / file_access.expand_user(value) if folder and value else None
 
 
 FilePath = Annotated[str, AfterValidator(_existing_file)]
-"""Path of an existing file. A relative path begins at the folder of the configuration file."""
+"""Path of an existing file. A relative path refers to the folder of the configuration file."""
 FileOrName = Annotated[str, AfterValidator(_file_or_name)]
-"""Path of a file beside the configuration file, or name of something that is shipped with the program."""
+"""Path of a file, or name of a file that is shipped with the program."""

@@ -1,9 +1,8 @@
 """Conversion factors from unit names to SI, for units in settings and CAN databases.
 
-Each table maps the spelling of a unit to the factor that converts a number in that unit to rad/s, m/s² or s. A
-temperature unit also has an offset. The spellings are those of data sheets, DBC files and plots. Upper and lower case
-are distinguished. Blanks around a name are ignored. An unknown name raises a ``ConfigError`` that lists all known
-names, beginning with the most similar name.
+Each table maps unit names to the factor that converts a number to rad/s, m/s² or s. A temperature unit also has an
+offset. The tables contain the names in data sheets, DBC files and plots. Names are case-sensitive, and blanks around a
+name are ignored. An unknown name raises a ``ConfigError`` that lists all known names, the most similar name first.
 """
 
 import math
@@ -37,7 +36,7 @@ RATE: Final[Mapping[str, float]] = {
     "deg/hr": DEGREE / HOUR_S,
     "°/h": DEGREE / HOUR_S,
 }
-"""Factor from each unit of angular rate to rad/s."""
+"""Factor that converts each unit of angular rate to rad/s."""
 
 ACCELERATION: Final[Mapping[str, float]] = {
     "m/s²": 1.0,
@@ -52,7 +51,7 @@ ACCELERATION: Final[Mapping[str, float]] = {
     "µg": 1e-6 * G0,
     "ug": 1e-6 * G0,
 }
-"""Factor from each unit of acceleration to m/s²."""
+"""Factor that converts each unit of acceleration to m/s²."""
 
 TEMPERATURE: Final[Mapping[str, tuple[float, float]]] = {
     "°C": (1.0, 0.0),
@@ -66,7 +65,7 @@ TEMPERATURE: Final[Mapping[str, tuple[float, float]]] = {
     "degF": (5.0 / 9.0, -160.0 / 9.0),
     "F": (5.0 / 9.0, -160.0 / 9.0),
 }
-"""Factor and offset of each unit of temperature: °C = factor · number + offset."""
+"""Factor and offset that convert each unit of temperature to °C: temperature = factor · number + offset."""
 
 TIME: Final[Mapping[str, float]] = {
     "s": 1.0,
@@ -76,13 +75,13 @@ TIME: Final[Mapping[str, float]] = {
     "us": 1e-6,
     "ns": 1e-9,
 }
-"""Factor from each unit of time to s."""
+"""Factor that converts each unit of time to s."""
 
 T = TypeVar("T")
 
 
 def rate_factor(unit: str) -> float:
-    """Return the factor from a unit of angular rate to rad/s. Raise ConfigError if the unit is unknown.
+    """Return the factor that converts a unit of angular rate to rad/s. Raise ConfigError if the unit is unknown.
 
     >>> round(rate_factor("deg/s"), 6)
     0.017453
@@ -91,7 +90,7 @@ def rate_factor(unit: str) -> float:
 
 
 def acceleration_factor(unit: str) -> float:
-    """Return the factor from a unit of acceleration to m/s². Raise ConfigError if the unit is unknown.
+    """Return the factor that converts a unit of acceleration to m/s². Raise ConfigError if the unit is unknown.
 
     >>> acceleration_factor("g")
     9.80665
@@ -100,9 +99,9 @@ def acceleration_factor(unit: str) -> float:
 
 
 def temperature_scale(unit: str) -> tuple[float, float]:
-    """Return factor and offset of a unit of temperature: °C = factor · number + offset.
+    """Return the factor and the offset that convert a unit of temperature to °C.
 
-    The function raises ConfigError if the unit is unknown.
+    The temperature in °C is factor · number + offset. The function raises ConfigError if the unit is unknown.
 
     >>> temperature_scale("K")
     (1.0, -273.15)
@@ -111,13 +110,13 @@ def temperature_scale(unit: str) -> tuple[float, float]:
 
 
 def time_factor(unit: str) -> float:
-    """Return the factor from a unit of time to s. Raise ConfigError if the unit is unknown."""
+    """Return the factor that converts a unit of time to s. Raise ConfigError if the unit is unknown."""
     return _look_up(TIME, unit, "time")
 
 
 def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
     """Return the entry of a unit. Raise ConfigError if the table does not contain the unit."""
-    # Unicode has two characters for the prefix micro, and keyboards produce both of them
+    # Unicode has two characters for the prefix micro, and both are in use
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     if name not in table:
         raise ConfigError(f'"{unit}" is not a unit of {quantity}{format_choices(name, tuple(table))}')

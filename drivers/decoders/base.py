@@ -5,8 +5,8 @@ A decoder module ``drivers/decoders/<protocol>.py`` defines ``Settings`` and ``b
 ``ConfigError`` with a line for each mistake that the model does not find. The line begins with the key:
 "signals.gx: ...".
 
-``feed`` never raises an exception for bad bytes. A frame that fails its check is left out and counted in ``bad``. The
-next block counts it in ``lost``, so that its place in time stays empty.
+``feed`` never raises an exception for bad bytes. A frame that fails its check is dropped and counted in ``bad``. The
+field ``lost`` of the next block includes the dropped frames, so that the sample clock leaves a gap for them.
 """
 
 from abc import ABC, abstractmethod
@@ -19,7 +19,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.sample import NO_TICK, Chunk, Floats, Ints, SampleBlock, Timing, make_block
-from drivers.settings_model import SettingsModel
 
 MAX_GYRO_RAD_S: Final = 1000.0
 """Largest plausible angular rate in rad/s. The widest range of MEMS gyroscopes is 4000 °/s, which is 70 rad/s."""
@@ -33,18 +32,14 @@ TEMPERATURE_LIMITS_C: Final = (-100.0, 300.0)
 Bytes = NDArray[np.uint8]
 
 
-class DecoderSettings(SettingsModel):
-    """Base class of the settings of decoders."""
-
-
 class Decoder(Protocol):
-    """Interface of a decoder of one wire format, which converts between bytes and ``SampleBlock``."""
+    """Interface of a decoder, which converts between the bytes of one wire format and ``SampleBlock`` objects."""
 
     carrier: ClassVar[str]  # see drivers.links.base.Carrier
 
     @property
     def timing(self) -> Timing:
-        """Timing information that the frames carry. The kind of timing does not change."""
+        """Source of the sample times in this wire format. The source does not change."""
 
     @property
     def bad(self) -> int:
@@ -52,16 +47,16 @@ class Decoder(Protocol):
 
     @property
     def recent_problem(self) -> str:
-        """Reason for rejected frames, for the status line; "" if no frame was rejected recently."""
+        """Description of a recent problem for the status, such as rejected frames; "" if there was no problem."""
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples that these chunks complete.
 
-        ``t_ns`` is the arrival time of the chunk that completed a sample.
+        ``t_ns`` of a sample is the arrival time of the chunk that completed the sample.
         """
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return the samples in the wire format as a device would send them. Counters are taken from ``ticks``."""
+        """Return the samples in the wire format, as a device would send them. Device counters are set to ``ticks``."""
 
     def reset(self) -> None:
         """Discard an incomplete frame, because the link was opened again."""
@@ -69,7 +64,7 @@ class Decoder(Protocol):
 
 @runtime_checkable
 class AddressFilter(Protocol):
-    """Interface of a decoder that reads only chunks with certain addresses."""
+    """Interface of a decoder that accepts only chunks with certain addresses."""
 
     @property
     def addresses(self) -> tuple[int, ...]:
@@ -78,42 +73,39 @@ class AddressFilter(Protocol):
 
 @runtime_checkable
 class LateFrameCountingDecoder(Protocol):
-    """Interface of a decoder that joins frames to samples, and distinguishes late frames from lost frames."""
+    """Interface of a decoder that assembles a sample from several frames and distinguishes late from lost frames."""
 
     @property
     def dropped_late_samples(self) -> int:
-        """Number of samples left out because some of their frames arrived too late.
-
-        These samples are not included in ``bad``.
-        """
+        """Number of samples dropped because some of their frames arrived too late. ``bad`` does not include them."""
 
     @property
     def late_frames_hint(self) -> str:
-        """Delay of the late frames and the remedy, for the status; "" if no frame has been late for a while."""
+        """Message with the delay of late frames and the remedy; "" if no frame has been late recently."""
 
 
 HINT_FRAMES: Final = 1000
-"""Number of good frames after a rejected frame until the hint about the rejected frame ends."""
+"""Number of good frames after which a rejected frame is no longer reported."""
 
 
 class RecentRejection:
-    """Reason for the last rejected frame, which is shown until HINT_FRAMES good frames have followed."""
+    """Reason for the last rejected frame. The reason is kept until HINT_FRAMES good frames have followed."""
 
     def __init__(self) -> None:
-        self._text = ""
+        self._reason = ""
         self._good_frames = HINT_FRAMES
 
     @property
     def rejection_reason(self) -> str:
         """Reason for the last rejected frame; "" if no frame was rejected recently."""
-        return self._text if self._good_frames < HINT_FRAMES else ""
+        return self._reason if self._good_frames < HINT_FRAMES else ""
 
-    def note_rejection(self, text: str) -> None:
+    def note_rejection(self, reason: str) -> None:
         """Store the reason for a rejected frame."""
-        self._text, self._good_frames = text, 0
+        self._reason, self._good_frames = reason, 0
 
     def count_good_frames(self, frames: int = 1) -> None:
-        """Count good frames."""
+        """Add frames to the number of good frames since the last rejected frame."""
         self._good_frames += frames
 
 
@@ -139,8 +131,8 @@ class BlockBuilder:
     ) -> list[SampleBlock]:
         """Return the plausible samples as blocks.
 
-        A sample with an infinite or implausible value is dropped and counted as missing. NaN means not measured and is
-        accepted unless all axes are NaN.
+        A sample with an infinite or implausible value is dropped and counted as missing. NaN marks an axis that is not
+        measured. A sample whose axes are all NaN is dropped as well.
 
         Parameters
         ----------
@@ -151,24 +143,23 @@ class BlockBuilder:
         temperature_c
             [n] float64 in °C. None if the format contains no temperature.
         ticks
-            [n] int64, counter of the device, NO_TICK for a frame without a counter. None if the format contains none.
+            [n] int64, counter of the device, NO_TICK for a frame without a counter. None if the format has no counter.
         bad_before
             [n] int64, number of frames that were rejected just before each sample. None if no frame was rejected.
         bad_after
-            Number of frames that were rejected after the last sample. The next call counts them before its first
-            sample.
+            Number of frames that were rejected after the last sample. The next block counts these frames as missing.
         """
         n = t_ns.size
         bad_before = np.zeros(n, np.int64) if bad_before is None else bad_before
         ticks = np.full(n, NO_TICK, np.int64) if ticks is None else ticks
         temperature_c = np.full(n, np.nan) if temperature_c is None else _valid_temperatures(temperature_c)
-        good = are_plausible(values)
+        good = _find_plausible(values)
         carried, self._missing = self._missing, bad_after
-        if n and good.all() and not bad_before.any():  # fast path for nearly all calls
+        if n and good.all() and not bad_before.any():  # the usual case
             self.bad += bad_after
             return [make_block(t_ns, values, temperature_c, ticks, carried)]
         kept = np.flatnonzero(good)
-        # number of frames and samples that have been dropped up to each sample
+        # number of rejected frames and implausible samples up to and including each sample
         dropped = np.cumsum(bad_before + ~good)
         total = int(dropped[-1]) if n else 0
         self.bad += total + bad_after
@@ -185,10 +176,10 @@ class BlockBuilder:
         ]
 
 
-def are_plausible(values: Floats) -> NDArray[np.bool_]:
+def _find_plausible(values: Floats) -> NDArray[np.bool_]:
     """Return a mask [n] of the plausible samples among ``values`` [n, 6].
 
-    A plausible sample has at least one measured axis. None of its values is infinite or above the range of a MEMS IMU.
+    A plausible sample has at least one measured axis, and every measured value is within the range of MEMS IMUs.
     """
     too_large: NDArray[np.bool_] = np.any(np.abs(values) > VALUE_LIMITS, axis=1)
     unmeasured: NDArray[np.bool_] = np.all(np.isnan(values), axis=1)
@@ -203,10 +194,10 @@ def _valid_temperatures(temperature_c: Floats) -> Floats:
 
 @dataclass(frozen=True, slots=True)
 class Frames:
-    """Frames that passed their check, in order of arrival."""
+    """Frames that passed the check of their format, in order of arrival."""
 
     data: list[bytes]
-    t_ns: Ints  # [n] arrival of the chunk that completed each frame
+    t_ns: Ints  # [n] arrival time of the chunk that completed each frame
     bad_before: Ints  # [n] number of frames rejected just before each frame
     adjacent: NDArray[np.bool_]  # [n] True if the frame follows the previous one without other bytes
     bad_after: int = 0  # number of frames rejected after the last frame
@@ -226,39 +217,45 @@ class Frames:
         bad_before = np.diff(rejected_at, prepend=0)
         return Frames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at], after)
 
-    def stack_bytes(self, rows: Sequence[int]) -> Bytes:
-        """Return the frames with these indices, which have the same length, as an array [n, length] of uint8."""
-        return np.frombuffer(b"".join([self.data[i] for i in rows]), np.uint8).reshape(len(rows), -1)
+    def stack_bytes(self, rows: Ints) -> Bytes:
+        """Return the bytes of frames of equal length as an array [n, length] of uint8."""
+        data = self.data if rows.size == len(self.data) else [self.data[i] for i in rows.tolist()]
+        return np.frombuffer(b"".join(data), np.uint8).reshape(rows.size, -1)
 
 
 NEED_MORE: Final = 0
-"""Result of a ``FrameMatcher`` if the buffer ends before the frame does."""
+"""Result of a ``FrameMatcher`` if the buffer contains only the beginning of the frame."""
 REJECT: Final = -1
 """Result of a ``FrameMatcher`` if the bytes at the offset are not a valid frame."""
 
 FrameMatcher = Callable[[bytes, int], int]
-"""Function of the buffer and the offset of a sync pattern that returns the length of the frame, NEED_MORE or REJECT."""
+"""Function that checks a candidate frame.
+
+The arguments are the received bytes and the offset of the candidate. The result is the length of the frame in bytes,
+NEED_MORE or REJECT.
+"""
 
 MAX_BYTES_WITHOUT_FRAME: Final = 2000
-"""Bytes without a valid frame after which a hint is given. Every supported frame is shorter."""
+"""Number of bytes without a valid frame after which a problem is reported. Every supported frame is shorter."""
 NO_OFFSET: Final = -(1 << 62)
-"""Offset far before every byte of the stream."""
+"""Offset in the stream that is smaller than the offset of any received byte."""
 
 
 class FrameBuffer:
-    """Buffer that finds the frames in a byte stream. The stream may be split anywhere, damaged, or begin anywhere.
+    """Buffer that finds the frames in a byte stream. Chunks may begin and end anywhere, and bytes may be damaged.
 
-    After a rejected candidate, the search continues one byte later in the same bytes, since a sync pattern may occur
-    inside a payload. The number of frames lost between two valid frames is the larger of two counts: rejected
-    candidates at least one frame length apart, and complete frames that fit between the valid frames. Bytes before the
-    first frame are not counted, because reading may begin inside a frame. At most ``longest`` bytes are kept between
-    calls of ``feed``.
+    A sync pattern may also occur inside a payload. After a rejected candidate, the search therefore continues one byte
+    later. The number of frames lost between two valid frames is estimated in two ways, and the larger estimate is used.
+    The first estimate is the number of rejected candidates that are at least one frame length apart. The second
+    estimate is the number of complete frames that fit between the two valid frames. Bytes before the first frame are
+    ignored, because reading may begin inside a frame. At most ``longest`` bytes are kept between calls of ``feed``.
 
     Parameters
     ----------
     sync
-        Fixed start of a frame; empty if a frame can start with any byte. ``match`` may narrow the attribute ``sync`` to
-        the first byte of all further frames. The attribute is widened again after MAX_BYTES_WITHOUT_FRAME bytes.
+        Fixed start of a frame; empty if a frame can start with any byte. ``match`` may set the attribute ``sync`` to
+        the first byte of a valid frame, so that only frames with this first byte are searched. The initial pattern is
+        restored after MAX_BYTES_WITHOUT_FRAME bytes without a valid frame.
     match
         Function that checks one candidate.
     longest
@@ -275,7 +272,7 @@ class FrameBuffer:
         self.reset()
 
     def reset(self) -> None:
-        """Discard the buffered bytes, the synchronization, and the narrowed ``sync``."""
+        """Discard the buffered bytes and the synchronization, and restore the initial ``sync``."""
         self.sync = self._initial_sync
         self._buffer_offset += len(self._buffer)
         self._buffer = b""
@@ -289,7 +286,7 @@ class FrameBuffer:
 
     @property
     def recent_problem(self) -> str:
-        """Reason for rejected or missing frames; "" if the stream is free of errors."""
+        """Reason for rejected or missing frames; "" if no frame was rejected recently."""
         if self._skipped_bytes >= MAX_BYTES_WITHOUT_FRAME:
             return f"{self._skipped_bytes} bytes without a valid frame: is the baud rate right, and the decoder?"
         return self._rejection.rejection_reason
@@ -336,7 +333,7 @@ class FrameBuffer:
                 self.sync = self._initial_sync
                 return self._examine_candidate(buffer, widen_at)
         if start < 0:
-            # the end of the buffer may be the first part of a sync pattern
+            # the buffer may end with the first part of a sync pattern
             start = max(at, len(buffer) - len(self.sync) + 1)
             self._skipped_bytes += start - at
             return start, NEED_MORE
@@ -347,7 +344,7 @@ class FrameBuffer:
         return start, length
 
     def _append_chunks(self, chunks: Sequence[Chunk]) -> bytes:
-        """Return the buffer with the data of these chunks, and note their arrival times."""
+        """Return the buffered bytes followed by the data of these chunks, and store the arrival times of the chunks."""
         end = self._buffer_offset + len(self._buffer)
         for chunk in chunks:
             if chunk.data:
@@ -356,14 +353,14 @@ class FrameBuffer:
         return b"".join((self._buffer, *[chunk.data for chunk in chunks]))
 
     def _count_rejected(self, at: int) -> None:
-        """Count a rejected candidate unless the previous rejected candidate is less than a frame length away."""
+        """Count a rejected candidate unless the previous rejected candidate is less than one frame length before it."""
         offset = self._buffer_offset + at
         if offset - self._last_rejected >= max(self._frame_length, 1):
             self._rejected += 1
             self._last_rejected = offset
 
     def _take_lost_frames(self) -> int:
-        """Return the number of frames lost since the last frame, and reset the counts."""
+        """Return the number of frames lost since the last valid frame, and start counting again."""
         fitting = round(self._skipped_bytes / self._frame_length) if self._frame_length else 0
         count = max(self._rejected, fitting) if self._synchronized else 0
         self._skipped_bytes = self._rejected = 0
@@ -381,27 +378,35 @@ class FrameBuffer:
         return arrived
 
 
-class FrameStreamDecoder(ABC):
-    """Common part of the decoders that find frames with a ``FrameBuffer`` in a byte stream.
+class RejectingDecoder:
+    """Base class of decoders that reject frames and implausible samples."""
 
-    A subclass defines ``encode``, ``timing`` and ``_decode``.
+    def __init__(self) -> None:
+        self._builder = BlockBuilder()
+        self._rejection = RecentRejection()
 
-    Parameters
-    ----------
-    buffer
-        Buffer that finds the frames.
+    @property
+    def bad(self) -> int:
+        """Number of rejected frames and implausible samples."""
+        return self._builder.bad
+
+    @property
+    def recent_problem(self) -> str:
+        """Reason for the last rejected frame; "" if no frame was rejected recently."""
+        return self._rejection.rejection_reason
+
+
+class FrameStreamDecoder(RejectingDecoder, ABC):
+    """Base class of decoders that find frames in a byte stream.
+
+    A subclass defines ``encode``, ``timing`` and ``_decode``. The parameters are those of ``FrameBuffer``.
     """
 
     carrier: ClassVar[str] = "bytes"
 
-    def __init__(self, buffer: FrameBuffer) -> None:
-        self._buffer = buffer
-        self._builder = BlockBuilder()
-
-    @property
-    def bad(self) -> int:
-        """Number of frames that failed their check, and of implausible samples."""
-        return self._builder.bad
+    def __init__(self, sync: bytes, match: FrameMatcher, longest: int) -> None:
+        super().__init__()
+        self._buffer = FrameBuffer(sync, match, longest)
 
     @property
     def recent_problem(self) -> str:
@@ -421,48 +426,53 @@ class FrameStreamDecoder(ABC):
     def _build_measured_blocks(
         self, frames: Frames, values: Floats, temperature_c: Floats, ticks: Ints
     ) -> tuple[list[SampleBlock], int | None]:
-        """Return the samples of the frames with at least one measured axis, and the index of the last such frame."""
+        """Return the samples with at least one measured axis, and the index of the frame with the last sample."""
         rows = np.flatnonzero(~np.isnan(values).all(axis=1))
-        kept = frames.select_frames(rows.tolist())
+        if rows.size < len(values):
+            frames = frames.select_frames(rows.tolist())
+            values, temperature_c, ticks = values[rows], temperature_c[rows], ticks[rows]
         blocks = self._builder.build_plausible_blocks(
-            kept.t_ns, values[rows], temperature_c[rows], ticks[rows], kept.bad_before, kept.bad_after
+            frames.t_ns, values, temperature_c, ticks, frames.bad_before, frames.bad_after
         )
         return blocks, int(rows[-1]) if rows.size else None
 
     @abstractmethod
     def _decode(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples of one or more frames."""
+        """Return the samples in one or more frames."""
 
 
 Key = TypeVar("Key", bound=Hashable)
 
 
-def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, list[int]]]:
-    """Yield each different key with the indices at which it occurs.
+def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, Ints]]:
+    """Yield each distinct key together with the indices [k] at which the key occurs.
 
     >>> list(group_indices("aba"))
-    [('a', [0, 2]), ('b', [1])]
+    [('a', array([0, 2])), ('b', array([1]))]
     """
-    groups: dict[Key, list[int]] = {}
-    for i, key in enumerate(keys):
-        groups.setdefault(key, []).append(i)
-    yield from groups.items()
+    distinct = {key: i for i, key in enumerate(dict.fromkeys(keys))}
+    if len(distinct) == 1:  # the usual case
+        yield keys[0], np.arange(len(keys))
+        return
+    groups = np.array([distinct[key] for key in keys])
+    for key, i in distinct.items():
+        yield key, np.flatnonzero(groups == i)
 
 
 def nan_to_infinity(values: Floats) -> Floats:
-    """Replace NaN by infinity, for formats in which every number sent is a measurement."""
+    """Replace NaN by infinity, so that ``BlockBuilder`` rejects a NaN that a device sends."""
     return np.where(np.isnan(values), np.inf, values)
 
 
 def quantize(values: Floats, step: float, bits: int) -> Ints:
-    """Return values as signed integers, rounded and clipped like the output of a sensor. NaN becomes 0.
+    """Convert values to signed integers, rounded and clipped like the output of a sensor. NaN becomes 0.
 
     Parameters
     ----------
     values
         float64 array in any unit.
     step
-        Value of one count, in the same unit.
+        Value of one least significant bit, in the unit of ``values``.
     bits
         Number of bits of the integers.
     """
@@ -471,24 +481,17 @@ def quantize(values: Floats, step: float, bits: int) -> Ints:
 
 
 def chunk_per_sample(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
-    """Return one chunk per sample.
-
-    Parameters
-    ----------
-    frames
-        Bytes of each sample.
-    t_ns
-        [n] int64, arrival times of the samples in ns.
-    """
+    """Return a chunk for each sample, with the encoded sample and the time ``t_ns`` [n]."""
     return [Chunk(data, t) for data, t in zip(frames, t_ns.tolist(), strict=True)]
 
 
 def xor_checksum(data: bytes) -> int:
-    """Return the exclusive or of all bytes. One long integer is folded in halves, which takes 1 µs for a sentence.
+    """Return the exclusive or of all bytes.
 
     >>> xor_checksum(b"VNRRG,8") == 0x4B
     True
     """
+    # combining the two halves of one long integer repeatedly is faster than a loop over the bytes
     bits = 8 << max(len(data) - 1, 0).bit_length()
     folded = int.from_bytes(data, "little")
     while bits > 8:

@@ -1,14 +1,18 @@
 """ROS 2 ``sensor_msgs/msg/Imu`` over zenoh (rmw_zenoh, zenoh-bridge-ros2dds), one message per sample.
 
-The payload is XCDR1 (OMG DDSI-RTPS 10.5). It begins with 4 bytes of encapsulation (``00 01`` little-endian, ``00 00``
-big-endian, two bytes of options). The following fields are aligned from byte 4: stamp.sec i32, stamp.nanosec u32,
-frame_id (u32 length with its NUL, bytes), padding to 8 bytes, then 37 float64. The 37 numbers are orientation x y z w,
-angular velocity x y z in rad/s and linear acceleration x y z in m/s², each followed by 9 covariances. covariance[0] =
--1 means that the quantity is not provided (sensor_msgs/Imu.msg). The stamp is the time of the sample. The message
-contains no temperature.
+The payload is XCDR1 (OMG DDSI-RTPS 10.5). The first 4 bytes are the encapsulation: ``00 01`` for little-endian or
+``00 00`` for big-endian, and two bytes of options. The following fields are aligned from byte 4:
+
+- stamp.sec (i32) and stamp.nanosec (u32), the time of the sample;
+- frame_id (u32 length including the final NUL, then the characters), and padding to 8 bytes;
+- 37 float64: orientation x y z w, angular velocity x y z in rad/s and linear acceleration x y z in m/s², each followed
+  by 9 covariances.
+
+If the first covariance of a quantity is -1, the message does not provide the quantity (sensor_msgs/Imu.msg). The
+message contains no temperature.
 
 The attachment of rmw_zenoh exists in two layouts: labelled (77 bytes) and bare (33 bytes). Both layouts contain the
-identifier of the publisher and a sequence number i64, by which lost messages are counted. The attachment is optional.
+identifier of the publisher and a sequence number (i64), which reveals lost messages. The attachment is optional.
 """
 
 import struct
@@ -18,9 +22,10 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RecentRejection
+from drivers.decoders.base import Decoder, RejectingDecoder
 from drivers.errors import DecodeError
 from drivers.sample import NO_TICK, Chunk, Floats, SampleBlock, SenderTimedFormat, Timing
+from drivers.settings_model import SettingsModel
 
 HEADER_BYTES: Final = 4
 DOUBLES: Final = 37
@@ -34,37 +39,37 @@ MAX_FRAME_ID_BYTES: Final = 1024
 FRAME_ID: Final = b"imu_link\0"
 """frame_id that ``encode`` writes (REP 145)."""
 SEQUENCE_OFFSETS: Final = {77: 16, 33: 0}
-"""Offset of the sequence number by the length of the attachment. In the labelled layout, the string "sequence_number"
-with its length byte precedes the number.
+"""Offset of the sequence number, by the length of the attachment in bytes.
+
+In the labelled layout, the string "sequence_number" with its length byte precedes the number.
 """
 MAX_GAP_MESSAGES: Final = 1_000_000_000
-"""Largest gap in messages, eleven days at 1 kHz. A larger jump indicates that the counter was restarted."""
+"""Largest number of lost messages, eleven days at 1 kHz. A larger step means that the publisher was restarted."""
 GID_BYTES: Final = 16  # the last bytes of both layouts
 BYTE_ORDERS: Final = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
 
-class Settings(DecoderSettings):
-    """Settings of the decoder. There are no keys, since the message contains everything."""
+class Settings(SettingsModel):
+    """Settings of the decoder, which has no options."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Message:
-    """Parsed payload with its numbers still as bytes."""
+    """Time, numbers and byte order of one message."""
 
     t_ns: int
     body: bytes  # 37 float64
     little: bool
 
 
-class Ros2ImuDecoder:
-    """Decoder and encoder of CDR messages."""
+class Ros2ImuDecoder(RejectingDecoder):
+    """Decoder and encoder of ``sensor_msgs/msg/Imu`` messages."""
 
     carrier: ClassVar[str] = "messages"
 
     def __init__(self) -> None:
+        super().__init__()
         self.timing: Timing = SenderTimedFormat()
-        self._rejection = RecentRejection()
-        self._builder = BlockBuilder()
         self._lost_in_builder = 0  # lost messages that the builder has counted as bad
         self._lost = 0  # messages lost before the next message
         self._sequence: int | None = None
@@ -76,19 +81,14 @@ class Ros2ImuDecoder:
         """Number of rejected messages and of implausible samples."""
         return self._builder.bad - self._lost_in_builder
 
-    @property
-    def recent_problem(self) -> str:
-        """Reason for the last rejected message, while it is recent."""
-        return self._rejection.rejection_reason
-
     def reset(self) -> None:
-        """Start the count of lost messages again. There are no incomplete messages."""
+        """Forget the last sequence number, so that the next message reveals no loss."""
         self._sequence = None
         self._lost = 0
         self._builder.forget_rejected_frames()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return one sample per message at its own time stamp. ``ticks`` is the sequence number of the publisher."""
+        """Return one sample per message. ``t_ns`` is the time stamp of the message, ``ticks`` the sequence number."""
         messages: list[_Message] = []
         ticks: list[int] = []
         missing: list[int] = []
@@ -115,10 +115,7 @@ class Ros2ImuDecoder:
         )
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return little-endian messages with the bare attachment.
-
-        The sequence number is taken from ``ticks`` if available.
-        """
+        """Return little-endian messages with the bare attachment. The sequence number is ``ticks`` if available."""
         chunks = []
         for t_ns, values, tick in zip(samples.t_ns, samples.values, samples.ticks, strict=True):
             self._encoded = self._encoded + 1 if tick == NO_TICK else int(tick)
@@ -127,7 +124,7 @@ class Ros2ImuDecoder:
         return chunks
 
     def _read_sequence(self, attachment: bytes) -> int:
-        """Return the sequence number of a message, and count the messages missing before it."""
+        """Return the sequence number of a message, and count the messages that were lost before this message."""
         at = SEQUENCE_OFFSETS.get(len(attachment))
         if at is None:
             return NO_TICK
@@ -141,7 +138,7 @@ class Ros2ImuDecoder:
 
 
 def _parse_message(data: bytes) -> _Message:
-    """Find the numbers in a payload. Raise ``DecodeError`` if it is not an Imu message."""
+    """Parse a payload. Raise ``DecodeError`` if the payload is not an Imu message."""
     end = BYTE_ORDERS.get(data[:2])
     if end is None:
         raise DecodeError("no XCDR1 message: the encapsulation is not 00 00 or 00 01")
@@ -157,7 +154,7 @@ def _parse_message(data: bytes) -> _Message:
 
 
 def _read_values(messages: Sequence[_Message]) -> Floats:
-    """Return values [n, 6] in rad/s and m/s²; NaN if the message states that a quantity is not provided."""
+    """Return values [n, 6] in rad/s and m/s²; NaN for a quantity that the message does not provide."""
     raw = np.frombuffer(b"".join(m.body for m in messages), "<f8").reshape(-1, DOUBLES).astype(np.float64)
     big = np.array([not m.little for m in messages], bool)
     raw[big] = raw[big].byteswap()
@@ -168,7 +165,7 @@ def _read_values(messages: Sequence[_Message]) -> Floats:
 
 
 def _encode_payload(t_ns: int, values: Floats) -> bytes:
-    """Return the payload of a message with these values [6]."""
+    """Return a payload with the time and the values [6] of one sample."""
     body = np.zeros(DOUBLES)
     body[3] = 1.0  # orientation w
     body[4] = NOT_PROVIDED

@@ -8,15 +8,16 @@ zeros to a multiple of four bytes. Sources: vortexntnu/stim300-driver, the frame
 data sheet TS1524 tables 5-21 to 5-23 as restated by public drivers.
 
 The datagram contains neither the range of the accelerometer nor the output units, so both must be configured. An
-"increment" is the change of angle or velocity during one sample. ``rate`` is needed to convert an increment to a rate.
-Integrated outputs are not supported. The counter runs with the internal 2000 Hz sampling. This has not been confirmed
-on a device. The counter would then step by 4 at 500 Hz.
+"increment" is the change of angle or velocity during one sample. The sample rate converts an increment to an angular
+rate or an acceleration. Integrated outputs are not supported. The decoder assumes that the counter advances at the
+internal sampling rate of 2000 Hz, so that the counter advances by 4 per sample at 500 Hz. The assumption has not been
+tested with a device.
 
-The status byte of gyro and accelerometer marks a sample as bad if it reports a system integrity error (bit 7), start-up
-(6), overload (4) or a channel error (3). The values of such a sample are wrong or unsettled. A sample outside the
-operating conditions (5) is accepted, because the sensor still measures, for example in a climate chamber beyond the
-stated range. The temperature is the mean of the three sensors of the gyro. If the status of these sensors shows an
-error, the temperature is not measured.
+The gyroscopes and the accelerometers have a status byte. A sample is bad if a status byte reports a system integrity
+error (bit 7), start-up (bit 6), overload (bit 4) or a channel error (bit 3). Bit 5 reports operation outside the
+specified conditions, for example in a climate chamber. The sensor still measures under such conditions, so the sample
+is accepted. The temperature is the mean of the three temperature sensors of the gyroscopes. The temperature is marked
+as not measured if the status byte of these sensors reports an error.
 """
 
 import zlib
@@ -26,34 +27,23 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.decoders.base import (
-    NEED_MORE,
-    REJECT,
-    Bytes,
-    Decoder,
-    DecoderSettings,
-    FrameBuffer,
-    Frames,
-    FrameStreamDecoder,
-    chunk_per_sample,
-    group_indices,
-    quantize,
-)
+from drivers.decoders import base
 from drivers.errors import ConfigError
 from drivers.number_ranges import RATE_HZ
 from drivers.sample import Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
-from drivers.settings_model import Conflict, WordOr, checked_by
+from drivers.settings_model import Conflict, SettingsModel, WordOr, checked_by
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
-# The order is that of the part bits. F0 to F7 contain PPS instead of aux. 97 is A7 of hardware up to revision C.
+# The position of an identifier in each list is the bit mask of its parts. The datagrams F0 to F7 contain PPS (pulse per
+# second) in place of the auxiliary input. Hardware up to revision C sends 97 in place of A7.
 IDENTIFIERS: Final = {
     **dict(zip((0x90, 0x91, 0x92, 0x93, 0x94, 0xA5, 0xA6, 0xA7), range(8), strict=True)),
     **dict(zip((0x98, 0x99, 0x9A, 0x9B, 0x9C, 0xAD, 0xAE, 0xAF), range(8, 16), strict=True)),
     **dict(zip(range(0xF0, 0xF8), range(8, 16), strict=True)),
     0x97: 7,
 }
-"""Bit mask of the parts in addition to the gyro, by identifier."""
+"""Bit mask of the parts that follow the gyroscope part, by identifier."""
 
 
 def _datagram_size(parts: int) -> int:
@@ -68,9 +58,9 @@ SIZES: Final = {identifier: _datagram_size(parts) for identifier, parts in IDENT
 LONGEST: Final = max(SIZES.values())
 
 ACCEL_BITS: Final = {"2g": 21, "5g": 20, "10g": 19, "30g": 18, "80g": 16}
-"""Exponent of the resolution by accelerometer range. The least significant bit is 2**-bits g.
+"""Exponent of the resolution by accelerometer range.
 
-The least significant bit of an increment is 2**-(bits + 3) m/s.
+The least significant bit is 2**-bits g for an acceleration, and 2**-(bits + 3) m/s for an increment.
 """
 ERROR_BITS: Final = 0x80 | 0x40 | 0x10 | 0x08
 START_UP: Final = 0x40
@@ -78,7 +68,7 @@ CHANNEL_ERROR: Final = 0x08
 
 _BITS = np.arange(256, dtype=np.uint8)[:, None] >> np.arange(8, dtype=np.uint8) & 1
 BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
-"""Each byte with its bits in reverse order, for conversions between the CRC and the reflected CRC of zlib."""
+"""Translation table that reverses the bits of each byte. The CRC of zlib is reflected, the CRC of a datagram is not."""
 
 
 def _check_identifier(identifier: int) -> None:
@@ -88,7 +78,7 @@ def _check_identifier(identifier: int) -> None:
         raise ConfigError(f"{identifier}; possible are {known}")
 
 
-class Settings(DecoderSettings):
+class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]``."""
 
     accelerometer_range: Literal["2g", "5g", "10g", "30g", "80g"] = Field(
@@ -114,12 +104,12 @@ class Settings(DecoderSettings):
             yield Conflict("rate", 'missing; an output of "increment" needs the sample rate in Hz')
 
 
-class Stim300Decoder(FrameStreamDecoder):
+class Stim300Decoder(base.FrameStreamDecoder):
     """Decoder and encoder of STIM300 datagrams."""
 
     def __init__(self, settings: Settings) -> None:
         wanted = b"" if settings.identifier == "auto" else bytes([settings.identifier])
-        super().__init__(FrameBuffer(wanted, self._match_datagram, LONGEST))
+        super().__init__(wanted, self._match_datagram, LONGEST)
         self._settings = settings
         self.timing: Timing = CounterTimedFormat(256, 1.0 / 2000.0)
         rate = settings.rate or 1.0
@@ -131,27 +121,27 @@ class Stim300Decoder(FrameStreamDecoder):
 
     @property
     def recent_problem(self) -> str:
-        """Meaning of the status byte, or reason for rejected datagrams."""
+        """Error that the sensor reports, or reason for rejected datagrams; "" if there is no problem."""
         if self._status & START_UP:
             return "the sensor is starting up"
         if self._status:
             return f"the sensor reports an error: status 0x{self._status:02X}"
         return super().recent_problem
 
-    def _decode(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples of these datagrams. The sensor may have switched to another identifier among them."""
+    def _decode(self, frames: base.Frames) -> list[SampleBlock]:
+        """Return the samples of these datagrams, whose identifiers may differ."""
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
         ticks = np.empty(n, np.int64)
-        for identifier, rows in group_indices([frame[0] for frame in frames.data]):
+        for identifier, rows in base.group_indices([frame[0] for frame in frames.data]):
             data = frames.stack_bytes(rows)
             values[rows], temperature_c[rows] = self._read_measurements(data, IDENTIFIERS[identifier])
             ticks[rows] = data[:, -7]
         return self._builder.build_plausible_blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
 
-    def _read_measurements(self, data: Bytes, parts: int) -> tuple[Floats, Floats]:
-        """Return values [n, 6], infinite where the status byte shows an error, and temperatures [n] in °C."""
+    def _read_measurements(self, data: base.Bytes, parts: int) -> tuple[Floats, Floats]:
+        """Return values [n, 6] and temperatures [n] in °C. Values are infinite if a status byte reports an error."""
         values = np.full((len(data), 6), np.nan)
         values[:, :3] = _read_int24(data, 1) * self._gyro_step
         status = data[:, 10]
@@ -170,22 +160,22 @@ class Stim300Decoder(FrameStreamDecoder):
     def _match_datagram(self, buffer: bytes, at: int) -> int:
         """Return the length of a datagram (see ``drivers.decoders.base.FrameMatcher``)."""
         if at >= len(buffer):
-            return NEED_MORE
+            return base.NEED_MORE
         length = SIZES.get(buffer[at])
         if length is None:
-            return REJECT
+            return base.REJECT
         if len(buffer) < at + length:
-            return NEED_MORE
+            return base.NEED_MORE
         if not has_valid_crc(buffer[at : at + length]):
-            return REJECT
+            return base.REJECT
         self._buffer.sync = buffer[at : at + 1]
         return length
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return datagrams with the configured identifier.
 
-        With auto, they contain acceleration, and temperature if there is any. A row with an unmeasured axis has the
-        channel error set.
+        If the identifier is "auto", the datagrams contain accelerations, and temperatures if the block has any. The
+        status byte reports a channel error if an axis is not measured.
         """
         identifier = self._settings.identifier
         if identifier == "auto":
@@ -198,30 +188,30 @@ class Stim300Decoder(FrameStreamDecoder):
             _write_int24(data, 11, samples.values[:, 3:], self._accel_step)
         if parts & TEMPERATURE_PART:
             at = _temperature_offset(parts)
-            raw = quantize(samples.temperature_c, 2**-8, 16).astype(">i2")
+            raw = base.quantize(samples.temperature_c, 2**-8, 16).astype(">i2")
             data[:, at : at + 6] = np.repeat(raw[:, None], 3, axis=1).view(np.uint8)
             data[:, at + 6] = np.where(np.isnan(samples.temperature_c), CHANNEL_ERROR, 0)
         data[:, -3] = samples.ticks & 0xFF
         tail = b"\r\n" if self._settings.crlf else b""
-        return chunk_per_sample([row + datagram_crc(row) + tail for row in map(bytes, data)], samples.t_ns)
+        return base.chunk_per_sample([row + datagram_crc(row) + tail for row in map(bytes, data)], samples.t_ns)
 
 
 def _temperature_offset(parts: int) -> int:
-    """Return the offset of the temperatures of the gyro."""
+    """Return the offset of the gyroscope temperatures in a datagram."""
     return 1 + 10 * (1 + (parts & (ACCEL_PART | INCL_PART)).bit_count())
 
 
-def _read_int24(data: Bytes, at: int) -> Ints:
-    """Return three signed 24-bit big-endian integers [n, 3] of each datagram, beginning at the offset ``at``."""
+def _read_int24(data: base.Bytes, at: int) -> Ints:
+    """Return the three signed 24-bit big-endian integers [n, 3] at the offset ``at`` of each datagram."""
     wide = np.zeros((len(data), 3, 4), np.uint8)
     wide[:, :, :3] = data[:, at : at + 9].reshape(-1, 3, 3)
     raised: Ints = wide.view(">i4")[:, :, 0].astype(np.int64) >> 8
     return raised
 
 
-def _write_int24(data: Bytes, at: int, values: Floats, step: float) -> None:
-    """Write three values and their status byte at the offset ``at`` of each datagram."""
-    raw = quantize(values, step, 24).astype(">i4").reshape(-1, 3, 1).view(np.uint8)
+def _write_int24(data: base.Bytes, at: int, values: Floats, step: float) -> None:
+    """Write three values [n, 3] and a status byte at the offset ``at`` of each datagram."""
+    raw = base.quantize(values, step, 24).astype(">i4").reshape(-1, 3, 1).view(np.uint8)
     data[:, at : at + 9] = raw[:, :, 1:].reshape(-1, 9)
     data[:, at + 9] = np.where(np.isnan(values).any(axis=1), CHANNEL_ERROR, 0)
 
@@ -238,11 +228,11 @@ def has_valid_crc(frame: bytes) -> bool:
 
 
 def _reflected_crc(mirrored: bytes) -> int:
-    """Return the CRC with reversed bits of a datagram whose bytes have reversed bits."""
-    # reversed zeros are zeros, so the padding can be appended after the reversal
+    """Return the reflected CRC of a datagram after the bits of each byte have been reversed."""
+    # the padding consists of zeros, which the reversal does not change
     return zlib.crc32(bytes(-len(mirrored) % 4), zlib.crc32(mirrored)) ^ 0xFFFFFFFF
 
 
-def build(settings: Settings) -> Decoder:
+def build(settings: Settings) -> base.Decoder:
     """Return a decoder with these settings."""
     return Stim300Decoder(settings)

@@ -1,15 +1,17 @@
-"""Text lines of numbers, as printed by boards of the Arduino class.
+"""Text lines of numbers, as printed by Arduino boards and similar microcontrollers.
 
 The format has no standard. ``columns`` names the content of each column, and the numbers are converted from the
-configured units to SI. A line ends in LF, CR or both. With ``delimiter = "auto"``, fields are separated by commas,
-semicolons or tabs. In a line without these characters, fields are separated by blanks. An empty field or ``nan`` is not
-measured. Empty lines and lines that begin with the comment prefix are skipped. A line with another number of columns,
-or with a field that is not a number, is bad. With ``nmea`` a line is ``$fields*CC``, where CC is the exclusive or of
-the characters between ``$`` and ``*``. A line with a wrong CC is bad.
+configured units to SI. A line ends in LF, CR or CR LF. With ``delimiter = "auto"``, fields are separated by commas,
+semicolons or tabs. If a line contains none of these characters, fields are separated by blanks. An empty field or
+``nan`` means that the value was not measured. Empty lines and lines that begin with the comment prefix are skipped. A
+line is rejected if it has the wrong number of columns, or if a field is not a number. With ``nmea = true`` a line is
+``$fields*CC``, where the checksum CC is the exclusive or of the characters between ``$`` and ``*`` in two hexadecimal
+digits. A line with a wrong checksum is rejected.
 
-The first line after the link was opened has usually lost its beginning. Without its beginning, ``-0.012`` reads as
-``12``. The first line is therefore left out without being counted as bad, unless its checksum is correct or
-``first_line = "keep"``. For this reason ``encode`` puts a line end before the first line of a block.
+The first line that arrives after the link was opened is often incomplete. If the first characters of ``-0.012`` are
+missing, the field reads as ``12``. The first line is therefore skipped without being counted as bad. A first line with
+a correct checksum is used, and ``first_line = "keep"`` keeps any first line. ``encode`` puts a line end before the
+first line of a block, so that only an empty line is skipped.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,37 +21,30 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from drivers import units
-from drivers.decoders.base import (
-    BlockBuilder,
-    Decoder,
-    DecoderSettings,
-    RecentRejection,
-    chunk_per_sample,
-    xor_checksum,
-)
+from drivers.decoders import base
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError
 from drivers.number_ranges import COUNTER_MODULUS, HEADER_LINES, SCALE
 from drivers.sample import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
-from drivers.settings_model import ListOf, checked_by, one_of
+from drivers.settings_model import ListOf, SettingsModel, checked_by, one_of
 
 MAX_LINE_BYTES: Final = 4096
-"""Maximum length of a line in bytes. Longer text without a line end is dropped as noise."""
+"""Maximum length of a line in bytes. Longer text without a line end is discarded."""
 OVERLONG_LINE: Final = b"\0"
-"""Replacement for an overlong line. The replacement is a bad line, since it is not a number."""
+"""Replacement for an overlong line. The replacement is not a number, so the line is rejected."""
 OVERLONG_HINT: Final = f"more than {MAX_LINE_BYTES} bytes without a line end: is the baud rate right?"
 SKIP: Final = "-"
 COLUMNS: Final = (*AXES, "temperature", "t", "counter", SKIP)
 TICK_S: Final = 1e-9
-"""Length of a tick in s. The ``t`` column is converted to ticks of 1 ns."""
+"""Length of a tick in s. The column ``t`` is converted to ticks of 1 ns."""
 DEVICE_WRAP: Final = 1 << 32
-"""Counts after which ``millis()`` and ``micros()`` of small boards start again at 0."""
+"""Number of counts after which ``millis()`` and ``micros()`` of small boards start again at 0."""
 UNWRAPPED_TICKS: Final = 1 << 62
-"""Modulus in ticks for a clock that does not wrap. It corresponds to 146 years."""
+"""Modulus in ticks for a clock that does not wrap. The modulus corresponds to 146 years."""
 
 
 def _check_columns(columns: tuple[str, ...]) -> None:
-    """Raise ConfigError with a line for each mistake in the columns."""
+    """Raise ConfigError if the columns contain mistakes. The error has one line for each mistake."""
     given = [name for name in columns if name != SKIP]
     wrong = [f'unknown column "{name}"{format_choices(name, COLUMNS)}' for name in given if name not in COLUMNS]
     if len(given) != len(set(given)):
@@ -63,7 +58,7 @@ def _check_columns(columns: tuple[str, ...]) -> None:
 
 
 def _unit(look_up: Callable[[str], object], axis: str) -> AfterValidator:
-    """Return a validator of a unit, whose message also says how raw counts are converted."""
+    """Return a validator for a unit. The error message also explains how raw counts are converted."""
 
     def check(unit: str) -> None:
         try:
@@ -76,12 +71,12 @@ def _unit(look_up: Callable[[str], object], axis: str) -> AfterValidator:
 
 
 def _check_delimiter(delimiter: str) -> None:
-    """Raise ConfigError if a text cannot separate the fields of a line."""
+    """Raise ConfigError if the text cannot separate the fields of a line."""
     if not delimiter or not delimiter.isascii() or set(delimiter) & set("\r\n"):
         raise ConfigError(f"{delimiter!r}; it is auto, or ASCII text within a line")
 
 
-class Settings(DecoderSettings):
+class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]``."""
 
     columns: Annotated[ListOf[str], checked_by(_check_columns)] = Field(
@@ -118,12 +113,13 @@ class Settings(DecoderSettings):
     )
 
 
-class TextDecoder:
+class TextDecoder(base.RejectingDecoder):
     """Decoder and encoder of lines of numbers."""
 
     carrier: ClassVar[str] = "bytes"
 
     def __init__(self, settings: Settings) -> None:
+        super().__init__()
         self._settings = settings
         self._column = {name: i for i, name in enumerate(settings.columns) if name != SKIP}
         self._wanted = frozenset(self._column.values())
@@ -132,22 +128,10 @@ class TextDecoder:
         self.timing: Timing = _timing(settings)
         self._comment = settings.comment.encode()
         self._delimiter = settings.delimiter.encode()
-        self._builder = BlockBuilder()
-        self._rejection = RecentRejection()
         self.reset()
 
-    @property
-    def bad(self) -> int:
-        """Number of unreadable lines and implausible samples."""
-        return self._builder.bad
-
-    @property
-    def recent_problem(self) -> str:
-        """Description of the last bad line, while it is recent."""
-        return self._rejection.rejection_reason
-
     def reset(self) -> None:
-        """Discard an incomplete line. The next line is a first line again."""
+        """Discard an incomplete line. The next line may be incomplete, as after opening the link."""
         self._rest = b""
         self._overlong = False
         self._first_line_ended = False  # True if the end of the first line has arrived
@@ -168,7 +152,7 @@ class TextDecoder:
         return self._build_blocks(table, np.array(t_ns, np.int64)[counted])
 
     def _split_lines(self, data: bytes) -> list[bytes]:
-        """Return the lines that these bytes complete, stripped of line ends and blanks. Empty lines are left out."""
+        """Return the lines that these bytes complete, without line ends and surrounding blanks. Omit empty lines."""
         *lines, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
         if lines and self._overlong:
             lines[0], self._overlong = OVERLONG_LINE, False
@@ -183,19 +167,19 @@ class TextDecoder:
         return [line for line in lines if line]
 
     def _first_is_whole(self, line: bytes) -> bool:
-        """Return True if the first line is used. An unused first line does not count as bad."""
+        """Return True if the first line after opening the link is known to be complete or is kept by the settings."""
         if self._settings.header:
-            return True  # the line is skipped with the rest of the header
+            return True  # the first line belongs to the header, which is skipped later
         if self._settings.nmea:
             return _nmea_body(line) is not None
         return self._settings.first_line == "keep" and self._parse_line(line)[0] is not None
 
     def _parse_data_lines(self, lines: list[bytes]) -> tuple[Floats, list[int]]:
-        """Return the numbers [n, columns] of all lines that are not skipped, and the indices of the lines.
+        """Return the numbers [n, columns] of all lines that are not skipped, and the indices of these lines.
 
-        The numbers of a bad line are infinite.
+        The numbers of a rejected line are infinite.
         """
-        bodies: list[bytes | None] = []  # None: the checksum is wrong
+        bodies: list[bytes | None] = []  # None stands for a line with a wrong checksum
         counted: list[int] = []
         comment, header = self._comment, self._settings.header
         for i, line in enumerate(lines):
@@ -209,7 +193,7 @@ class TextDecoder:
         return self._parse_lines(bodies), counted
 
     def _parse_lines(self, bodies: list[bytes | None]) -> Floats:
-        """Return an array [n, columns]. Regular lines are parsed together. Other lines are parsed one by one."""
+        """Return the numbers [n, columns]. All lines are parsed together if they are regular, otherwise one by one."""
         table = self._parse_regular_lines(bodies)
         if table is not None:
             self._rejection.count_good_frames(len(bodies))
@@ -225,7 +209,7 @@ class TextDecoder:
         return np.array(rows).reshape(-1, self._width)
 
     def _parse_regular_lines(self, bodies: list[bytes | None]) -> Floats | None:
-        """Return an array [n, columns] if every line has all its fields and all are numbers, otherwise None."""
+        """Return the numbers [n, columns], or None if a line has missing fields or a field is not a number."""
         separated = [self._comma_separated(body) for body in bodies if body is not None]
         joined = b",".join(separated)
         regular = all(body.count(b",") == self._width - 1 for body in separated)
@@ -241,7 +225,7 @@ class TextDecoder:
         return table
 
     def _comma_separated(self, body: bytes) -> bytes:
-        """Return the line with commas between the fields."""
+        """Return the line with a comma between two fields."""
         if self._delimiter == b"auto":
             body = body.replace(b";", b",").replace(b"\t", b",")
             return body if b"," in body else b",".join(body.split())
@@ -250,7 +234,7 @@ class TextDecoder:
         return body.replace(b",", b"?").replace(self._delimiter, b",") if self._delimiter != b"," else body
 
     def _parse_line(self, body: bytes) -> tuple[list[float] | None, str]:
-        """Return the numbers of one line, or None and the reason."""
+        """Return the numbers of one line and an empty text, or None and the reason for rejecting the line."""
         if body == OVERLONG_LINE:
             return None, OVERLONG_HINT
         fields = self._comma_separated(body).split(b",")
@@ -262,10 +246,10 @@ class TextDecoder:
             return None, f"a field is not a number: {body[:60]!r}"
 
     def _build_blocks(self, table: Floats, t_ns: Ints) -> list[SampleBlock]:
-        """Convert a table of numbers to blocks of samples in SI units."""
+        """Convert the numbers [n, columns] to blocks of samples in SI units."""
         n = len(table)
         bad = np.isinf(table).any(axis=1)
-        with np.errstate(over="ignore", invalid="ignore"):  # an overflow is also implausible for a sensor
+        with np.errstate(over="ignore", invalid="ignore"):  # an overflow gives an implausible value
             scaled = table * self._factor + self._offset
         values = np.full((n, 6), np.nan)
         for axis, name in enumerate(AXES):
@@ -275,7 +259,7 @@ class TextDecoder:
         ticks = None
         if isinstance(self.timing, CounterTimedFormat):
             counts = scaled[:, self._column["t" if "t" in self._column else "counter"]]
-            bad |= ~(np.abs(counts) < float(UNWRAPPED_TICKS))  # missing or implausible clock value
+            bad |= ~(np.abs(counts) < float(UNWRAPPED_TICKS))  # the clock value is missing or implausible
             ticks = np.rint(np.where(bad, 0.0, counts)).astype(np.int64) % self.timing.modulus
         values[bad] = np.inf
         return self._builder.build_plausible_blocks(t_ns, values, temperature_c, ticks)
@@ -299,31 +283,31 @@ class TextDecoder:
             for row in table.tolist()
         ]
         if self._settings.nmea:
-            bodies = [b"$%b*%02X" % (body, xor_checksum(body)) for body in bodies]
+            bodies = [b"$%b*%02X" % (body, base.xor_checksum(body)) for body in bodies]
         lines = [body + b"\r\n" for body in bodies]
-        return chunk_per_sample([b"\r\n" + lines[0], *lines[1:]], samples.t_ns)
+        return base.chunk_per_sample([b"\r\n" + lines[0], *lines[1:]], samples.t_ns)
 
 
 def _parse_number(field: bytes) -> float:
-    """Return a number, or NaN for an empty field. Raise ValueError for text."""
+    """Return the number in a field, or NaN for an empty field. Raise ValueError for any other text."""
     field = field.strip()
-    if b"_" in field:  # Python accepts underscores in numbers, but no device sends them
+    if b"_" in field:  # Python accepts underscores in numbers
         raise ValueError(field)
     return float(field) if field else np.nan
 
 
 def _nmea_body(line: bytes) -> bytes | None:
-    """Return the text between $ and * if its checksum is correct, otherwise None."""
+    """Return the text between $ and * if the checksum is correct, otherwise None."""
     start, star = line.rfind(b"$") + 1, line.rfind(b"*")
     body, stated = line[start:star], line[star + 1 :]
     try:
-        return body if 0 < start <= star and len(stated) == 2 and int(stated, 16) == xor_checksum(body) else None
+        return body if 0 < start <= star and len(stated) == 2 and int(stated, 16) == base.xor_checksum(body) else None
     except ValueError:
         return None
 
 
 def _scales(settings: Settings) -> tuple[Floats, Floats]:
-    """Return factor and offset of each column for the conversion to SI, and of ``t`` to ticks."""
+    """Return the factor and the offset that convert each column to SI units, or the column ``t`` to ticks."""
     factors, offsets = np.ones(len(settings.columns)), np.zeros(len(settings.columns))
     for i, name in enumerate(settings.columns):
         factor, offset = 1.0, 0.0
@@ -340,7 +324,7 @@ def _scales(settings: Settings) -> tuple[Floats, Floats]:
 
 
 def _timing(settings: Settings) -> Timing:
-    """Return the timing according to the columns."""
+    """Return the source of the sample times according to the columns."""
     if "t" in settings.columns:
         unit_ticks = round(units.time_factor(settings.time_unit) / TICK_S)
         wraps = settings.time_unit in ("ms", "us")
@@ -348,6 +332,6 @@ def _timing(settings: Settings) -> Timing:
     return CounterTimedFormat(settings.counter_modulus) if "counter" in settings.columns else ArrivalTimedFormat()
 
 
-def build(settings: Settings) -> Decoder:
+def build(settings: Settings) -> base.Decoder:
     """Return a decoder with these settings."""
     return TextDecoder(settings)

@@ -1,16 +1,16 @@
 r"""VectorNav VN-100/200/300 ASCII sentences ``$VNIMU`` and ``$VNYMR``.
 
-A sentence is ``$VNxxx,f1,f2,...*CC\r\n``. CC is the exclusive or of the characters between ``$`` and ``*`` in two hex
-digits. Four digits are a CRC-16 of the same characters with the polynomial 0x1021 and the initial value 0. ``*XX`` ("do
-not check") is only for the host. A device always computes its checksum, so ``*XX`` is rejected here. A line end that
-was converted to LF is accepted. Other sentences with a correct checksum are ignored (VN-100 user manual UM001 v2.1,
-pages 27-43).
+A sentence is ``$VNxxx,f1,f2,...*CC\r\n``. The checksum CC covers the characters between ``$`` and ``*``. A checksum of
+two hexadecimal digits is the exclusive or of the characters. A checksum of four digits is a CRC-16 with the polynomial
+0x1021 and the initial value 0. Only a host may send ``*XX`` ("do not check"), so a received ``*XX`` is rejected. A
+sentence may end in LF alone. Other sentences with a correct checksum are ignored (VN-100 user manual UM001 v2.1, pages
+27-43).
 
-``$VNIMU`` contains the magnetic field [Gauss], acceleration [m/s²], rate [rad/s], temperature [°C] and pressure [kPa]
-as measured. ``$VNYMR`` contains yaw, pitch, roll [°], magnetic field, acceleration and rate, all compensated. Its bias
-instability and random walk are the residuals of the on-board filter and do not describe the sensor. Data that may be
-appended to a sentence (a count or time of synchronization) are ignored. The printed resolution is 0.001 m/s² and 1e-6
-rad/s, so quantization is visible in the Allan deviation. Binary messages have a finer resolution.
+``$VNIMU`` contains the measured magnetic field [Gauss], acceleration [m/s²], angular rate [rad/s], temperature [°C] and
+pressure [kPa]. ``$VNYMR`` contains yaw, pitch, roll [°], and the magnetic field, acceleration and angular rate after
+compensation by the on-board filter. The bias instability and random walk of ``$VNYMR`` are residuals of this filter and
+do not describe the sensor. A synchronization count or time at the end of a sentence is ignored. The printed resolution
+is 0.001 m/s² and 1e-6 rad/s, so the Allan deviation shows quantization noise. Binary messages have a finer resolution.
 """
 
 import binascii
@@ -19,35 +19,25 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.decoders.base import (
-    NEED_MORE,
-    REJECT,
-    Decoder,
-    DecoderSettings,
-    FrameBuffer,
-    Frames,
-    FrameStreamDecoder,
-    chunk_per_sample,
-    nan_to_infinity,
-    xor_checksum,
-)
+from drivers.decoders import base
 from drivers.sample import ArrivalTimedFormat, Chunk, Floats, SampleBlock, Timing
+from drivers.settings_model import SettingsModel
 
 LONGEST: Final = 256
-"""Maximum length of a sentence in bytes. The longest sentence of the manual is under 200."""
+"""Maximum length of a sentence in bytes. The longest sentence in the manual has fewer than 200 bytes."""
 
 COLUMNS: Final = {
     b"$VNIMU,": ((6, 7, 8, 3, 4, 5), 11, 9),
     b"$VNYMR,": ((9, 10, 11, 6, 7, 8), 12, None),
 }
-"""Columns of gx gy gz ax ay az in each sentence, number of columns, and column of the temperature."""
+"""Columns of gx gy gz ax ay az, number of columns, and column of the temperature, by sentence."""
 MAX_UNWANTED_SENTENCES: Final = 100
-"""Number of consecutive unwanted sentences after which a hint is given."""
+"""Number of consecutive unwanted sentences after which a problem is reported."""
 GYRO: Final = "{:+010.6f}"  # rad/s
 ACCEL: Final = "{:+07.3f}"  # m/s²
 
 
-class Settings(DecoderSettings):
+class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]``."""
 
     sentence: Literal["auto", "VNIMU", "VNYMR"] = Field(
@@ -55,11 +45,11 @@ class Settings(DecoderSettings):
     )
 
 
-class VectornavAsciiDecoder(FrameStreamDecoder):
+class VectornavAsciiDecoder(base.FrameStreamDecoder):
     """Decoder and encoder of VectorNav sentences."""
 
     def __init__(self, settings: Settings) -> None:
-        super().__init__(FrameBuffer(b"$VN", _match_sentence, LONGEST))
+        super().__init__(b"$VN", _match_sentence, LONGEST)
         self.timing: Timing = ArrivalTimedFormat()
         self._wanted = b"" if settings.sentence == "auto" else f"${settings.sentence},".encode()
         self._sentence = self._wanted
@@ -67,18 +57,18 @@ class VectornavAsciiDecoder(FrameStreamDecoder):
 
     @property
     def recent_problem(self) -> str:
-        """Reason for missing samples or rejected sentences."""
+        """Reason for missing samples or rejected sentences; "" if there is no problem."""
         if self._unwanted_sentences > MAX_UNWANTED_SENTENCES:
             return "sentences arrive, but none of the wanted kind: set the sensor's async output to VNIMU"
         return super().recent_problem
 
     def reset(self) -> None:
-        """Discard an incomplete sentence, and with auto the selected sentence."""
+        """Discard an incomplete sentence. If the setting ``sentence`` is "auto", select the sentence again."""
         super().reset()
         self._sentence = self._wanted
 
-    def _decode(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples of the sentences of the wanted kind."""
+    def _decode(self, frames: base.Frames) -> list[SampleBlock]:
+        """Return the samples in the sentences of the selected kind."""
         if not self._sentence:
             self._sentence = next((f[:7] for f in frames.data if f[:7] in COLUMNS), b"")
         wanted = self._sentence or b"none yet"
@@ -88,16 +78,13 @@ class VectornavAsciiDecoder(FrameStreamDecoder):
         axes, width, temperature = COLUMNS.get(self._sentence, COLUMNS[b"$VNIMU,"])
         table = _parse_numbers([f[7 : f.rindex(b"*")] for f in frames.data], width)
         temperature_c = None if temperature is None else table[:, temperature]
-        values = nan_to_infinity(table[:, axes])
+        values = base.nan_to_infinity(table[:, axes])
         return self._builder.build_plausible_blocks(
             frames.t_ns, values, temperature_c, None, frames.bad_before, frames.bad_after
         )
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return sentences as the device prints them: VNYMR if it is configured, otherwise VNIMU.
-
-        Unknown values are 0.
-        """
+        """Return VNYMR sentences if the settings name them, otherwise VNIMU. A missing temperature is sent as 0."""
         imu = self._wanted != b"$VNYMR,"
         frames = []
         temperatures = np.nan_to_num(samples.temperature_c).tolist()
@@ -109,12 +96,12 @@ class VectornavAsciiDecoder(FrameStreamDecoder):
             else:
                 parts = ["VNYMR", *["+000.000"] * 3, *magnetic, *parts]
             body = ",".join(parts).encode()
-            frames.append(b"$%b*%02X\r\n" % (body, xor_checksum(body)))
-        return chunk_per_sample(frames, samples.t_ns)
+            frames.append(b"$%b*%02X\r\n" % (body, base.xor_checksum(body)))
+        return base.chunk_per_sample(frames, samples.t_ns)
 
 
 def _parse_numbers(bodies: list[bytes], width: int) -> Floats:
-    """Return the first ``width`` numbers of each sentence as an array. A sentence with other text gives infinities."""
+    """Return the first ``width`` numbers of each sentence; infinities for a sentence with other text."""
     split = [body.split(b",", width)[:width] for body in bodies]
     try:
         return np.array([[float(field) for field in fields] for fields in split]).reshape(len(bodies), width)
@@ -123,7 +110,7 @@ def _parse_numbers(bodies: list[bytes], width: int) -> Floats:
 
 
 def _parse_fields(fields: list[bytes], width: int) -> list[float]:
-    """Return the numbers of one sentence; infinities if a field is other text or the number of fields is wrong."""
+    """Return the numbers of one sentence; infinities if a field is missing or not a number."""
     try:
         row = [float(field) for field in fields]
     except ValueError:
@@ -135,17 +122,17 @@ def _match_sentence(buffer: bytes, at: int) -> int:
     """Return the length of a sentence (see ``drivers.decoders.base.FrameMatcher``)."""
     end = buffer.find(b"\n", at, at + LONGEST) + 1
     if not end:
-        return NEED_MORE
+        return base.NEED_MORE
     star = buffer.rfind(b"*", at, end)
     if star < 0:
-        return REJECT
+        return base.REJECT
     body = buffer[at + 1 : star]
     stated = buffer[star + 1 : end - 1].removesuffix(b"\r")
     if len(stated) == 2:
-        return end - at if b"%02X" % xor_checksum(body) == stated else REJECT
-    return end - at if b"%04X" % binascii.crc_hqx(body, 0) == stated else REJECT
+        return end - at if b"%02X" % base.xor_checksum(body) == stated else base.REJECT
+    return end - at if b"%04X" % binascii.crc_hqx(body, 0) == stated else base.REJECT
 
 
-def build(settings: Settings) -> Decoder:
+def build(settings: Settings) -> base.Decoder:
     """Return a decoder with these settings."""
     return VectornavAsciiDecoder(settings)

@@ -2,15 +2,16 @@
 
 The format is ``FA | groups u8 | a field mask u16le for each group | payload little-endian | CRC u16be``. The masks
 state which fields follow, in the order of groups and bits. Messages of groups 1, 2, 3 and 5 are decoded. Messages of
-other groups are rejected, since the sizes of their fields are not known to the decoder. The CRC-16 has the polynomial
-0x1021 and the initial value 0, and covers all bytes after 0xFA. The CRC of these bytes followed by the CRC field is 0
-(VN-100 user manual UM001 v2.1, pages 27-43).
+other groups are rejected, since the decoder does not know the sizes of their fields. The CRC-16 has the polynomial
+0x1021 and the initial value 0, and covers all bytes after 0xFA. The CRC of a valid message, including the CRC field, is
+0 (VN-100 user manual UM001 v2.1, pages 27-43).
 
-For noise analysis, TimeStartup and Imu of group 1 are recommended (``FA 01 01 02``, 38 bytes). Imu and the Uncomp
-fields are the values of the sensor. From AngularRate and Accel, the on-board filter has removed its bias estimate,
-which hides bias instability and random walk. If a message contains both kinds of fields, ``compensated`` selects one
-kind. A message with only accelerations or only rates leaves the other axes unmeasured. A message without accelerations
-and rates is ignored. VectorNav's z axis points down and measures -9.8 m/s² at rest.
+For noise analysis, the fields TimeStartup and Imu of group 1 are recommended (``FA 01 01 02``, 38 bytes). The fields
+Imu, UncompGyro and UncompAccel contain the measured values. The fields AngularRate and Accel contain the values after
+the on-board filter has subtracted its bias estimate. The subtraction hides bias instability and random walk. If a
+message contains both kinds of fields, ``compensated`` selects one kind. If a message contains only accelerations or
+only angular rates, the other axes are marked as not measured. A message without accelerations and angular rates is
+ignored. The z axis of VectorNav sensors points down and measures -9.8 m/s² at rest.
 """
 
 import binascii
@@ -22,19 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from drivers.decoders.base import (
-    NEED_MORE,
-    REJECT,
-    Decoder,
-    DecoderSettings,
-    FrameBuffer,
-    Frames,
-    FrameStreamDecoder,
-    chunk_per_sample,
-    group_indices,
-    nan_to_infinity,
-)
+from drivers.decoders import base
 from drivers.sample import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, SampleBlock, Timing
+from drivers.settings_model import SettingsModel
 
 FIELD_SIZES: Final = {
     1: (8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8),
@@ -42,10 +33,10 @@ FIELD_SIZES: Final = {
     3: (2, 12, 12, 12, 4, 4, 16, 12, 12, 12, 12),
     5: (2, 12, 16, 36, 12, 12, 12, 12, 12, 12, 28),
 }
-"""Size of each field in bytes, by group and bit."""
+"""Sizes of the fields in bytes, by group and in the order of the mask bits."""
 LONGEST: Final = 1 + 1 + 2 * len(FIELD_SIZES) + sum(map(sum, FIELD_SIZES.values())) + 2
 
-# (group, bit, offset inside the field), in order of preference
+# each entry is (group, bit, offset inside the field), in the order of preference
 TIME: Final = ((1, 0, 0), (2, 0, 0))
 UNCOMPENSATED_GYRO: Final = ((1, 9, 12), (3, 3, 0))
 UNCOMPENSATED_ACCEL: Final = ((1, 9, 0), (3, 2, 0))
@@ -54,13 +45,13 @@ COMPENSATED_ACCEL: Final = ((1, 8, 0), (3, 9, 0))
 TEMPERATURE: Final = ((1, 10, 12), (3, 4, 0))
 
 TICKS: Final = 1 << 62
-"""Modulus of the time in ticks.
+"""Modulus of the device time in ticks of 1 ns.
 
-TimeStartup is an unsigned 64-bit count of ns. 62 bits last 146 years and fit into int64.
+TimeStartup is an unsigned 64-bit integer. Its lowest 62 bits fit into int64 and wrap after 146 years.
 """
 
 
-class Settings(DecoderSettings):
+class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]``."""
 
     compensated: bool = Field(
@@ -76,15 +67,15 @@ def find_layout(header: bytes, compensated: bool) -> np.dtype[np.void] | None:
     Parameters
     ----------
     header
-        Group byte and masks.
+        Group byte and field masks.
     compensated
         True if compensated fields are preferred.
 
     Returns
     -------
     dtype or None
-        Type of a complete message, with the fields time, gyro, accel and temperature if the message contains them. None
-        if the header contains unknown groups or fields.
+        Structured type of a complete message. The fields are time, gyro, accel and temperature, as far as the message
+        contains them. None if the header contains unknown groups or fields.
     """
     groups = [g for g in range(1, 9) if header[0] >> (g - 1) & 1]
     masks = struct.unpack(f"<{len(groups)}H", header[1:])
@@ -102,7 +93,7 @@ def find_layout(header: bytes, compensated: bool) -> np.dtype[np.void] | None:
 
 
 def _build_layout(offsets: dict[tuple[int, int], int], length: int, compensated: bool) -> np.dtype[np.void]:
-    """Return the layout of messages with fields (group, bit) at these offsets."""
+    """Return the layout of messages of ``length`` bytes. ``offsets`` maps (group, bit) to the offset of the field."""
     order = -1 if compensated else 1
     gyro = (UNCOMPENSATED_GYRO, COMPENSATED_GYRO)[::order]
     accel = (UNCOMPENSATED_ACCEL, COMPENSATED_ACCEL)[::order]
@@ -123,19 +114,20 @@ def _build_layout(offsets: dict[tuple[int, int], int], length: int, compensated:
 
 
 def _header_end(groups: int) -> int:
-    """Return the offset after the masks; 0 if there is no group, or a second group byte."""
+    """Return the offset of the payload; 0 for an invalid or unsupported group byte."""
+    # bit 7 announces a second group byte, which is not supported
     return 0 if groups == 0 or groups & 0x80 else 2 + 2 * groups.bit_count()
 
 
 HEADER_END: Final = tuple(map(_header_end, range(256)))
-"""Offset after the masks for each group byte."""
+"""Offset of the payload by group byte; 0 for an invalid or unsupported group byte."""
 
 
-class VectornavBinaryDecoder(FrameStreamDecoder):
+class VectornavBinaryDecoder(base.FrameStreamDecoder):
     """Decoder and encoder of VectorNav binary messages."""
 
     def __init__(self, settings: Settings) -> None:
-        super().__init__(FrameBuffer(b"\xfa", self._match_message, LONGEST))
+        super().__init__(b"\xfa", self._match_message, LONGEST)
         self._compensated = settings.compensated
         self._uses_device_time = settings.clock == "time_startup"
         self.timing: Timing = CounterTimedFormat(TICKS, 1e-9) if self._uses_device_time else ArrivalTimedFormat()
@@ -143,26 +135,26 @@ class VectornavBinaryDecoder(FrameStreamDecoder):
 
     @property
     def recent_problem(self) -> str:
-        """Remedy for messages that are rejected or contain no time."""
+        """Reason for rejected messages, or message about a missing time; "" if there is no problem."""
         if self._time_missing:
             return 'messages contain no TimeStartup: enable it in the sensor, or set clock = "arrival"'
         return super().recent_problem
 
-    def _decode(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples of the messages with rates or accelerations."""
+    def _decode(self, frames: base.Frames) -> list[SampleBlock]:
+        """Return the samples in the messages with angular rates or accelerations."""
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
-        for header, rows in group_indices([f[1 : HEADER_END[f[1]]] for f in frames.data]):
+        for header, rows in base.group_indices([f[1 : HEADER_END[f[1]]] for f in frames.data]):
             layout = find_layout(header, self._compensated)
             assert layout is not None, "the buffer accepts only messages with a known layout"
             messages = frames.stack_bytes(rows).view(layout)[:, 0]
             fields = layout.names or ()
             if "gyro" in fields:
-                values[rows, :3] = nan_to_infinity(_as_float64(messages["gyro"]))
+                values[rows, :3] = base.nan_to_infinity(_as_float64(messages["gyro"]))
             if "accel" in fields:
-                values[rows, 3:] = nan_to_infinity(_as_float64(messages["accel"]))
+                values[rows, 3:] = base.nan_to_infinity(_as_float64(messages["accel"]))
             if "temperature" in fields:
                 temperature_c[rows] = _as_float64(messages["temperature"])
             if "time" in fields and self._uses_device_time:
@@ -175,22 +167,22 @@ class VectornavBinaryDecoder(FrameStreamDecoder):
     def _match_message(self, buffer: bytes, at: int) -> int:
         """Return the length of a message (see ``drivers.decoders.base.FrameMatcher``)."""
         if len(buffer) < at + 2:
-            return NEED_MORE
+            return base.NEED_MORE
         header_end = HEADER_END[buffer[at + 1]]
         if not header_end:
-            return REJECT
+            return base.REJECT
         if len(buffer) < at + header_end:
-            return NEED_MORE
+            return base.NEED_MORE
         layout = find_layout(buffer[at + 1 : at + header_end], self._compensated)
         if layout is None:
-            return REJECT
+            return base.REJECT
         length = layout.itemsize
         if len(buffer) < at + length:
-            return NEED_MORE
-        return REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
+            return base.NEED_MORE
+        return base.REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return messages with TimeStartup and Imu of group 1, and with MagPres if the block has temperatures."""
+        """Return messages with TimeStartup and Imu of group 1. If the block has temperatures, add MagPres."""
         has_temperature = bool(np.isfinite(samples.temperature_c).any())
         header = bytes.fromhex("01 01 06" if has_temperature else "01 01 02")
         layout = find_layout(header, compensated=False)
@@ -202,15 +194,15 @@ class VectornavBinaryDecoder(FrameStreamDecoder):
             rows["temperature"] = samples.temperature_c
         inner = [header + row.tobytes()[1 + len(header) : -2] for row in rows]
         frames = [b"\xfa" + part + binascii.crc_hqx(part, 0).to_bytes(2, "big") for part in inner]
-        return chunk_per_sample(frames, samples.t_ns)
+        return base.chunk_per_sample(frames, samples.t_ns)
 
 
 def _as_float64(numbers: NDArray[np.float32]) -> Floats:
     """Convert numbers to float64."""
-    with np.errstate(invalid="ignore"):  # a signalling NaN is treated as NaN
+    with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
         return numbers.astype(np.float64)
 
 
-def build(settings: Settings) -> Decoder:
+def build(settings: Settings) -> base.Decoder:
     """Return a decoder with these settings."""
     return VectornavBinaryDecoder(settings)

@@ -1,16 +1,17 @@
 """WitMotion WT901, JY61 and BWT61 over UART, and the combined packet of the Bluetooth models.
 
 UART packets have 11 bytes: ``55 | type | 8 bytes | SUM``. SUM is the low byte of the sum of the ten bytes before it.
-Type 0x51 contains acceleration xyz and temperature, type 0x52 rates xyz, as i16 little-endian with a full scale of
-32768. One sample is a 0x51 packet directly followed by a 0x52 packet. A packet without its partner is dropped. There is
-no counter. The temperature is taken from 0x51, since the fourth word of 0x52 is not a temperature on every model (WT901
-data sheet v20-0702, section 5.1). The manual uses g = 9.8 m/s²; here it is 9.80665 m/s².
+Type 0x51 contains the accelerations xyz and the temperature, type 0x52 the angular rates xyz. The numbers are i16
+little-endian with a full scale of 32768. One sample is a 0x51 packet directly followed by a 0x52 packet. A 0x51 or 0x52
+packet without its partner is dropped. There is no counter. The temperature is taken from 0x51, since the fourth word of
+0x52 is not a temperature on every model (WT901 data sheet v20-0702, section 5.1). The decoder uses g = 9.80665 m/s²,
+while the manual uses 9.8 m/s².
 
-A damaged packet of another type (angles, magnetic field) costs no sample. The number of samples lost in a gap is
-therefore derived from the number of packets between two samples.
+If a packet of another type (angles, magnetic field) is damaged, no sample is lost. The number of lost samples in a gap
+is therefore derived from the number of packets between two samples.
 
-Bluetooth packets have 20 bytes without a checksum: ``55 61 | a xyz | w xyz | angles``. A packet is accepted only when
-the header of the next packet follows it. Samples are therefore delayed by one packet.
+Bluetooth packets have 20 bytes without a checksum: ``55 61 | a xyz | w xyz | angles``. A packet is accepted only if it
+is followed by the header of the next packet. Samples are therefore delayed by one packet.
 """
 
 from typing import Annotated, Final, Literal
@@ -18,20 +19,10 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.decoders.base import (
-    NEED_MORE,
-    REJECT,
-    Bytes,
-    Decoder,
-    DecoderSettings,
-    FrameBuffer,
-    Frames,
-    FrameStreamDecoder,
-    chunk_per_sample,
-    quantize,
-)
+from drivers.decoders import base
 from drivers.number_ranges import FULL_SCALE
 from drivers.sample import ArrivalTimedFormat, Chunk, Floats, Ints, SampleBlock, Timing
+from drivers.settings_model import SettingsModel
 from drivers.units import DEGREE, G0
 
 ACCEL, RATE = 0x51, 0x52
@@ -39,16 +30,15 @@ TYPES: Final = range(0x50, 0x60)
 UART_LENGTH: Final = 11
 BLUETOOTH_LENGTH: Final = 20
 HEADERS: Final = (b"\x55\x61", b"\x55\x71")
-"""Headers of the Bluetooth models: a sample, and the answer to a register read."""
+"""Headers of Bluetooth packets: of a sample, and of the answer to a register read."""
 MIN_PACKETS_PER_SAMPLE: Final = 2
-"""Minimum number of packets per sample."""
 CYCLE_SAMPLES: Final = 8
-"""Number of recent samples that determine the packets per sample.
+"""Number of recent samples whose minimum number of packets is the number of packets per sample.
 
-The sample with the fewest packets counts, since packets of other types are sent only occasionally.
+The minimum is used, since a device may send packets of other types only occasionally.
 """
 MAX_UNPAIRED_PACKETS: Final = 100
-"""Number of consecutive packets without a pair after which a hint is given."""
+"""Number of consecutive packets without a pair after which a problem is reported."""
 TEMPERATURE: Final = {"wt901": (1.0 / 100.0, 0.0), "jy61": (1.0 / 340.0, 36.53)}
 """Step and offset of the temperature by model family: °C = raw · step + offset.
 
@@ -56,7 +46,7 @@ Sources: WT901 data sheet v20-0702, BWT61CL data sheet v20-0630.
 """
 
 
-class Settings(DecoderSettings):
+class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]``."""
 
     packet: Literal["uart", "bluetooth"] = Field(
@@ -69,20 +59,20 @@ class Settings(DecoderSettings):
     gyro_range: Annotated[float, FULL_SCALE] = Field(2000.0, description="full scale of the gyroscope in °/s")
 
 
-class WitmotionDecoder(FrameStreamDecoder):
+class WitmotionDecoder(base.FrameStreamDecoder):
     """Decoder and encoder of WitMotion packets."""
 
     def __init__(self, settings: Settings) -> None:
         self._bluetooth = settings.packet == "bluetooth"
         if self._bluetooth:
-            super().__init__(FrameBuffer(b"\x55", _match_bluetooth, BLUETOOTH_LENGTH + 2))
+            super().__init__(b"\x55", _match_bluetooth, BLUETOOTH_LENGTH + 2)
         else:
-            super().__init__(FrameBuffer(b"\x55", _match_uart, UART_LENGTH))
+            super().__init__(b"\x55", _match_uart, UART_LENGTH)
         self.timing: Timing = ArrivalTimedFormat()
         self._accel_step = settings.accelerometer_range * G0 / 2**15
         self._gyro_step = settings.gyro_range * DEGREE / 2**15
         self._temperature_step, self._temperature_offset = TEMPERATURE[settings.temperature]
-        self._harmless_rejects = 0  # number of rejected packets that cost no sample
+        self._harmless_rejects = 0  # number of rejected packets that did not belong to a lost sample
         self._pairs = PairFinder()
 
     @property
@@ -92,7 +82,7 @@ class WitmotionDecoder(FrameStreamDecoder):
 
     @property
     def recent_problem(self) -> str:
-        """Reason for missing samples or rejected packets."""
+        """Reason for missing samples or rejected packets; "" if there is no problem."""
         if self._pairs.unpaired > MAX_UNPAIRED_PACKETS:
             return "packets arrive, but no 0x51 directly followed by 0x52: enable both outputs in the sensor"
         return super().recent_problem
@@ -102,19 +92,19 @@ class WitmotionDecoder(FrameStreamDecoder):
         super().reset()
         self._pairs = PairFinder()
 
-    def _decode(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples of these packets."""
+    def _decode(self, frames: base.Frames) -> list[SampleBlock]:
+        """Return the samples in these packets."""
         return self._decode_bluetooth(frames) if self._bluetooth else self._decode_uart(frames)
 
-    def _decode_bluetooth(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples of Bluetooth packets."""
+    def _decode_bluetooth(self, frames: base.Frames) -> list[SampleBlock]:
+        """Return the samples in Bluetooth packets."""
         kept = frames.select_frames([i for i, f in enumerate(frames.data) if f[1] == HEADERS[0][1]])
         words = np.frombuffer(b"".join(kept.data), "<i2").reshape(-1, BLUETOOTH_LENGTH // 2)
         values = self._to_si(words[:, 4:7], words[:, 1:4])
         return self._builder.build_plausible_blocks(kept.t_ns, values, None, None, kept.bad_before, kept.bad_after)
 
-    def _decode_uart(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples of pairs of UART packets."""
+    def _decode_uart(self, frames: base.Frames) -> list[SampleBlock]:
+        """Return the samples in pairs of UART packets."""
         at, packets, missing, harmless = self._pairs.find_pairs(frames)
         self._harmless_rejects += harmless
         words = np.ascontiguousarray(packets[:, :, 2:10]).view("<i2")  # [n, 0x51 and 0x52, 4]
@@ -127,18 +117,15 @@ class WitmotionDecoder(FrameStreamDecoder):
         return np.hstack([gyro * self._gyro_step, accel * self._accel_step])
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return both packets of each sample in one chunk.
-
-        The format cannot mark unmeasured values, so they are sent as 0.
-        """
+        """Return one chunk per sample. The format cannot mark missing values, so a missing value is sent as 0."""
         n = len(samples)
-        gyro = quantize(samples.values[:, :3], self._gyro_step, 16)
-        accel = quantize(samples.values[:, 3:], self._accel_step, 16)
+        gyro = base.quantize(samples.values[:, :3], self._gyro_step, 16)
+        accel = base.quantize(samples.values[:, 3:], self._accel_step, 16)
         if self._bluetooth:
             words = np.hstack([accel, gyro, np.zeros((n, 3), np.int64)]).astype("<i2")
-            return chunk_per_sample([HEADERS[0] + row.tobytes() for row in words], samples.t_ns)
+            return base.chunk_per_sample([HEADERS[0] + row.tobytes() for row in words], samples.t_ns)
         excess = samples.temperature_c - self._temperature_offset
-        temperature = quantize(excess, self._temperature_step, 16)[:, None]
+        temperature = base.quantize(excess, self._temperature_step, 16)[:, None]
         frames = [
             encode_packet(ACCEL, first.tobytes()) + encode_packet(RATE, second.tobytes())
             for first, second in zip(
@@ -147,7 +134,7 @@ class WitmotionDecoder(FrameStreamDecoder):
                 strict=True,
             )
         ]
-        return chunk_per_sample(frames, samples.t_ns)
+        return base.chunk_per_sample(frames, samples.t_ns)
 
 
 class PairFinder:
@@ -156,21 +143,31 @@ class PairFinder:
     def __init__(self) -> None:
         self.unpaired = 0  # number of packets since the last pair
         self._last = bytes(UART_LENGTH)  # last packet of the previous call
-        self._elapsed = 0  # packets since the end of the last pair, including rejected packets
-        self._rejected = 0  # number of rejected packets since the end of the last pair, and of separated pairs
+        self._elapsed = 0  # number of packets since the last pair, including rejected packets
+        self._rejected = 0  # number of rejected packets and separated pairs since the last pair
         self._recent_cycles: list[int] = []  # packets per sample of the last samples without a rejected packet
         self._first = True
 
-    def find_pairs(self, frames: Frames) -> tuple[Ints, Bytes, Ints, int]:
-        """Return the index of the 0x52 packet of each pair [n], the packets of each pair [n, 2, 11], the number of
-        samples missing before each pair [n], and the number of rejected packets that cost no sample.
+    def find_pairs(self, frames: base.Frames) -> tuple[Ints, base.Bytes, Ints, int]:
+        """Find the pairs in the received packets.
+
+        Returns
+        -------
+        indices : array of int64, shape (n,)
+            Index of the 0x52 packet of each pair.
+        packets : array of uint8, shape (n, 2, 11)
+            Both packets of each pair.
+        missing : array of int64, shape (n,)
+            Number of samples missing before each pair.
+        harmless : int
+            Number of rejected packets that did not belong to a missing sample.
         """
         joined = np.frombuffer(self._last + b"".join(frames.data), np.uint8).reshape(-1, UART_LENGTH)
         self._last = frames.data[-1]
         kinds = joined[:, 1]
         in_order = (kinds[:-1] == ACCEL) & (kinds[1:] == RATE)
         at = np.flatnonzero(in_order & frames.adjacent)
-        # the bytes between both packets may be the remains of many lost packets, so the pair may not be one sample
+        # the bytes between the two packets may be the rest of many lost packets, so the pair may not be one sample
         separated = in_order & ~frames.adjacent & (frames.bad_before == 0)
         elapsed = self._elapsed + np.cumsum(1 + frames.bad_before)
         rejected = self._rejected + np.cumsum(frames.bad_before + separated)
@@ -183,9 +180,10 @@ class PairFinder:
         return at, np.stack([joined[at], joined[at + 1]], axis=1), missing, harmless
 
     def _count_missing(self, steps: Ints, holes: Ints) -> tuple[Ints, int]:
-        """Return the samples missing before each pair [n], and the number of rejected packets that cost no sample.
+        """Return the number of samples missing before each pair [n], and the number of harmless rejected packets.
 
-        ``steps`` are the packets since the previous pair [n], ``holes`` the rejected packets among them [n].
+        ``steps`` [n] is the number of packets since the previous pair, ``holes`` [n] the number of rejected packets
+        since the previous pair.
         """
         if not steps.size:
             return steps, 0
@@ -194,7 +192,8 @@ class PairFinder:
         usual = [*self._recent_cycles, *steps[whole].tolist()]
         known = len(self._recent_cycles) + np.cumsum(whole)
         missing = np.zeros(steps.size, np.int64)
-        for row in np.flatnonzero(holes).tolist():  # earlier samples only: independent of the chunks
+        # only earlier samples are used, so that the result does not depend on the division into chunks
+        for row in np.flatnonzero(holes).tolist():
             cycle = min(usual[max(known[row] - CYCLE_SAMPLES, 0) : known[row]], default=MIN_PACKETS_PER_SAMPLE)
             missing[row] = max(round(steps[row] / cycle) - 1, 0)
         self._recent_cycles = usual[-CYCLE_SAMPLES:]
@@ -219,20 +218,20 @@ def encode_packet(kind: int, data: bytes) -> bytes:
 def _match_uart(buffer: bytes, at: int) -> int:
     """Return the length of a UART packet (see ``drivers.decoders.base.FrameMatcher``)."""
     if len(buffer) < at + UART_LENGTH:
-        return NEED_MORE
+        return base.NEED_MORE
     if buffer[at + 1] not in TYPES or sum(buffer[at : at + 10]) & 0xFF != buffer[at + 10]:
-        return REJECT
+        return base.REJECT
     return UART_LENGTH
 
 
 def _match_bluetooth(buffer: bytes, at: int) -> int:
     """Return the length of a Bluetooth packet that is followed by another header."""
     if len(buffer) < at + BLUETOOTH_LENGTH + 2:
-        return NEED_MORE
+        return base.NEED_MORE
     following = buffer[at + BLUETOOTH_LENGTH : at + BLUETOOTH_LENGTH + 2]
-    return BLUETOOTH_LENGTH if buffer[at : at + 2] in HEADERS and following in HEADERS else REJECT
+    return BLUETOOTH_LENGTH if buffer[at : at + 2] in HEADERS and following in HEADERS else base.REJECT
 
 
-def build(settings: Settings) -> Decoder:
+def build(settings: Settings) -> base.Decoder:
     """Return a decoder with these settings."""
     return WitmotionDecoder(settings)

@@ -1,17 +1,17 @@
 """Xsens / Movella MTi over UART or USB: MTData2 messages of the Xbus protocol.
 
-The format is ``FA FF 36 | LEN | payload | CS``, big-endian. LEN = 0xFF is followed by the true length as u16. The low
-byte of the sum of all bytes after 0xFA is 0. The payload is a list of ``DID u16 | size u8 | data``. The two low bits of
-a DID state the number format: float32, fixed 12.20, fixed 16.32, float64. The rest of its low nibble is a coordinate
-frame, which is masked off here. A fixed 16.32 number is sent with its 32-bit fraction first and then its 16-bit integer
-part, each big-endian (three independent public parsers agree; the manual was not available). Source: Movella, MT low
-level communication protocol (MT0101P).
+The format is ``FA FF 36 | LEN | payload | CS``, big-endian. If LEN is 0xFF, the length follows as u16. The low byte of
+the sum of all bytes after 0xFA is 0. The payload is a list of items ``DID u16 | size u8 | data``. The two low bits of
+the data identifier (DID) state the number format: float32, fixed 12.20, fixed 16.32 or float64. The next two bits state
+the coordinate frame and are ignored. In a fixed 16.32 number, the 32-bit fraction precedes the 16-bit integer part, and
+each part is big-endian. Three independent public parsers agree on this order; the manual was not available. Source:
+Movella, MT low level communication protocol (MT0101P).
 
-The decoder reads acceleration 0x4020 (or HR 0x4040), rate of turn 0x8020 (or HR 0x8040), the clock 0x1060 or 0x1020,
-and temperature 0x0810. Free acceleration 0x4030 is never used, since the orientation filter has removed gravity from
-it. A packet with accelerations alone, or rates alone, leaves the other axes unmeasured (NaN). A packet without
-accelerations and rates is neither a sample nor bad. Temperature often arrives in separate packets at a lower rate. The
-last temperature is used until the next temperature arrives, or until the link is opened again.
+The decoder reads acceleration 0x4020 (or high-rate 0x4040), rate of turn 0x8020 (or high-rate 0x8040), the clock 0x1060
+or 0x1020, and temperature 0x0810. Free acceleration 0x4030 is not used, since the orientation filter has removed
+gravity. If a packet contains only accelerations or only rates, the other axes are marked as not measured (NaN). A
+packet without accelerations and rates is ignored. Temperatures often arrive in separate packets at a lower rate. Each
+sample gets the newest temperature since the link was opened.
 """
 
 import struct
@@ -22,27 +22,15 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
-from drivers.decoders.base import (
-    NEED_MORE,
-    REJECT,
-    Bytes,
-    Decoder,
-    DecoderSettings,
-    FrameBuffer,
-    Frames,
-    FrameStreamDecoder,
-    chunk_per_sample,
-    group_indices,
-    nan_to_infinity,
-    quantize,
-)
-from drivers.sample import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, SampleBlock, Timing
+from drivers.decoders import base
+from drivers.sample import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
+from drivers.settings_model import SettingsModel
 
 SYNC: Final = b"\xfa\xff\x36"
 MAX_PAYLOAD: Final = 2048
-"""Maximum payload in bytes, so that a damaged length does not block the stream.
+"""Maximum payload in bytes, far above the payload of any MTi configuration.
 
-The payload of every MTi configuration is far smaller.
+The limit prevents a damaged length field from blocking the stream.
 """
 LONGEST: Final = 7 + MAX_PAYLOAD
 
@@ -54,12 +42,12 @@ GYRO, GYRO_HR = 0x8020, 0x8040
 
 Format = Literal["float32", "fp12.20", "fp16.32", "float64"]
 FORMATS: Final[tuple[Format, ...]] = ("float32", "fp12.20", "fp16.32", "float64")
-"""Number formats by the two low bits of a DID."""
+"""Number formats, by the two low bits of a DID."""
 SIZES: Final = (4, 4, 6, 8)
-"""Size of one number in bytes, by the two low bits of a DID."""
+"""Sizes of one number in bytes, by the two low bits of a DID."""
 
 
-class Settings(DecoderSettings):
+class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]``."""
 
     clock: Literal["sample_time_fine", "packet_counter", "arrival"] = Field(
@@ -75,13 +63,13 @@ class Settings(DecoderSettings):
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Positions of the items of a packet: (DID, offset of the data, size)."""
+    """Positions of the items in a packet."""
 
-    items: tuple[tuple[int, int, int], ...]
+    items: tuple[tuple[int, int, int], ...]  # DID, offset of the data and size of each item
     header_offsets: tuple[int, ...]  # offsets of the DID and size bytes of all items
 
     def find_numbers(self, did: int, count: int) -> tuple[int, int] | None:
-        """Find the first item that consists of a number of values.
+        """Find the first item with a given DID and number of values.
 
         Parameters
         ----------
@@ -101,7 +89,7 @@ class Layout:
         return None
 
     def find_integer(self, did: int, size: int) -> int:
-        """Return the offset of an unsigned integer item; 0 if there is none.
+        """Return the offset of an item that is an unsigned integer; 0 if there is no such item.
 
         Parameters
         ----------
@@ -114,7 +102,7 @@ class Layout:
 
 
 def _parse_layout(frame: bytes) -> Layout | None:
-    """Return the layout of a packet with a correct checksum; None if its items do not fill it exactly."""
+    """Return the layout of a packet; None if the items do not fill the payload exactly."""
     at = 6 if frame[3] == 0xFF else 4
     end = len(frame) - 1
     items: list[tuple[int, int, int]] = []
@@ -126,11 +114,11 @@ def _parse_layout(frame: bytes) -> Layout | None:
     return Layout(tuple(items), headers) if at == end else None
 
 
-class XsensMtdata2Decoder(FrameStreamDecoder):
+class XsensMtdata2Decoder(base.FrameStreamDecoder):
     """Decoder and encoder of MTData2 packets."""
 
     def __init__(self, settings: Settings) -> None:
-        super().__init__(FrameBuffer(SYNC, match_message, LONGEST))
+        super().__init__(SYNC, match_message, LONGEST)
         self._settings = settings
         # (timing, DID, size of the counter in bytes)
         clocks: dict[str, tuple[Timing, int, int]] = {
@@ -145,7 +133,7 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
 
     @property
     def recent_problem(self) -> str:
-        """Remedy for packets that are rejected or contain no clock."""
+        """Reason for rejected packets, or message about a missing clock; "" if there is no problem."""
         if self._clock_missing:
             return f'packets contain no {self._settings.clock}: enable it in the device, or set "clock"'
         return super().recent_problem
@@ -155,8 +143,8 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
         super().reset()
         self._temperature_c = np.nan
 
-    def _decode(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples of the packets with rates or accelerations. A packet with an invalid layout is bad."""
+    def _decode(self, frames: base.Frames) -> list[SampleBlock]:
+        """Return the samples in the packets with rates or accelerations. A packet with an invalid layout is bad."""
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
@@ -167,7 +155,7 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
                 continue
             for did, axes in ((self._gyro, slice(0, 3)), (self._accel, slice(3, 6))):
                 if found := layout.find_numbers(did, 3):
-                    values[rows, axes] = nan_to_infinity(_read_numbers(packets, *found, 3))
+                    values[rows, axes] = base.nan_to_infinity(_read_numbers(packets, *found, 3))
             if found := layout.find_numbers(TEMPERATURE, 1):
                 temperature_c[rows] = _read_numbers(packets, *found, 1)[:, 0]
             if self._clock and (at := layout.find_integer(self._clock, self._clock_size)):
@@ -179,7 +167,7 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
         return blocks
 
     def _fill_temperatures(self, temperature_c: Floats) -> Floats:
-        """Return the temperature of each packet, or the last known temperature."""
+        """Replace missing temperatures by the last known temperature."""
         known = np.concatenate([[self._temperature_c], temperature_c])
         last = np.maximum.accumulate(np.where(np.isnan(known), 0, np.arange(known.size)))
         filled: Floats = known[last][1:]
@@ -187,7 +175,7 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
         return filled
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return one packet per sample with both clocks, the temperature if measured, and the measured axes."""
+        """Return one packet per sample with both clocks and the measured quantities."""
         number_format = FORMATS.index(self._settings.format)
         frames = []
         rows = zip(samples.values, samples.temperature_c.tolist(), samples.ticks.tolist(), strict=True)
@@ -201,27 +189,26 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
                     payload += struct.pack(">HB", did | number_format, 3 * SIZES[number_format])
                     payload += _encode_numbers(triple, number_format)
             frames.append(encode_message(payload))
-        return chunk_per_sample(frames, samples.t_ns)
+        return base.chunk_per_sample(frames, samples.t_ns)
 
 
-def _group_by_layout(frames: Frames) -> Iterator[tuple[Layout | None, list[int], Bytes]]:
-    """Yield each layout, the indices of its packets, and their bytes [k, length]. The layout is None if invalid."""
-    for _, rows in group_indices([len(packet) for packet in frames.data]):
-        packets = frames.stack_bytes(rows)
-        at = np.array(rows)
+def _group_by_layout(frames: base.Frames) -> Iterator[tuple[Layout | None, Ints, base.Bytes]]:
+    """Yield each layout with the indices and the bytes [k, length] of its packets. An invalid layout is None."""
+    for _, rows in base.group_indices([len(packet) for packet in frames.data]):
+        packets, at = frames.stack_bytes(rows), rows
         while at.size:
             layout = _parse_layout(packets[0].tobytes())
             compared = list(layout.header_offsets) if layout else slice(None)
             same = (packets[:, compared] == packets[0, compared]).all(axis=1)
-            yield layout, at[same].tolist(), packets[same]
+            yield layout, at[same], packets[same]
             at, packets = at[~same], packets[~same]
 
 
-def _read_numbers(packets: Bytes, at: int, number_format: int, count: int) -> Floats:
-    """Return ``count`` numbers of each packet, which begin at the offset ``at``, as an array [k, count]."""
+def _read_numbers(packets: base.Bytes, at: int, number_format: int, count: int) -> Floats:
+    """Return the ``count`` numbers at the offset ``at`` of each packet as an array [k, count]."""
     data = np.ascontiguousarray(packets[:, at : at + count * SIZES[number_format]])
     if number_format == 0:
-        with np.errstate(invalid="ignore"):  # a signalling NaN is treated as NaN
+        with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
             return data.view(">f4").astype(np.float64)
     if number_format == 1:
         return data.view(">i4") / 2.0**20
@@ -238,9 +225,9 @@ def _encode_numbers(triple: Floats, number_format: int) -> bytes:
         return triple.astype(">f4").tobytes()
     if number_format == 3:
         return triple.astype(">f8").tobytes()
-    triple = np.nan_to_num(triple)  # fixed-point numbers have no value for not measured
+    triple = np.nan_to_num(triple)  # fixed-point formats have no NaN
     if number_format == 1:
-        return quantize(triple, 2.0**-20, 32).astype(">i4").tobytes()
+        return base.quantize(triple, 2.0**-20, 32).astype(">i4").tobytes()
     whole = [min(max(round(x * 2**32), -(2**47)), 2**47 - 1) for x in triple.tolist()]
     return b"".join(struct.pack(">Ih", x & 0xFFFFFFFF, x >> 32) for x in whole)
 
@@ -265,18 +252,18 @@ def match_message(buffer: bytes, at: int) -> int:
     """
     have = len(buffer) - at
     if have < 6:
-        return NEED_MORE
+        return base.NEED_MORE
     length = buffer[at + 3] + 5
     if length == 0xFF + 5:
         payload = int.from_bytes(buffer[at + 4 : at + 6], "big")
         if payload > MAX_PAYLOAD:
-            return REJECT
+            return base.REJECT
         length = payload + 7
     if have < length:
-        return NEED_MORE
-    return REJECT if sum(buffer[at + 1 : at + length]) & 0xFF else length
+        return base.NEED_MORE
+    return base.REJECT if sum(buffer[at + 1 : at + length]) & 0xFF else length
 
 
-def build(settings: Settings) -> Decoder:
+def build(settings: Settings) -> base.Decoder:
     """Return a decoder with these settings."""
     return XsensMtdata2Decoder(settings)

@@ -1,4 +1,1 @@
-"""Links: each module moves bytes of one kind of transport and does not interpret them.
-
-``base`` defines the interface.
-"""
+"""Links: each module receives bytes over one kind of transport. ``base`` defines the interface."""

@@ -1,10 +1,10 @@
-"""Interface of a link. A link moves bytes and does not interpret them.
+"""Interface of a link. A link receives bytes and does not interpret them.
 
 A link module ``drivers/links/<name>_link.py`` defines ``Settings``, ``build(settings) -> Link`` and
 ``DEFAULT_DECODER``. ``Settings`` is a pydantic model with the keys of the link in ``[device.driver]``.
-``DEFAULT_DECODER`` is the name of a decoder, or "" if the user must choose one. Nothing is opened before ``open`` is
-called. ``build`` raises one ``ConfigError`` with a line for each mistake that the model does not find. The line begins
-with the key: "interface: ...".
+``DEFAULT_DECODER`` is the name of a decoder, or "" if the user must choose a decoder. ``build`` opens nothing, and
+raises one ``ConfigError`` with a line for each mistake that the model does not find. The line begins with the key:
+"interface: ...".
 """
 
 import threading
@@ -21,13 +21,11 @@ from drivers.sample import Chunk
 from drivers.settings_model import SettingsModel
 
 Carrier = Literal["bytes", "frames", "messages"]
-"""Kind of data of a link: "bytes" is a stream without boundaries (serial). "frames" is one CAN frame per chunk.
-"messages" is one message per chunk.
-"""
+"""Content of a chunk: part of a stream without boundaries ("bytes"), one CAN frame ("frames") or one message."""
 
 
 class LinkSettings(SettingsModel):
-    """Keys that all links have."""
+    """Keys of all links."""
 
     silence: Annotated[float, SILENCE_S] = Field(
         3.0, description="time without data in s after which the link is opened again; 0 = never"
@@ -35,11 +33,11 @@ class LinkSettings(SettingsModel):
 
 
 class Link(Protocol):
-    """Interface of a link. ``read`` is called from one thread, ``close`` from any thread."""
+    """Interface of a link. One thread calls ``open`` and ``poll_chunks``. Any thread may call ``close``."""
 
     carrier: Carrier
     epoch: Literal["monotonic", "unix"]  # clock of Chunk.t_ns
-    name: str  # for messages, such as "/dev/ttyUSB0 at 460800 baud"
+    name: str  # name in messages, such as "/dev/ttyUSB0 at 460800 baud"
 
     def open(self) -> None:
         """Open the link. Do nothing if the link is already open.
@@ -47,33 +45,31 @@ class Link(Protocol):
         Raises
         ------
         LinkUnavailable
-            If the link cannot be opened. The text says what to do.
+            If the link cannot be opened. The text names the reason and the remedy.
         """
 
     def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
-        """Return the received chunks, after waiting up to ``timeout_s`` seconds for the first chunk.
-
-        Return None if nothing arrived.
+        """Return the received chunks, or None if nothing arrives within ``timeout_s`` seconds.
 
         Raises
         ------
         LinkLost
             If the connection was lost, or the link was closed.
         LinkEnded
-            If a replay has reached its end.
+            If a replay has reached the end of the file.
         """
 
     def close(self) -> None:
-        """Close the link and end a waiting ``read``. Do nothing if the link is already closed."""
+        """Close the link and end a waiting ``poll_chunks``. Do nothing if the link is already closed."""
 
 
 class PolledLink(ABC):
-    """Common part of links whose source is polled. A lock is held while the source is read, opened or closed.
+    """Base class of links that poll a source. A lock ensures that a source is not closed while it is read.
 
     Parameters
     ----------
     name
-        Name of the link for messages.
+        Name of the link in messages.
     """
 
     def __init__(self, name: str) -> None:
@@ -82,14 +78,14 @@ class PolledLink(ABC):
         self._in_use = threading.Lock()
 
     def open(self) -> None:
-        """Open the source unless it is open. Raise ``LinkUnavailable`` with the reason and the remedy if this fails."""
+        """Open the source unless it is open. Raise ``LinkUnavailable`` if the source cannot be opened."""
         with self._in_use:
             if not self._is_open():
                 self._open_source()
                 self._closing.clear()
 
     def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
-        """Return the received chunks, after waiting up to ``timeout_s`` seconds for the first chunk."""
+        """Return the received chunks, or None if nothing arrives within ``timeout_s`` seconds."""
         deadline = time.monotonic() + timeout_s
         with self._in_use:
             while self._is_open() and not self._closing.is_set():
@@ -101,7 +97,7 @@ class PolledLink(ABC):
         raise LinkLost(f"{self.name}: the link is closed")
 
     def close(self) -> None:
-        """Close the source after a waiting ``read`` has ended."""
+        """End a waiting ``poll_chunks``, then close the source."""
         self._closing.set()
         with self._in_use:
             self._close_source()
@@ -116,7 +112,7 @@ class PolledLink(ABC):
 
     @abstractmethod
     def _poll_source(self, deadline: float) -> list[Chunk]:
-        """Return the chunks that arrive soon, at the latest at the monotonic time ``deadline`` in s."""
+        """Wait for chunks until the monotonic time ``deadline`` in s or earlier, and return them."""
 
     @abstractmethod
     def _close_source(self) -> None:
@@ -125,7 +121,7 @@ class PolledLink(ABC):
 
 @runtime_checkable
 class AddressFilteringLink(Protocol):
-    """Interface of a link that can filter by address."""
+    """Interface of a link that can filter chunks by address."""
 
     def set_address_filter(self, addresses: Sequence[int]) -> None:
-        """Receive only chunks of these addresses. The method is called before ``open``."""
+        """Receive only chunks with these addresses after the next call of ``open``."""

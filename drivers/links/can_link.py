@@ -1,17 +1,18 @@
 """CAN buses through python-can, one frame per chunk.
 
-The identifiers that the decoder names are filtered in the hardware or the kernel if the interface supports filters,
-otherwise in python-can. A read waits for the first frame, and then takes all frames that are queued.
+Frames are filtered by the identifiers that the decoder needs. The hardware or the kernel filters the frames if the
+interface supports filters, otherwise python-can does. A read waits for the first frame, and then takes all frames in
+the queue.
 
-``Chunk.t_ns`` is the monotonic time of the host at arrival. A delayed reader finds many waiting frames, which must not
-all get the time of the read. Some interfaces stamp each frame on arrival with the system clock of the host
-(``HOST_STAMPED_INTERFACES``). For these interfaces, the age of each frame is subtracted from the present time. The age
-is a difference over milliseconds, so a step of the system clock affects only the frames that wait during the step. An
-age outside 0 to 1 s is ignored. Other interfaces stamp with clocks of their own, which drift against the host. For
+``Chunk.t_ns`` is the arrival time on the monotonic clock of the host. If a reader is delayed, many frames wait in the
+queue, and the time of the read is too late for most of them. The interfaces in ``HOST_STAMPED_INTERFACES`` stamp each
+frame on arrival with the system clock of the host. For these interfaces, the age of a frame is subtracted from the time
+of the read. A step of the system clock affects only the frames that are in the queue during the step. An age outside
+the range 0 to 1 s is ignored. Other interfaces stamp frames with a clock that drifts against the clock of the host. For
 these interfaces, the time of the read is used, and the regression of the sample clock removes the jitter.
 
-A bus-off state, an interface that is down and an unplugged adapter raise ``LinkLost``. Other error frames and remote
-frames are counted and ignored. Nothing is sent, apart from the set-up of an adapter.
+If the bus is off, the interface is down or the adapter is unplugged, ``LinkLost`` is raised. Other error frames are
+counted and ignored. Remote frames are ignored. The link sends nothing except commands that configure an adapter.
 """
 
 import contextlib
@@ -39,25 +40,24 @@ if TYPE_CHECKING:
 
 DEFAULT_DECODER: Final = "dbc"
 MAX_FRAMES: Final = 1000
-"""Maximum number of frames per read: 65 ms of a fully loaded bus at 1 Mbit/s."""
+"""Maximum number of frames per read, 65 ms of a fully loaded bus at 1 Mbit/s."""
 NEXT_FRAME_WAIT_S: Final = 0.0005
-"""Wait for the next frame after a frame.
+"""Time to wait for another frame after a frame has been received.
 
-The wait must not be 0. With a wait of 0, python-can stops at the first frame that it filters out, although wanted
-frames may follow.
+If the time were 0, python-can would stop at the first frame that the filters reject, although other frames may follow.
 """
 MAX_READ_S: Final = 0.01
-"""Longest time from the first frame of a read to the return of its frames."""
+"""Longest time from the arrival of the first frame to the end of a read."""
 MAX_WAIT_S: Final = 0.1
 """Longest single wait on the bus. A waiting read ends at most this time after the link has been closed."""
 HOST_STAMPED_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
-"""Interfaces whose time stamps are the system clock of the host at arrival of the frame."""
+"""Interfaces that stamp a frame with the system clock of the host when the frame arrives."""
 MAX_FRAME_AGE_S: Final = 1.0
 CLOCK_PAIRS: Final = 3
-"""Number of pairs of clock readings. The pair with the shortest time between its readings is used."""
+"""Number of readings of both clocks. The reading that took the shortest time is used."""
 PROBE_TIMEOUT_S: Final = 2.0
 BUS_OFF_INTERFACES: Final = ("socketcan", "virtual", "udp_multicast")
-"""Interfaces whose error frames contain the error classes of SocketCAN in their identifier."""
+"""Interfaces that report the error classes of SocketCAN in the identifier of an error frame."""
 PACKAGES: Final[Mapping[str, tuple[str, str, str]]] = {
     "udp_multicast": ("msgpack", "msgpack", "imu-monitor[multicast]"),
     "canalystii": ("canalystii", "canalystii", "python-can[canalystii]"),
@@ -66,18 +66,18 @@ PACKAGES: Final[Mapping[str, tuple[str, str, str]]] = {
     "neovi": ("ics", "python-ics", "python-can[neovi]"),
     "nixnet": ("nixnet", "nixnet", "python-can[nixnet]"),
 }
-"""Module, package and requirement of the interfaces that need an optional package.
+"""Module, package and pip requirement of the interfaces that need an optional package.
 
-pyserial, which slcan, robotell, seeedstudio and serial need, is required by this project. socketcan, socketcand and
-virtual need no package. The other interfaces need a library of the adapter's manufacturer.
+The interfaces slcan, robotell, seeedstudio and serial need pyserial, which is always installed. The interfaces
+socketcan, socketcand and virtual need no package. The other interfaces need a library of the adapter's manufacturer.
 """
 BUS_OFF: Final = 0x40
-"""CAN_ERR_BUSOFF of linux/can/error.h, in the identifier of a socketcan error frame."""
+"""Bit CAN_ERR_BUSOFF (linux/can/error.h) in the identifier of a SocketCAN error frame."""
 ID_MASK: Final = 0x1FFF_FFFF
 
 
 def _check_channel(channel: object) -> None:
-    """Raise ConfigError if a channel is neither a text nor a number."""
+    """Raise ConfigError if the channel is neither a string nor a whole number."""
     if not isinstance(channel, str | int) or isinstance(channel, bool):
         raise ConfigError(f"expected text in quotes or a whole number, got {format_value(channel)}")
 
@@ -116,13 +116,12 @@ class CanLink(PolledLink):
         self._filters: list[dict[str, Any]] | None = None
         self._bus: can.BusABC | None = None
         self.error_frames = 0
-        self.garbled = 0  # answers of the adapter that were not frames
+        self.garbled = 0  # number of lines from the adapter that were not frames
 
     def set_address_filter(self, addresses: Sequence[int]) -> None:
-        """Receive only these identifiers from the next ``open`` on. Without identifiers, receive all frames.
+        """Receive only frames with these addresses after the next call of ``open``. An empty sequence means all frames.
 
-        ``EXTENDED_ID`` marks 29-bit identifiers. With ``ANY_SOURCE``, only the J1939 parameter group of the identifier
-        has to match.
+        ``EXTENDED_ID`` marks 29-bit identifiers. If ``ANY_SOURCE`` is set, only the J1939 parameter group must match.
         """
         self._filters = [_filter_for_address(address) for address in addresses] or None
 
@@ -132,12 +131,12 @@ class CanLink(PolledLink):
     def _open_source(self) -> None:
         import can
 
-        # python-can reports missing vendor libraries as warnings
+        # python-can logs a warning for each missing vendor library
         logging.getLogger("can").setLevel(logging.ERROR)
         s = self._settings
         if missing := describe_missing_package(s.interface):
             raise LinkUnavailable(missing)
-        # exceptions of python-can's modules if a vendor library or a key is missing
+        # exceptions that python-can raises if a vendor library or a key is missing
         wrong_set_up = (NameError, AttributeError, TypeError, ValueError, ArithmeticError, NotImplementedError)
         try:
             _probe_server(s)
@@ -152,7 +151,7 @@ class CanLink(PolledLink):
             raise LinkUnavailable(f"{self.name}: {_why_not_open(s, error)}") from error
 
     def _bus_arguments(self) -> dict[str, Any]:
-        """Return the arguments for python-can's Bus."""
+        """Return the keyword arguments of ``can.Bus``."""
         s = self._settings
         keys: dict[str, Any] = {"receive_own_messages": s.receive_own_messages}
         if s.bitrate is not None:
@@ -182,7 +181,7 @@ class CanLink(PolledLink):
         return chunks
 
     def _receive_frame(self, wait_s: float) -> "can.Message | None":
-        """Return one frame; None if no frame arrives in time. Raise LinkLost if the bus is gone."""
+        """Return one frame; None if no frame arrives in time. Raise LinkLost if the bus has failed."""
         import can
 
         bus = self._bus
@@ -193,8 +192,8 @@ class CanLink(PolledLink):
             except (can.CanOperationError, ValueError) as error:
                 if not isinstance(error, ValueError) and not isinstance(error.__cause__, ValueError):
                     raise
-                # A text adapter has sent a line that is not a frame. slcan keeps a line with non-ASCII bytes in its
-                # buffer, where it would fail again at every read unless the buffer is flushed.
+                # A text-based adapter has sent a line that is not a frame. slcan keeps a line with non-ASCII bytes in
+                # a buffer, so every read would fail again unless the buffer is flushed.
                 self.garbled += 1
                 flush = getattr(bus, "flush", None)
                 if flush is not None:
@@ -213,7 +212,7 @@ class CanLink(PolledLink):
         return Chunk(bytes(message.data), self._arrival_ns(message), address)
 
     def _arrival_ns(self, message: "can.Message") -> int:
-        """Return the monotonic arrival time of a frame, or the present time if the time stamp is implausible."""
+        """Return the monotonic arrival time of a frame; the present time if the time stamp cannot be used."""
         now_ns = time.monotonic_ns()
         if self._settings.interface not in HOST_STAMPED_INTERFACES:
             return now_ns
@@ -233,13 +232,13 @@ class CanLink(PolledLink):
         bus, self._bus = self._bus, None
         if bus is None:
             return
-        # closing the channel of an unplugged adapter fails, but the adapter is gone anyway
+        # closing the channel of an unplugged adapter fails
         with contextlib.suppress(can.CanError, OSError):
             bus.shutdown()
 
 
 def describe_missing_package(interface: str) -> str:
-    """Return the missing package of a python-can interface and how to install it; "" if no package is missing."""
+    """Return a message about the package that a python-can interface lacks; "" if no package is missing."""
     module, package, requirement = PACKAGES.get(interface, ("", "", ""))
     if not module or importlib.util.find_spec(module) is not None:
         return ""
@@ -247,10 +246,10 @@ def describe_missing_package(interface: str) -> str:
 
 
 def _unix_minus_monotonic_ns() -> int:
-    """Return the difference of the two clocks of the host in nanoseconds.
+    """Return Unix time minus monotonic time in ns.
 
-    On a loaded machine the thread may be interrupted between the two readings. The closest of several pairs is
-    therefore used.
+    On a loaded machine, the thread may be interrupted between the readings of the two clocks. The clocks are therefore
+    read several times, and the fastest reading is used.
     """
     pairs = []
     for _ in range(CLOCK_PAIRS):
@@ -260,7 +259,7 @@ def _unix_minus_monotonic_ns() -> int:
 
 
 def _probe_server(s: Settings) -> None:
-    """Check that a socketcand server answers. python-can would try to reach a missing server for 10 s."""
+    """Raise OSError if a socketcand server does not answer. python-can would try for 10 s to reach the server."""
     if s.interface == "socketcand":
         host, port = str(s.options.get("host", "127.0.0.1")), int(s.options.get("port", 29536))
         socket.create_connection((host, port), timeout=PROBE_TIMEOUT_S).close()
@@ -271,7 +270,7 @@ def _filter_for_address(address: int) -> dict[str, Any]:
     extended = bool(address & EXTENDED_ID)
     mask = ID_MASK if extended else 0x7FF
     if address & ANY_SOURCE:
-        # SAE J1939-21: for a PDU format below 240 the third byte is the destination, not part of the group
+        # SAE J1939-21: if the PDU format is below 240, the third byte is the destination and not part of the group
         broadcast = (address >> 16 & 0xFF) >= 240
         mask = 0x03FF_FF00 if broadcast else 0x03FF_0000
     return {"can_id": address & mask, "can_mask": mask, "extended": extended}
@@ -298,7 +297,7 @@ def _why_not_open(s: Settings, error: Exception) -> str:
 
 
 def build(settings: Settings) -> Link:
-    """Return the link of these settings without opening it.
+    """Return the link without opening the bus.
 
     Raises
     ------

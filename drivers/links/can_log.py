@@ -1,7 +1,8 @@
-"""Reading of CAN logs as chunks: .asc, .blf, .log and .trc files, CSV of python-can, and CSV with t, id_hex, data_hex.
+"""Reading of CAN logs: .asc, .blf, .log and .trc files, CSV of python-can, and CSV with t, id_hex and data_hex.
 
-python-can parses the logs. It reads until it finds the next frame, and allocates the sizes that a BLF log states. The
-readers of this module therefore limit lines, objects and content without a frame. They raise ValueError above a limit.
+python-can parses the logs. python-can reads any amount of text to find the next frame, and allocates as much memory as
+a BLF log states. The readers in this module therefore limit the length of lines, the size of objects, and the amount of
+data between two frames. If a limit is exceeded, a reader raises ValueError.
 """
 
 import csv
@@ -25,37 +26,34 @@ MAX_FRAME_BYTES: Final = 64  # of CAN FD
 READ_BYTES: Final = 4096
 MAX_LINE_BYTES: Final = 1 << 20
 MAX_BYTES_WITHOUT_FRAME: Final = 8_000_000
-"""Maximum length of text without a frame, such as comments. python-can needs seconds for this much text."""
+"""Maximum length of text without a frame, such as comments. python-can needs seconds to read text of this length."""
 MAX_OBJECT_BYTES: Final = 64_000_000
-"""Maximum size of an object of a BLF log, packed or unpacked.
-
-Vector's tools write containers of some hundred kilobytes.
-"""
+"""Maximum compressed or uncompressed size of an object in a BLF log. Typical objects have some hundred kilobytes."""
 MAX_OBJECTS_WITHOUT_FRAME_BYTES: Final = 256_000_000
 BLF_OBJECT: Final = b"LOBJ"
 BLF_HEADER_BYTES: Final = blf.OBJ_HEADER_BASE_STRUCT.size
 
 
 def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterator[Chunk]:
-    """Yield the data frames of a log that python-can reads.
+    """Yield the data frames of a log in a format of python-can.
 
     Parameters
     ----------
     stream
-        Content of the log, decompressed.
+        Decompressed content of the log.
     suffix
-        Suffix that names the format: ".blf" or a key of TEXT_READERS.
+        File suffix of the format: ".blf" or a key of TEXT_READERS.
     channel
-        Channel whose frames are wanted. None for all channels.
+        Channel to read. None for all channels.
 
     Raises
     ------
     ValueError
-        If the content is damaged or exceeds a limit.
+        If the log is damaged or exceeds a limit.
     """
     try:
         if suffix == ".blf":
-            reader = ValidatingBlfReader(cast("BinaryIO", _BoundedReader(stream)))
+            reader = _ValidatingBlfReader(cast("BinaryIO", _BoundedReader(stream)))
             yield from _data_frames(iter(reader), channel, lambda: None)
         else:
             lines = _BoundedLineReader(stream)
@@ -72,14 +70,14 @@ def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
     Parameters
     ----------
     stream
-        Content of the file, decompressed.
+        Decompressed content of the file.
     channel
-        Channel whose frames are wanted. None for all channels.
+        Channel to read. None for all channels.
 
     Raises
     ------
     ValueError
-        If the content is damaged or exceeds a limit.
+        If the file is damaged or exceeds a limit.
     """
     lines = _BoundedLineReader(stream)
     rows = csv.reader(lines.as_text(""))
@@ -101,7 +99,7 @@ def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
 def _data_frames(
     messages: Iterator[can.Message], channel: str | None, note_frame: Callable[[], None]
 ) -> Iterator[Chunk]:
-    """Yield the data frames of one channel. ``note_frame`` is called for each message of all channels."""
+    """Yield the data frames of one channel. Call ``note_frame`` for every message of every channel."""
     for message in messages:
         note_frame()
         if message.is_error_frame or message.is_remote_frame:
@@ -112,7 +110,7 @@ def _data_frames(
 
 
 def _frame_chunk(data: bytes, t_s: float, address: int) -> Chunk:
-    """Return a frame of a log as a chunk. Raise ValueError if its identifier, length or time is invalid."""
+    """Return a frame as a chunk. Raise ValueError if the identifier, the length or the time is invalid."""
     if not abs(t_s) < T_LIMIT_S:
         raise ValueError(f"{t_s:g} s is no time")
     if not 0 <= address & ~EXTENDED_ID <= MAX_EXTENDED_ID or address < 0 or len(data) > MAX_FRAME_BYTES:
@@ -121,27 +119,27 @@ def _frame_chunk(data: bytes, t_s: float, address: int) -> Chunk:
 
 
 class _BoundedLineReader(io.RawIOBase):
-    """Reader of a text file that raises ValueError for an overlong line and for long text without a frame."""
+    """Reader that raises ValueError if a line is too long, or if too much text contains no frame."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
-        self._line_bytes = 0  # since the last line end
+        self._line_bytes = 0  # number of bytes since the last line end
         self._bytes_without_frame = 0
 
     def as_text(self, newline: str | None) -> io.TextIOWrapper:
-        """Return the decoded text of the file. ``newline`` has the same meaning as for the function ``open``."""
+        """Return a text file. ``newline`` has the same meaning as in the function ``open``."""
         return io.TextIOWrapper(io.BufferedReader(self), "utf-8", newline=newline)
 
     def note_frame(self) -> None:
-        """Note that the text so far contained a frame."""
+        """Set the number of bytes without a frame to 0."""
         self._bytes_without_frame = 0
 
     def readable(self) -> bool:
-        """Return True, since the stream can be read."""
+        """Return True."""
         return True
 
     def readinto(self, buffer: Any, /) -> int:
-        """Read at most the length of ``buffer`` bytes into it, and return their number."""
+        """Read bytes into the buffer, and return their number."""
         data = self._stream.read(min(len(buffer), READ_BYTES))
         end = max(data.rfind(b"\n"), data.rfind(b"\r"))
         self._line_bytes = len(data) - end - 1 if end >= 0 else self._line_bytes + len(data)
@@ -155,7 +153,7 @@ class _BoundedLineReader(io.RawIOBase):
 
 
 class _BoundedReader:
-    """Binary file that raises ValueError for the negative or oversized reads that a damaged BLF log asks for."""
+    """Binary file that raises ValueError for reads of a negative or too large size, as a damaged BLF log causes."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
@@ -168,8 +166,8 @@ class _BoundedReader:
         return self._stream.read(size)
 
 
-class ValidatingBlfReader(can.BLFReader):
-    """BLF reader that rejects oversized objects, and objects of size zero, which python-can would read forever."""
+class _ValidatingBlfReader(can.BLFReader):
+    """BLF reader that rejects too large objects, and empty objects, which python-can would read forever."""
 
     def __iter__(self) -> Generator[can.Message, None, None]:
         bytes_without_frame = 0
@@ -182,7 +180,7 @@ class ValidatingBlfReader(can.BLFReader):
                 raise blf.BLFParseError(f"{MAX_OBJECTS_WITHOUT_FRAME_BYTES} bytes hold no CAN frame")
 
     def _read_container(self) -> bytes | None:
-        """Return the unpacked content of the next container; None at the end of the file."""
+        """Return the uncompressed content of the next container; None at the end of the file."""
         while header := self.file.read(BLF_HEADER_BYTES):
             mark, _, _, size, kind = blf.OBJ_HEADER_BASE_STRUCT.unpack(header)
             if mark != BLF_OBJECT:
@@ -207,7 +205,7 @@ class ValidatingBlfReader(can.BLFReader):
 
 
 def _unpack_container(container: bytes) -> bytes:
-    """Return the objects of a container; none if the compression method is unknown."""
+    """Return the uncompressed content of a container; b"" if the compression method is unknown."""
     method, _ = blf.LOG_CONTAINER_STRUCT.unpack_from(container)
     data = container[blf.LOG_CONTAINER_STRUCT.size :]
     if method == blf.NO_COMPRESSION:

@@ -1,20 +1,21 @@
 """Replay of a file in place of a device, at the recorded speed or another speed.
 
-The link carries different data for each kind of file:
+The chunks depend on the kind of file:
 
-- recordings (``drivers.recordings``: CSV, .npz, Parquet, Arrow, a folder) become messages for the decoder ``samples``;
-- CAN logs (``drivers.links.can_log``) become frames;
-- captured bytes (.bin .raw .txt, also with .gz) become bytes;
-- raw bytes recorded by the daemon (one segment, or a folder of segments) become bytes, frames or messages, according to
-  their original link.
+- A recording (``drivers.recordings``: CSV, .npz, Parquet, Arrow, or a folder) becomes messages for the decoder
+  ``samples``.
+- A CAN log (``drivers.links.can_log``) becomes CAN frames.
+- A file of captured bytes (.bin, .raw or .txt, also with .gz) becomes bytes.
+- Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages, as the
+  original link has received them.
 
-Recordings, logs and raw bytes keep their own times (``epoch`` is unix). Captured bytes have no times. With
-``bytes_per_second``, each chunk gets the time at which a device with this rate would have sent the chunk. Otherwise
-each chunk gets the time of the read.
+The chunks of recordings, logs and raw data have the recorded Unix times. Captured bytes have no times. If
+``bytes_per_second`` is set, each chunk gets the time at which a device with this byte rate would have sent the chunk.
+Otherwise each chunk gets the time of the read.
 
-``read`` raises ``LinkEnded`` after all data have been returned. A truncated file is replayed up to the cut, and the
-message at the end mentions the cut. ``build`` reads the header of a CSV file, since the decoder must match. All other
-content is read by ``open``.
+``poll_chunks`` raises ``LinkEnded`` after all data have been returned. If a file is truncated, the complete part is
+replayed, and the message at the end mentions the truncation. ``build`` reads the header of a CSV file, since the header
+decides which decoder is needed. ``open`` reads all other content.
 """
 
 import binascii
@@ -46,28 +47,28 @@ CAN_LOGS: Final = (".asc", ".blf", ".log", ".trc")
 CAPTURES: Final = (".bin", ".raw", ".txt")
 BATCH_CHUNKS: Final = 1000
 BATCH_BYTES: Final = 1_000_000
-"""Size of the chunks after which a read returns. A read returns at most BATCH_CHUNKS chunks.
+"""Total size of the chunks after which a read ends. A read also ends after BATCH_CHUNKS chunks.
 
 Without these limits, one read could return hours of a recording.
 """
 MAX_MESSAGE_ROWS: Final = 4096
 STEP_S: Final = 0.02
-"""Paced recordings and bytes are delivered in pieces of this duration, as from a device with a small buffer."""
+"""Duration of the chunks if data are replayed at a limited speed, as from a device with a small buffer."""
 CHUNK_BYTES: Final = 4096
 PYTHON_CAN_HEADER: Final = "timestamp,arbitration_id"
 DAMAGE_ERRORS: Final = (
     EOFError, LookupError, OverflowError, zlib.error, gzip.BadGzipFile, struct.error, binascii.Error, csv.Error,
 )  # fmt: skip
-"""Exceptions, in addition to ValueError, that readers raise where a file is truncated or damaged."""
+"""Exceptions, in addition to ValueError, that readers raise if a file is truncated or damaged."""
 
 PACES: Final = {"recorded": 1.0, "max": float("inf")}
-"""Values of ``speed`` that are words, with the factor that they stand for."""
+"""Words for the key ``speed`` and the factors that they stand for."""
 
 Kind = Literal["recording", "log", "capture", "raw"]
 TimedChunk = tuple[float, Chunk]
-"""Time in s since the start of the file at which a chunk is due, and the chunk."""
+"""Due time of a chunk in s since the start of the file, and the chunk."""
 CARRIERS: Final[dict[Kind, Carrier]] = {"recording": "messages", "log": "frames", "capture": "bytes"}
-"""Carrier of each kind of file. Raw bytes state their carrier themselves."""
+"""Carrier of each kind of file. A segment of raw data states its carrier."""
 
 DEFAULT_DECODERS: Final[dict[Kind, str]] = {"recording": DEFAULT_DECODER, "log": "dbc", "capture": "", "raw": ""}
 """Default decoder of each kind of file; "" if the settings must name the decoder."""
@@ -96,19 +97,19 @@ class Settings(LinkSettings):
 
 
 class ReplayLink(PolledLink):
-    """Replay of one file, which starts from the beginning each time it is opened."""
+    """Replay of one file. Each call of ``open`` starts the replay from the beginning."""
 
     def __init__(self, settings: Settings, kind: Kind) -> None:
         super().__init__(f"replay of {settings.path}")
         self._settings = settings
         self._path = file_access.expand_user(settings.path)
         self._kind: Kind = kind
-        self._pace = settings.speed  # seconds of the file per second; inf = no waiting
+        self._pace = settings.speed  # seconds of recorded time per second; inf = as fast as possible
         self.carrier: Carrier = _raw_carrier(self._path) if kind == "raw" else CARRIERS[kind]
         self.epoch: Literal["monotonic", "unix"] = "monotonic" if kind == "capture" else "unix"
         self.default_decoder = DEFAULT_DECODERS[kind]
         self.notes: tuple[str, ...] = ()
-        self._items: Generator[TimedChunk] | None = None  # chunks that remain; closing it closes the file
+        self._items: Generator[TimedChunk] | None = None  # remaining chunks; closing the generator closes the file
         self._next: TimedChunk | None = None
         self._started_s = 0.0
 
@@ -144,17 +145,17 @@ class ReplayLink(PolledLink):
         return chunks
 
     def _due_s(self, item: TimedChunk) -> float:
-        """Return the monotonic time in s at which an item is due."""
+        """Return the due time of an item on the monotonic clock, in s."""
         return self._started_s + item[0] / self._pace
 
     def _fetch_next(self) -> None:
-        """Fetch the next item. If the file is damaged from here on, the replay ends here."""
+        """Fetch the next item. If the rest of the file is damaged, end the replay and add a note."""
         assert self._items is not None
         try:
             self._next = next(self._items, None)
         except (ValueError, *DAMAGE_ERRORS) as error:
             self._next = None
-            self.notes += (f"The file is cut off or damaged there: {describe_error(error)}.",)
+            self.notes += (f"The file is cut off or damaged at this point: {describe_error(error)}.",)
 
     def _close_source(self) -> None:
         items, self._items, self._next = self._items, None, None
@@ -162,7 +163,7 @@ class ReplayLink(PolledLink):
             items.close()
 
     def _read_items(self) -> Generator[TimedChunk]:
-        """Return the content of the file according to its kind."""
+        """Return the chunks of the file with their due times."""
         if self._kind == "recording":
             recording = load_samples(self._path, self._settings.rate)
             self.notes = recording.notes
@@ -175,7 +176,7 @@ class ReplayLink(PolledLink):
         return _read_capture(self._path, self._settings.bytes_per_second)
 
     def _message_rows(self, recording: Recording) -> int:
-        """Return the number of rows per message: few for a paced replay, many without pacing."""
+        """Return the number of rows per message: STEP_S of recorded time, or many if the speed is not limited."""
         t, n = recording.t_s, len(recording)
         if self._pace == float("inf") or n < 2:
             return MAX_MESSAGE_ROWS
@@ -184,7 +185,7 @@ class ReplayLink(PolledLink):
 
 
 def _read_messages(recording: Recording, rows: int) -> Generator[TimedChunk]:
-    """Yield messages of ``rows`` samples. Each message is due at the time of its newest sample."""
+    """Yield messages of up to ``rows`` samples. A message is due at the time of the newest sample in the message."""
     given = 0
     start_ns: int | None = None
     for samples in iter_blocks(recording, rows):
@@ -195,7 +196,7 @@ def _read_messages(recording: Recording, rows: int) -> Generator[TimedChunk]:
 
 
 def _relative_times(chunks: Iterator[Chunk]) -> Generator[TimedChunk]:
-    """Yield chunks with their time since the first chunk in s."""
+    """Yield each chunk with the time since the first chunk in s."""
     start_ns: int | None = None
     for chunk in chunks:
         start_ns = chunk.t_ns if start_ns is None else start_ns
@@ -218,12 +219,12 @@ def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
 
 
 def _raw_segments(path: Path) -> list[Path]:
-    """Return the segments of a folder, oldest first. For a file, return the file."""
+    """Return the segments of a folder, oldest first. If the path is a file, return only the file."""
     return segment.list_segments(path) if path.is_dir() else [path]
 
 
 def _is_raw(path: Path) -> bool:
-    """Return True if the newest segment contains raw bytes. An unreadable segment is reported when it is opened."""
+    """Return True if the newest segment contains raw data. Return False if the segment cannot be read."""
     found = _raw_segments(path)
     if not found or not segment.NAME.fullmatch(found[-1].name):
         return False
@@ -234,7 +235,7 @@ def _is_raw(path: Path) -> bool:
 
 
 def _raw_carrier(path: Path) -> Carrier:
-    """Return the carrier of the newest segment. Raise ConfigError if it is unknown."""
+    """Return the carrier of the newest segment. Raise ConfigError if the carrier is unknown."""
     carrier = segment.read_metadata(_raw_segments(path)[-1]).carrier
     known: tuple[Carrier, ...] = ("bytes", "frames", "messages")
     for one in known:
@@ -247,7 +248,7 @@ def _raw_carrier(path: Path) -> Carrier:
 
 
 def _read_capture(path: Path, bytes_per_second: float | None) -> Generator[TimedChunk]:
-    """Yield captured bytes at a given rate, or as fast as they are read."""
+    """Yield captured bytes with due times according to the byte rate. Without a rate, every chunk is due at once."""
     start_ns = time.monotonic_ns()
     size = CHUNK_BYTES if bytes_per_second is None else min(max(1, round(bytes_per_second * STEP_S)), CHUNK_BYTES)
     given = 0
@@ -263,7 +264,7 @@ def _read_capture(path: Path, bytes_per_second: float | None) -> Generator[Timed
 
 
 def _detect_kind(path: Path) -> Kind:
-    """Return the kind of a file by its suffix and, for CSV, its header. Raise ConfigError if it is unknown."""
+    """Return the kind of a file according to the suffix and the content. Raise ConfigError for any other file."""
     suffix = _plain_suffix(path)
     if path == Path():
         raise ConfigError("path: empty; it is a recording, a CAN log, captured bytes, or a folder of segments")
@@ -286,7 +287,7 @@ def _detect_kind(path: Path) -> Kind:
 
 
 def _plain_suffix(path: Path) -> str:
-    """Return the last suffix, or the suffix before .gz."""
+    """Return the last suffix of a path, without a final ".gz"."""
     suffixes = [s.lower() for s in path.suffixes]
     if suffixes and suffixes[-1] == ".gz":
         suffixes.pop()
@@ -299,26 +300,26 @@ def _read_header(path: Path) -> str:
         with _open_text(path) as stream:
             return stream.readline(1000).strip()
     except (OSError, UnicodeDecodeError, *DAMAGE_ERRORS):
-        return ""  # opening or reading the file reports the error
+        return ""  # the error is reported when the file is replayed
 
 
 def _open_binary(path: Path) -> IO[bytes]:
-    """Open a file for binary reading, decompressed if it ends in .gz."""
+    """Open a binary file for reading. Decompress the content if the name ends in ".gz"."""
     file = file_access.open_regular(path)
     if path.suffix.lower() != ".gz":
         return file
     unzipped: Any = gzip.GzipFile(fileobj=file, mode="rb")
-    unzipped.myfileobj = file  # closed together with the reader
+    unzipped.myfileobj = file  # GzipFile closes this file together with itself
     return cast("IO[bytes]", unzipped)
 
 
 def _open_text(path: Path) -> IO[str]:
-    """Open a file for text reading, decompressed if it ends in .gz."""
+    """Open a text file for reading. Decompress the content if the name ends in ".gz"."""
     return io.TextIOWrapper(_open_binary(path), "utf-8", newline="")
 
 
 def build(settings: Settings) -> Link:
-    """Return the link of these settings without opening it.
+    """Return the link without opening the file for replay.
 
     Raises
     ------
@@ -334,7 +335,7 @@ def build(settings: Settings) -> Link:
 
 
 def _check_path(path: Path) -> None:
-    """Raise ConfigError for a path that is neither a file nor a folder. A missing file may be created later."""
+    """Raise ConfigError if the path exists but is neither a file nor a folder."""
     if path.is_dir():
         return
     try:

@@ -1,16 +1,16 @@
 """Serial ports, local or networked, by any URL that pyserial supports.
 
-Bytes are returned as they arrive, without regard to frames. The reader waits for the first byte, then for a short time
-(``read_timeout``, 10 ms) for more bytes, and takes all bytes that have arrived. The short wait needs a tenth of the
-processor time of a wake-up per frame, and no byte waits longer than ``read_timeout``. URL handlers without a file
-descriptor wake up at every arrival instead.
+The link returns bytes as they arrive, without regard to frames. A read waits for the first byte, then for the time
+``read_timeout`` (10 ms by default) for more bytes, and returns all bytes that have arrived. A short wait needs a tenth
+of the processor time of a read per frame, and no byte waits longer than ``read_timeout``. If a URL handler has no file
+descriptor, a read returns at every arrival.
 
-``close`` sets a flag and ends a waiting read. The port itself is closed after the read has ended. If the descriptor
-were closed while a reader waits, its number could already belong to another file.
+``close`` ends a waiting read and closes the port after the read has ended. If the file descriptor were closed earlier,
+the system could assign the same descriptor to another file while the read is waiting.
 
-``open`` succeeds or raises ``LinkUnavailable``. The text names the cause and the remedy, such as a list of the existing
-ports, a missing permission, or another program that uses the port. ``read`` returns bytes or None, or raises
-``LinkLost`` if the device was unplugged or the other end closed the connection. Nothing is ever written to the device.
+If the port cannot be opened, ``LinkUnavailable`` names the cause and the remedy, such as a missing permission or
+another program that uses the port. If the device is unplugged or the connection is closed, ``poll_chunks`` raises
+``LinkLost``. Nothing is written to the device.
 """
 
 import contextlib
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 
 DEFAULT_DECODER: Final = ""
 READ_BYTES: Final = 4096
-"""Maximum number of bytes per read, more than 10 ms at 3 Mbit/s. At higher rates the reader does not wait."""
+"""Maximum number of bytes per read, more than arrive in 10 ms at 3 Mbit/s. At higher rates, reads do not wait."""
 STOP_BITS: Final = (1.0, 1.5, 2.0)
 SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
 """URL schemes that are part of pyserial."""
 
 
 def _check_port(port: str) -> None:
-    """Raise ConfigError for an empty port, or a URL with an unknown scheme."""
+    """Raise ConfigError if the port is empty, or is a URL with an unknown scheme."""
     scheme, found, _ = port.partition("://")
     if not port:
         raise ConfigError('empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")')
@@ -86,14 +86,14 @@ class SerialLink(PolledLink):
         super().__init__(f"{self._shown_port} at {settings.baudrate} baud")
         self._settings = settings
         self._port: serial.SerialBase | None = None
-        self._buffer_filling = False  # True if the last read was so large that the next one must not wait
+        self._buffer_filling = False  # True if the last read returned so many bytes that the next read must not wait
 
     def close(self) -> None:
-        """Close the port after a waiting ``read`` has ended."""
+        """End a waiting ``poll_chunks``, then close the port."""
         self._closing.set()
-        cancel = getattr(self._port, "cancel_read", None)  # not every URL handler has it
+        cancel = getattr(self._port, "cancel_read", None)  # some URL handlers lack this method
         if cancel is not None:
-            # cancelling fails if the reader has just closed the port; then no read is waiting
+            # an error means that the reader has just closed the port, so that no read is waiting
             with contextlib.suppress(OSError, TypeError):
                 cancel()
         super().close()
@@ -126,7 +126,7 @@ class SerialLink(PolledLink):
         return [Chunk(data, time.monotonic_ns())] if data else []
 
     def _read_available(self) -> bytes:
-        """Read the bytes that arrive within the read timeout. Raise LinkLost if the device is gone."""
+        """Return the bytes that arrive within ``read_timeout``. Raise LinkLost if the device has failed."""
         port = self._port
         assert port is not None
         try:
@@ -156,14 +156,14 @@ class SerialLink(PolledLink):
 
 
 def _has_file_number(port: "serial.SerialBase") -> bool:
-    """Return True if the port can be read by its file descriptor: it is pyserial's own non-blocking POSIX port."""
+    """Return True if the port is a POSIX port of pyserial, which can be read through its file descriptor."""
     import serial
 
     return os.name == "posix" and type(port).read is serial.Serial.read
 
 
 def _why_not_open(port: str, error: Exception) -> str:
-    """Return one line with the reason why a port cannot be opened, and the remedy."""
+    """Return the reason why a port cannot be opened, and the remedy, in one line."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
         return f"{port}: no such port; {_list_ports()}"
@@ -179,7 +179,7 @@ def _why_not_open(port: str, error: Exception) -> str:
 
 
 def _list_ports() -> str:
-    """Return a list of the existing ports for a message."""
+    """Return a text that lists the existing serial ports."""
     from serial.tools import list_ports
 
     found = sorted(info.device for info in list_ports.comports())
@@ -187,12 +187,12 @@ def _list_ports() -> str:
 
 
 def build(settings: Settings) -> Link:
-    """Return the link of these settings without opening it."""
+    """Return the link without opening the port."""
     return SerialLink(settings)
 
 
 def _has_handler(scheme: str) -> bool:
-    """Return True if pyserial, or a package that extends it, has a handler for this URL scheme."""
+    """Return True if pyserial or an extension of pyserial has a handler for this URL scheme."""
     import serial
 
     packages: Any = serial.protocol_handler_packages

@@ -1,16 +1,18 @@
 """Messages of another system over zenoh, one message per chunk with its attachment.
 
-The link has its own session. The session does not scout or listen, and connects only to the endpoints of the settings.
-With one endpoint the session is a client, which needs the endpoint to open, because a router does not forward data
-between two peers, and most publishers are peers. With several endpoints the session is a peer, since a client would
-stay with the first endpoint that answers. A peer opens at once, and zenoh keeps trying to connect in the background. A
-missing publisher therefore causes silence and not ``LinkLost``.
+Each link has a zenoh session. The session does not scout or listen, and connects only to the configured endpoints.
 
-zenoh writes to a ring channel, which overwrites its oldest message when the channel is full. A decoder detects the loss
-by the sequence numbers. A thread of the link takes the messages from the channel and time-stamps them, because zenoh's
-channels have no timeout. No Python callback is registered, since a callback that exists at exit blocks the process.
-Closing the session ends the thread and a waiting ``read``. If a program ends without closing the session, ``atexit``
-closes the session. Otherwise a thread that still waits in zenoh would abort the process.
+A session with one endpoint is a client. A router does not forward data between two peers, and most publishers are
+peers, so a peer would receive nothing. A client can be opened only if the endpoint answers. A session with several
+endpoints is a peer, since a client would use only the first endpoint that answers. A peer is opened immediately, and
+zenoh connects in the background. If a publisher is missing, the link is therefore silent and ``LinkLost`` is not
+raised.
+
+zenoh writes messages to a ring channel, which overwrites the oldest message when the channel is full. A decoder detects
+the loss by the sequence numbers. A thread of the link takes the messages from the channel and time-stamps them, because
+the channels of zenoh have no timeout. No Python callback is registered, since a callback that exists at exit blocks the
+process. Closing the session ends the thread and a waiting ``poll_chunks``. If a program ends without closing the
+session, ``atexit`` closes the session, since a thread that waits in zenoh would abort the process.
 """
 
 import atexit
@@ -39,9 +41,9 @@ if TYPE_CHECKING:
 
 DEFAULT_DECODER: Final = "samples"
 MAX_MESSAGES: Final = 4096
-"""Maximum number of messages that wait to be read: four seconds at 1 kHz."""
+"""Maximum number of queued messages, four seconds at 1 kHz."""
 MAX_QUEUED_BYTES: Final = 128_000_000
-"""Maximum size of all messages that wait to be read: twice the longest message that a session accepts."""
+"""Maximum total size of the queued messages, twice the size of the longest message that a session accepts."""
 
 
 class Settings(LinkSettings):
@@ -68,7 +70,7 @@ class Settings(LinkSettings):
 
 
 class ZenohLink:
-    """Link to one subscription in a session of its own."""
+    """Link to one subscription in a separate zenoh session."""
 
     carrier: Carrier = "messages"
     epoch: Literal["monotonic", "unix"] = "monotonic"
@@ -79,13 +81,13 @@ class ZenohLink:
         self._opening = threading.Lock()
         self._changed = threading.Condition()
         self._waiting: deque[Chunk] = deque()
-        self._waiting_bytes = 0  # size of all waiting messages
+        self._waiting_bytes = 0  # total size of the waiting messages
         self._session: zenoh.Session | None = None
         self._receiver: threading.Thread | None = None
         self._running = False
 
     def open(self) -> None:
-        """Open the session and subscribe. A client needs its router. A peer also opens without another program."""
+        """Open the session and subscribe. A client needs the router, and a peer needs no other program."""
         import zenoh
 
         with self._opening:
@@ -113,7 +115,7 @@ class ZenohLink:
             atexit.register(self.close)
 
     def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
-        """Return the received messages, after waiting up to ``timeout_s`` seconds for the first."""
+        """Return the received messages, or None if nothing arrives within ``timeout_s`` seconds."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or not self._running, timeout_s)
             if self._waiting:
@@ -125,7 +127,7 @@ class ZenohLink:
             return None
 
     def close(self) -> None:
-        """Close the session and end a waiting ``read``."""
+        """Close the session and end a waiting ``poll_chunks``."""
         with self._opening:
             self._close_session()
 
@@ -133,7 +135,7 @@ class ZenohLink:
         """Move messages from the ring channel to the queue and time-stamp them, until the session is closed."""
         import zenoh
 
-        handler = subscriber.handler  # a subscriber cannot be undeclared while it waits
+        handler = subscriber.handler  # a subscriber that waits for messages cannot be undeclared
         try:
             while True:
                 sample = handler.recv()
@@ -142,7 +144,7 @@ class ZenohLink:
                     self._enqueue(chunk)
                     self._changed.notify_all()
         except zenoh.ZError:
-            pass  # close() or a failure of the session has closed the channel
+            pass  # the session was closed or has failed
         finally:
             with self._changed:
                 self._running = False
@@ -154,7 +156,7 @@ class ZenohLink:
         self._waiting_bytes = 0
 
     def _enqueue(self, chunk: Chunk) -> None:
-        """Queue the newest chunk, and drop the oldest chunks above the limits."""
+        """Queue a chunk, and drop the oldest chunks if the queue exceeds a limit."""
         self._waiting.append(chunk)
         self._waiting_bytes += len(chunk.data)
         while len(self._waiting) > 1 and (self._waiting_bytes > MAX_QUEUED_BYTES or len(self._waiting) > MAX_MESSAGES):
@@ -175,7 +177,7 @@ class ZenohLink:
             receiver.join()
 
     def _why_not_open(self, error: Exception) -> str:
-        """Return one line with the reason why the session cannot be opened."""
+        """Return the reason why the session cannot be opened, in one line."""
         config = _configuration(self._settings)
         endpoints = find_connect_endpoints(config)
         shown = mask_secrets(", ".join(endpoints)) or "(connect is empty)"
@@ -205,12 +207,12 @@ def _configuration(settings: Settings) -> "zenoh.Config":
 
 
 def build(settings: Settings) -> Link:
-    """Return the link of these settings without opening it.
+    """Return the link without opening the session.
 
     Raises
     ------
     ConfigError
-        zenoh refuses a key expression, an endpoint or a configuration file.
+        If zenoh refuses the key expression, an endpoint or the configuration file.
     """
     import zenoh
 

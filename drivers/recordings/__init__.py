@@ -1,16 +1,16 @@
 """Reading and writing of recordings: CSV (plain or gzip), .npz, Parquet, Arrow IPC, or a folder of segments.
 
-``load_samples`` reads a path and returns a ``Recording`` with times, six axes, temperature, a stated rate, and notes.
-Each note is a sentence about an irregularity of the file and how it was handled. The module of a format only finds the
-columns (``Table``). ``_assemble`` turns columns into a recording.
+``load_samples`` reads a file or a folder and returns a ``Recording`` with times, six axes, temperature, a stated rate,
+and notes. Each note describes an irregularity of the file and how the irregularity was handled. The module of each
+format finds the columns (``Table``), and ``_assemble`` converts the columns to a recording.
 
-There are three outcomes. A ``Recording`` has at least one sample. ``RecordingError`` means that the file is not a
-recording. Its text is one line that names the file, the error and the expected content. ``ConfigError`` means that a
-setting (``--rate``) or a package (pyarrow) is missing. A truncated file is read up to the cut. An incomplete line, an
-unreadable field, and a value that is infinite or beyond 1e100 are read as missing. A note counts them.
+A ``Recording`` has at least one sample. If the file is not a recording, a ``RecordingError`` names the file, the error
+and the expected content in one line. If a setting (``--rate``) or a package (pyarrow) is missing, a ``ConfigError`` is
+raised. The complete part of a truncated file is read. An incomplete line, an unreadable field, and a value that is
+infinite or beyond 1e100 are read as missing values. A note states the number of missing values.
 
-Times are returned as stored, with their jitter, gaps and steps back. The module does not resample, sort or interpolate
-data, it does not guess units, and it never unpickles objects.
+Times are returned as stored, including jitter, gaps and steps back. The module does not resample, sort or interpolate
+data, does not guess units, and never unpickles objects.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -42,20 +42,20 @@ __all__ = [
 ]
 
 MAX_VALUE: Final = 1e100
-"""Largest absolute value. Sums of squares of larger values can exceed the range of float64."""
+"""Largest absolute value. The sum of squares of larger values can exceed the range of float64."""
 TIME_RESOLUTION_S: Final = 1e-6
-"""Slightly more than the resolution of Unix times in a float64."""
+"""Slightly more than the resolution of Unix times in float64."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
     """All samples of a file or folder in stored order. The arrays are read-only."""
 
-    t_s: Floats | None  # [n] s as stored, any origin; None if only a rate is known
+    t_s: Floats | None  # [n] s as stored, with any origin; None if only a rate is known
     values: Floats  # [n, 6] in AXES order, rad/s and m/s²; NaN = missing or absent
     temperature_c: Floats  # [n] °C; NaN = missing or absent
-    rate_hz: float | None  # stated (fs of the file, or the caller's), not measured
-    axes: tuple[str, ...]  # axes present as columns, in AXES order
+    rate_hz: float | None  # rate that the file or the caller states, not a measured rate
+    axes: tuple[str, ...]  # axes with a column in the file, in AXES order
     notes: tuple[str, ...]  # irregularities of the file and how they were handled
 
     def __len__(self) -> int:
@@ -63,17 +63,16 @@ class Recording:
 
 
 def load_samples(path: Path, rate_hz: float | None = None, last_s: float | None = None) -> Recording:
-    """Read a recording, or a folder of segments in the order of their names as one recording.
+    """Read a recording from a file, or from the segments in a folder in the order of their names.
 
     Parameters
     ----------
     path
         File or folder.
     rate_hz
-        Sample rate in Hz for a file without ``t``. It takes precedence over ``fs`` of the file.
+        Sample rate in Hz for a file without ``t``. The argument takes precedence over ``fs`` in the file.
     last_s
-        Duration in s to take from the end of the recording. In a folder, only the segments of this duration are read.
-        None for the whole recording.
+        Duration in s of the part to read at the end of the recording. None for the whole recording.
 
     Raises
     ------
@@ -112,8 +111,8 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
     Yields
     ------
     SampleBlock
-        Block whose ``t_ns`` are the times of the recording. Without ``t``, the first sample is at 0 and the others
-        follow at the stated rate.
+        Samples with the times of the recording. If the recording has no times, the first sample is at 0 and the other
+        samples follow at the stated rate.
     """
     for start in range(0, len(recording), rows):
         part = slice(start, min(start + rows, len(recording)))
@@ -121,7 +120,7 @@ def iter_blocks(recording: Recording, rows: int = 4096) -> Iterator[SampleBlock]
 
 
 def _error_text(path: Path, error: RecordingError | OSError) -> str:
-    """Return why a file cannot be read, in one line that names the file."""
+    """Return the reason why a file cannot be read, in one line that names the file."""
     if isinstance(error, RecordingError):
         return str(error)
     return f"{error.filename or path}: cannot be read: {describe_error(error)}"
@@ -131,7 +130,7 @@ def _error_text(path: Path, error: RecordingError | OSError) -> str:
 
 
 def _load_file(path: Path, rate_hz: float | None) -> Recording:
-    """Read one file. A pipe or a device is refused, since it has no end."""
+    """Read one regular file."""
     check_regular(path)
     if path.stat().st_size:
         return _assemble(path, find_format(path).read(path), rate_hz)
@@ -146,7 +145,7 @@ def _load_file(path: Path, rate_hz: float | None) -> Recording:
 
 
 def _assemble(path: Path, table: Table, rate_hz: float | None) -> Recording:
-    """Turn columns into a recording: check lengths, choose times and rate, and mark missing values."""
+    """Convert columns to a recording."""
     n = _common_length(path, table.columns)
     notes = list(table.notes)
     rate = _choose_rate(_supported_fs(table.fs, notes), rate_hz, notes)
@@ -173,7 +172,7 @@ def _read_only_recording(
     axes: tuple[str, ...],
     notes: Sequence[str],
 ) -> Recording:
-    """Return a recording after making its arrays read-only. Each note becomes one line."""
+    """Make the arrays read-only, convert each note to one line, and return the recording."""
     for array in (t_s, values, temperature_c):
         if array is not None:
             array.flags.writeable = False
@@ -181,7 +180,7 @@ def _read_only_recording(
 
 
 def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
-    """Return the common length of all columns. Raise RecordingError if the lengths differ or are zero."""
+    """Return the length of all columns. Raise RecordingError if the lengths differ or are zero."""
     first = next(iter(columns))
     n = columns[first].size
     for name, column in columns.items():
@@ -195,7 +194,7 @@ def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
 
 
 def _supported_fs(fs: float | None, notes: list[str]) -> float | None:
-    """Return the rate that the file states. Return None and add a note if it is outside the supported range."""
+    """Return the rate in the file. If the rate is outside the supported range, return None and add a note."""
     try:
         return fs if fs is None else RATE_HZ.check(fs)
     except ConfigError as error:
@@ -204,7 +203,7 @@ def _supported_fs(fs: float | None, notes: list[str]) -> float | None:
 
 
 def _choose_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> float | None:
-    """Return the rate to use. The rate of the caller takes precedence over the rate in the file."""
+    """Return the rate of the caller if there is one, otherwise the rate in the file."""
     if rate_hz is not None and fs is not None and rate_hz != fs:
         notes.append(f"The file states {fs:g} Hz; the requested {rate_hz:g} Hz are used.")
     return fs if rate_hz is None else float(rate_hz)
@@ -213,7 +212,7 @@ def _choose_rate(fs: float | None, rate_hz: float | None, notes: list[str]) -> f
 def _usable_times(
     path: Path, t: Floats | None, rate_hz: float | None, notes: list[str]
 ) -> tuple[Floats | None, NDArray[np.bool_] | slice]:
-    """Return the usable times and a mask of their samples; None and all samples if ``t`` is not usable."""
+    """Return the usable times and the mask of their rows, or None and all rows if most times are unusable."""
     if t is None:
         return None, slice(None)
     usable = np.abs(t) < T_LIMIT_S  # False for NaN as well
@@ -230,7 +229,7 @@ def _usable_times(
 
 
 def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None:
-    """Replace values beyond MAX_VALUE by NaN, in place, and add a note with their number."""
+    """Replace values beyond MAX_VALUE by NaN in place, and add a note with the number of replaced values."""
     count = 0
     for array in (values, temperature_c):
         large = np.abs(array) > MAX_VALUE
@@ -241,7 +240,7 @@ def _drop_large(values: Floats, temperature_c: Floats, notes: list[str]) -> None
 
 
 def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
-    """Return the times of some samples in ns."""
+    """Return the times of a range of samples in ns."""
     if recording.t_s is not None:
         seconds = recording.t_s[part]
     elif recording.rate_hz is not None:
@@ -255,7 +254,7 @@ def _times_ns(recording: Recording, part: slice) -> NDArray[np.int64]:
 
 
 def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Recording:
-    """Read segments in the order of their names. A segment that cannot be read is left out, with a note."""
+    """Read the segments in a folder. If a segment cannot be read, skip the segment and add a note."""
     segments = sorted(p for p in path.iterdir() if is_recording(p) and p.name[0] != ".")
     if not segments:
         raise RecordingError(f"{path}: no recordings in this folder; known are {' '.join(FORMATS)}")
@@ -283,20 +282,20 @@ def _load_folder(path: Path, rate_hz: float | None, last_s: float | None) -> Rec
 
 
 def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> None:
-    """Raise an error if the rows of all segments exceed the limits. Unreadable segments do not count."""
+    """Raise an error if the total number of rows exceeds the limits. Unreadable segments are ignored."""
     rows = size_bytes = 0
     for segment in segments:
         try:
             check_regular(segment)
             rows += find_format(segment).count_rows(segment) if segment.stat().st_size else 0
         except (RecordingError, OSError):
-            continue  # left out, with a note, when the segment is read
+            continue  # the note about the segment is added when the segment is read
         size_bytes += segment.stat().st_size
         memory_check.ReadLimit(path, size_bytes, free).check_rows(rows)
 
 
 def _duration_s(parts: Sequence[Recording]) -> float:
-    """Return the time from the first sample of the oldest part to the last sample of the newest part, in s."""
+    """Return the time from the first to the last sample of all parts in s. The parts begin with the newest."""
     newest, oldest = parts[0].t_s, parts[-1].t_s
     if newest is not None and oldest is not None:
         return float(newest[-1] - oldest[0])
@@ -307,7 +306,7 @@ def _take_last(found: Recording, last_s: float) -> Recording:
     """Return the samples of the last ``last_s`` seconds."""
     if found.t_s is not None:
         older = np.flatnonzero(found.t_s <= found.t_s[-1] - last_s + TIME_RESOLUTION_S)
-        # the newest sample is always included, however short the duration
+        # the newest sample is always included
         first = min(int(older[-1]) + 1, len(found) - 1) if older.size else 0
     else:
         first = max(len(found) - max(round(last_s * (found.rate_hz or 0.0)), 1), 0)

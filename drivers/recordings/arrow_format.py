@@ -1,8 +1,8 @@
-"""Reading and writing of Parquet and Arrow IPC. pyarrow is optional and imported when a file needs it.
+"""Reading and writing of Parquet and Arrow IPC. pyarrow is optional and is imported only for these formats.
 
-An Arrow file is read batch by batch up to a truncation. A truncated Parquet file cannot be read, since its index is at
-the end. Before data are read, the stated numbers of rows and the types of the columns are checked against the limits
-of ``drivers.recordings.memory_check``.
+If an Arrow file is truncated, the complete batches are read. A truncated Parquet file cannot be read, since the index
+is at the end of the file. The stated number of rows is checked against the limits of
+``drivers.recordings.memory_check`` before data are read.
 """
 
 import os
@@ -15,28 +15,19 @@ import numpy as np
 
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import open_regular
-from drivers.recordings import memory_check
+from drivers.recordings import memory_check, table
 from drivers.recordings.arrow_message_sizes import check_buffer_sizes, count_buffers, iter_batch_sizes
-from drivers.recordings.table import (
-    BATCH_ROWS,
-    PARTIAL_SUFFIX,
-    AppendColumns,
-    Table,
-    check_column_count,
-    choose_columns,
-    describe_content,
-)
 
 METADATA_KEY: Final = b"imu-monitor"
-"""Key of the schema metadata that identifies a segment recorded by the daemon."""
+"""Key in the schema metadata of a segment that the daemon has recorded."""
 SEGMENT_COLUMNS: Final = ("ticks", "lost")
-"""Columns of such a segment that are not measurements. A reader does not report them as unused."""
+"""Columns of a segment that are not measurements. A reader does not report these columns as unused."""
 SLACK_BYTES: Final = 1 << 20
 """Allowed size of a compressed buffer in addition to the size that its rows need."""
 MAX_DICTIONARY_BYTES: Final = 64_000_000
 MAX_INDEX_BYTES: Final = 10_000_000
-"""Maximum size of the index of a Parquet file. pyarrow needs about ten times as much memory for it."""
-PARQUET_FOOTER: Final = b"\0\0\0\0PAR1"  # after the index; the zeros are replaced by its length
+"""Maximum size of the index of a Parquet file. pyarrow needs about ten times as much memory to read the index."""
+PARQUET_FOOTER: Final = b"\0\0\0\0PAR1"  # last bytes of a file, with zeros in place of the length of the index
 ARROW_MAGIC: Final = b"ARROW1\0\0"
 ARROW_END: Final = b"\xff\xff\xff\xff\0\0\0\0"  # end-of-stream mark of Arrow IPC
 
@@ -52,18 +43,18 @@ def import_pyarrow(path: Path) -> Any:
     try:
         import pyarrow as pa
     except ImportError as error:
-        whole = Path(str(path).removesuffix(PARTIAL_SUFFIX))
+        whole = Path(str(path).removesuffix(table.PARTIAL_SUFFIX))
         raise ConfigError(f'{whole}: {whole.suffix} needs pyarrow: pip install "imu-monitor[arrow]"') from error
     return pa
 
 
-def read_parquet(path: Path) -> Table:
+def read_parquet(path: Path) -> table.Table:
     """Read the known columns of a Parquet file.
 
     Raises
     ------
     RecordingError
-        If the file is not complete, is not Parquet, or exceeds a limit.
+        If the file is truncated, is not Parquet, or exceeds a limit.
     ConfigError
         If pyarrow is not installed, or the samples do not fit into the memory.
     """
@@ -74,16 +65,16 @@ def read_parquet(path: Path) -> Table:
 
 
 def count_parquet_rows(path: Path) -> int:
-    """Return the number of rows that the index states."""
+    """Return the number of rows according to the index."""
     with _open_parquet(path) as file:
         return _check_parquet(path, file, [])[1]
 
 
 def _check_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, str], int]:
-    """Return the columns to read and the number of rows, after checking both against the limits."""
+    """Check the limits, and return the columns to read and the number of rows."""
     metadata = file.metadata
-    check_column_count(path, metadata.num_columns)
-    chosen = choose_columns(path, file.schema_arrow.names, notes)
+    table.check_column_count(path, metadata.num_columns)
+    chosen = table.choose_columns(path, file.schema_arrow.names, notes)
     _check_types(path, file.schema_arrow, chosen)
     rows = int(metadata.num_rows)
     stated = sum(metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
@@ -93,7 +84,7 @@ def _check_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, s
 
 @contextmanager
 def _open_parquet(path: Path) -> Iterator[Any]:
-    """Open a Parquet file. Within the context, pyarrow's errors are raised as RecordingError."""
+    """Open a Parquet file. In the context, an error of pyarrow is converted to RecordingError."""
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
@@ -113,12 +104,14 @@ def _open_parquet(path: Path) -> Iterator[Any]:
         except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
             raise RecordingError(
                 f"{path}: is no complete Parquet file ({first_line(error)}); its index is at the end, "
-                f"so a file that is cut off cannot be read{describe_content(path)}"
+                f"so a file that is cut off cannot be read{table.describe_content(path)}"
             ) from error
 
 
-def read_ipc(path: Path) -> Table:
-    """Read Arrow IPC up to a truncation. A file is a stream after a magic word, so both are read as streams.
+def read_ipc(path: Path) -> table.Table:
+    """Read the known columns of an Arrow file or stream. If the file is truncated, read the complete batches.
+
+    An Arrow file is an Arrow stream between two magic words, so a file is read like a stream.
 
     Raises
     ------
@@ -133,7 +126,9 @@ def read_ipc(path: Path) -> Table:
     with open_regular(path) as file:
         schema = _ipc_schema(path, file)
         own = METADATA_KEY in (schema.metadata or {})
-        chosen = choose_columns(path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes)
+        chosen = table.choose_columns(
+            path, [name for name in schema.names if not (own and name in SEGMENT_COLUMNS)], notes
+        )
         count, _ = _check_ipc(path, start, schema, chosen)
         if not _has_end_mark(path, start > 0):
             notes.append("The file has no end mark; it is cut off and was read up to the cut.")
@@ -147,7 +142,7 @@ def read_ipc(path: Path) -> Table:
                 batch.validate()
                 batches.append(batch)
         except StopIteration:
-            pass  # the regular end of the stream
+            pass  # the stream has ended
         except (pa.ArrowException, OSError) as error:
             notes.append(f"Only {len(batches)} complete batches could be read: {first_line(error)}.")
     schema = batches[0].schema if batches else schema
@@ -155,19 +150,19 @@ def read_ipc(path: Path) -> Table:
 
 
 def count_ipc_rows(path: Path) -> int:
-    """Return the number of rows of all batches up to a truncation."""
+    """Return the total number of rows of all complete batches."""
     with open_regular(path) as file:
         return _check_ipc(path, _ipc_start(path), _ipc_schema(path, file), {})[1]
 
 
 def _ipc_start(path: Path) -> int:
-    """Return the offset of the stream, which is after the magic word of a file."""
+    """Return the offset of the stream in bytes: the length of the magic word for a file, 0 for a stream."""
     with open_regular(path) as file:
         return len(ARROW_MAGIC) if file.read(len(ARROW_MAGIC)) == ARROW_MAGIC else 0
 
 
 def _has_end_mark(path: Path, is_file: bool) -> bool:
-    """Return True if the file ends with the end mark of its format."""
+    """Return True if the file or stream ends with its end mark, so that it is not truncated."""
     mark = ARROW_MAGIC.rstrip(b"\0") if is_file else ARROW_END
     with open_regular(path) as file:
         file.seek(max(path.stat().st_size - len(mark), 0))
@@ -175,22 +170,22 @@ def _has_end_mark(path: Path, is_file: bool) -> bool:
 
 
 def _ipc_schema(path: Path, file: Any) -> Any:
-    """Return the schema of the stream in an open file. Raise RecordingError if there is none."""
+    """Return the schema of an open file. Raise RecordingError if the file is not Arrow IPC."""
     pa = import_pyarrow(path)
     try:
         file.seek(_ipc_start(path))
         schema = pa.ipc.open_stream(file).schema
-        check_column_count(path, len(schema))
+        table.check_column_count(path, len(schema))
         schema.names, schema.metadata  # noqa: B018 - raises for names that are not UTF-8
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
-            f"{path}: is no Arrow IPC file or stream ({first_line(error)}){describe_content(path)}"
+            f"{path}: is no Arrow IPC file or stream ({first_line(error)}){table.describe_content(path)}"
         ) from error
     return schema
 
 
 def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -> tuple[int, int]:
-    """Return the number of record batches and of rows, after checking sizes and column types against the limits."""
+    """Check the limits and the column types, and return the numbers of record batches and rows."""
     pa = import_pyarrow(path)
     _check_types(path, schema, chosen)
     counts = [
@@ -228,34 +223,21 @@ def _check_types(path: Path, schema: Any, chosen: Mapping[str, str]) -> None:
             raise RecordingError(f"{path}: {key} contains {type_}, expected numbers{unit}")
 
 
-def _float_table(path: Path, table: Any, chosen: Mapping[str, str], notes: list[str]) -> Table:
-    """Return the chosen columns of a pyarrow table as float64, with null as NaN."""
+def _float_table(path: Path, data: Any, chosen: Mapping[str, str], notes: list[str]) -> table.Table:
+    """Return the chosen columns of a pyarrow table as float64. Null values become NaN."""
     float64 = import_pyarrow(path).float64()
-    columns = {name: table.column(key).cast(float64, safe=False).to_numpy() for name, key in chosen.items()}
-    return Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes)
+    columns = {name: data.column(key).cast(float64, safe=False).to_numpy() for name, key in chosen.items()}
+    return table.Table({name: np.asarray(column, np.float64) for name, column in columns.items()}, None, notes)
 
 
 def first_line(error: Exception) -> str:
-    """Return the first line of an exception's text without a full stop at the end."""
+    """Return the first line of the text of an exception, without a final full stop."""
     return str(error).strip().partition("\n")[0].rstrip(".")
 
 
 @contextmanager
-def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[AppendColumns]:
-    """Write Parquet with its default compression.
-
-    Parameters
-    ----------
-    path
-        File to write.
-    names
-        Names of the columns.
-
-    Yields
-    ------
-    AppendColumns
-        Function that appends rows. Each call writes one row group.
-    """
+def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
+    """Write a Parquet file with the default compression. Each call of the yielded function writes one row group."""
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
@@ -265,22 +247,12 @@ def open_parquet_writer(path: Path, names: Sequence[str]) -> Iterator[AppendColu
 
 
 @contextmanager
-def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> Iterator[AppendColumns]:
-    """Write an Arrow file (Feather version 2) or an Arrow stream.
-
-    Parameters
-    ----------
-    path
-        File to write.
-    names
-        Names of the columns.
-    stream
-        True for a stream.
-    """
+def open_ipc_writer(path: Path, names: Sequence[str], stream: bool = False) -> Iterator[table.AppendColumns]:
+    """Write an Arrow file (Feather version 2), or an Arrow stream if ``stream`` is True."""
     pa = import_pyarrow(path)
     schema = _float_schema(pa, names)
     with (pa.ipc.new_stream if stream else pa.ipc.new_file)(str(path), schema) as file:
-        yield lambda columns: file.write_table(pa.table(dict(columns), schema), max_chunksize=BATCH_ROWS)
+        yield lambda columns: file.write_table(pa.table(dict(columns), schema), max_chunksize=table.BATCH_ROWS)
 
 
 def _float_schema(pa: Any, names: Sequence[str]) -> Any:

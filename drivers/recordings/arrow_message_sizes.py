@@ -1,12 +1,12 @@
-"""Sizes of the messages of an Arrow IPC stream, read before data are unpacked.
+"""Stated sizes of the messages in an Arrow IPC stream, read before data are unpacked.
 
-A record batch states its number of rows, and a compressed buffer its unpacked size. pyarrow allocates the stated sizes
-and does not accept a limit. ``iter_batch_sizes`` therefore parses the metadata of each message. It reads the framing,
-the fields of the flatbuffer that state sizes, and the first eight bytes of each compressed buffer.
+A record batch states the number of rows, and a compressed buffer states the unpacked size. pyarrow allocates the stated
+sizes and does not support a limit. ``iter_batch_sizes`` therefore reads the sizes from the metadata of each message and
+from the first eight bytes of each compressed buffer.
 
 Sources: the Arrow columnar format, "Encapsulated message format" and "Compression",
-https://arrow.apache.org/docs/format; format/Message.fbs and Schema.fbs for the numbers of the fields; the FlatBuffers
-internals for tables and vectors.
+https://arrow.apache.org/docs/format; format/Message.fbs and Schema.fbs for the field numbers; the FlatBuffers internals
+for tables and vectors.
 """
 
 import os
@@ -17,7 +17,7 @@ from typing import IO, Any, Final
 
 CONTINUATION: Final = 0xFFFFFFFF
 MAX_METADATA_BYTES: Final = 64_000_000
-"""Maximum size of the metadata of one message. A schema of 10 000 columns needs about 2 MB."""
+"""Maximum size of the metadata of one message. A schema with 10 000 columns has about 2 MB."""
 SCHEMA: Final = 1  # values of MessageHeader
 DICTIONARY_BATCH: Final = 2
 RECORD_BATCH: Final = 3
@@ -33,28 +33,23 @@ BUFFER: Final = struct.Struct("<qq")  # offset in the body, length
 
 @dataclass(frozen=True, slots=True)
 class StatedBatchSize:
-    """Stated size of one record batch or dictionary."""
+    """Stated size of one record batch or dictionary batch."""
 
     rows: int
-    body_bytes: int  # in the file
+    body_bytes: int  # size in the file
     buffers: tuple[int, ...]  # unpacked size of each buffer in bytes
-    dictionary: bool  # True for a dictionary
+    dictionary: bool  # True for a dictionary batch
 
 
 def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSize]:
-    """Yield the stated sizes of the batches of a stream up to the end, a truncation or damaged metadata.
+    """Yield the stated size of each batch in a stream. Stop if the stream is truncated or the metadata are damaged.
 
     Parameters
     ----------
     file
-        Binary file that can seek.
+        Seekable binary file.
     start
         Offset of the stream in the file, in bytes.
-
-    Yields
-    ------
-    StatedBatchSize
-        Size of each record batch and dictionary, in the order of the file.
     """
     end = file.seek(0, os.SEEK_END)
     at = start
@@ -62,7 +57,7 @@ def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSiz
         file.seek(at)
         mark, size = struct.unpack("<II", file.read(8))
         at += 8
-        if mark != CONTINUATION:  # streams written before Arrow 0.15 lack the mark
+        if mark != CONTINUATION:  # versions before Arrow 0.15 do not write the mark
             size, at = mark, at - 4
         if not 0 < size <= MAX_METADATA_BYTES or at + size > end:
             return
@@ -87,7 +82,7 @@ def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSiz
 
 
 def check_buffer_sizes(size: StatedBatchSize, counts: Sequence[int | None], slack_bytes: int) -> str:
-    """Check that no buffer of a numeric column is larger after unpacking than the rows of the batch need.
+    """Check that the unpacked buffers of numeric columns are not larger than the number of rows requires.
 
     Parameters
     ----------
@@ -95,14 +90,15 @@ def check_buffer_sizes(size: StatedBatchSize, counts: Sequence[int | None], slac
         Stated size of the batch.
     counts
         Number of buffers of each column in the order of the schema. The number is negative if the column is not read,
-        and None if it is unknown. All buffers after an unknown number are checked.
+        and None if the number of buffers is unknown. If a number is unknown, all buffers from this column on are
+        checked.
     slack_bytes
-        Size allowed in addition to eight bytes per row.
+        Allowed size in addition to eight bytes per row.
 
     Returns
     -------
     str
-        Description of the error, "" if there is none.
+        Description of the error; "" if there is no error.
     """
     most = 8 * size.rows + slack_bytes
     at = 0
@@ -131,7 +127,7 @@ def count_buffers(pa: Any, type_: Any) -> int | None:
     Returns
     -------
     int or None
-        None if the type is nested or has views, and the number therefore varies.
+        None if the number varies, because the type is nested or has views.
     """
     types = pa.types
     if types.is_null(type_):
@@ -145,7 +141,7 @@ def count_buffers(pa: Any, type_: Any) -> int | None:
 
 
 def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> StatedBatchSize:
-    """Return the stated size of a batch whose body begins at the offset ``body`` of the file."""
+    """Return the stated size of the batch whose body begins at the offset ``body`` in the file."""
     rows = batch.read_number(BATCH_LENGTH, "q")
     packed = batch.has_field(BATCH_COMPRESSION)
     sizes = []
@@ -161,7 +157,7 @@ def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: in
 
 @dataclass(frozen=True, slots=True)
 class _Table:
-    """Table of a flatbuffer. The methods raise struct.error or LookupError for offsets outside of the buffer."""
+    """Table of a flatbuffer. The methods raise struct.error or LookupError if an offset is outside the buffer."""
 
     data: bytes
     at: int
@@ -176,19 +172,19 @@ class _Table:
         return self._field(field) != 0
 
     def read_number(self, field: int, number_format: str) -> int:
-        """Return a number; 0 if the field is absent. ``number_format`` is a format of the module struct."""
+        """Return a number; 0 if the field is absent. ``number_format`` is a format character of ``struct``."""
         at = self._field(field)
         return int(_unpack_number(f"<{number_format}", self.data, at)) if at else 0
 
     def read_table(self, field: int) -> "_Table":
-        """Return a table that this table refers to."""
+        """Return the table to which a field refers."""
         at = self._field(field)
         if not at:
             raise LookupError(field)
         return _Table(self.data, at + _unpack_number("<I", self.data, at))
 
     def read_structs(self, field: int, layout: struct.Struct) -> Iterator[tuple[Any, ...]]:
-        """Yield the unpacked structs of a vector; nothing if the field is absent."""
+        """Yield the structs in a vector; nothing if the field is absent."""
         at = self._field(field)
         if not at:
             return iter(())

@@ -1,10 +1,11 @@
 """Reading and writing of CSV recordings, plain or gzip. An empty field or ``nan`` is a missing value.
 
-Blank lines and comment lines (``#`` or ``%``) before the header are skipped. The header itself may be a comment.
+Blank lines and comment lines (``#`` or ``%``) before the header are skipped. The header itself may be a comment line.
 
-Text is parsed in pieces of complete lines. A piece of regular lines is parsed at once. Any other piece is parsed line
-by line, so that a damaged line affects no other line and is reported by its number. A last line without a line end may
-be cut inside a number and is left out. A file with more bad lines than good lines is not a recording.
+The text is parsed in pieces of complete lines. If all lines of a piece are regular, NumPy parses the whole piece.
+Otherwise each line is parsed separately, so that a damaged line does not affect other lines and is reported with the
+line number. A last line without a line end is skipped, since it may end inside a number. A file with more bad lines
+than good lines is not a recording.
 
 The lines are counted before they are parsed, and their number is checked against the limits of
 ``drivers.recordings.memory_check``. Reading ends at a line that is longer than ``MAX_LINE_BYTES``.
@@ -25,32 +26,24 @@ import numpy as np
 
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular
-from drivers.recordings import memory_check
-from drivers.recordings.table import (
-    BATCH_ROWS,
-    EXAMPLE_HEADER,
-    AppendColumns,
-    Columns,
-    Table,
-    check_column_count,
-    choose_columns,
-    describe_content,
-)
+from drivers.recordings import memory_check, table
 from drivers.sample import AXES, Floats
 
 READ_BYTES: Final = 1 << 20
 MAX_LINE_BYTES: Final = 1 << 20
 MAX_PREAMBLE_BYTES: Final = 1 << 20
-"""Maximum size of the blank lines and comments before the header."""
+"""Maximum total size of the blank lines and comments before the header."""
 MAX_EMPTY_MEMBERS: Final = 1000
 """Maximum number of consecutive gzip members without content."""
 MAX_BAD_LINES: Final = 100_000
-"""Number of bad lines after which reading stops if there are more bad lines than good lines."""
+"""Number of bad lines after which reading stops if most lines are bad."""
 COMMENT_MARKS: Final = (b"#", b"%")
 BOM: Final = b"\xef\xbb\xbf"
-GZIP_BYTES: Final = 1 << 16  # a damaged gzip file loses at most this many bytes before the damage
+GZIP_BYTES: Final = 1 << 16
+"""Number of compressed bytes that are decompressed at once. In a damaged file, at most this part is lost."""
 GZIP_MAGIC: Final = b"\x1f\x8b"
-GZIP_LEVEL: Final = 1  # digits of noise hardly compress: level 6 saves a further 6 % but takes eight times as long
+GZIP_LEVEL: Final = 1
+"""Compression level. Level 6 reduces the size of noise data by a further 6 % but takes eight times as long."""
 
 
 @dataclass(slots=True)
@@ -61,13 +54,13 @@ class _BadLines:
     first: str = ""
 
     def count_line(self, number: int, reason: str) -> None:
-        """Count the bad line with this number."""
+        """Count a bad line, and store the description of the first bad line."""
         self.first = self.first or f"line {number}: {reason}"
         self.count += 1
 
 
-def read_csv(path: Path) -> Table:
-    """Read a plain or gzip CSV file up to a truncation.
+def read_csv(path: Path) -> table.Table:
+    """Read the known columns of a plain or gzip CSV file. If the file is truncated, read the complete lines.
 
     Raises
     ------
@@ -84,9 +77,9 @@ def read_csv(path: Path) -> Table:
         head = _find_header(path, texts)
         if head is None:
             what = notes[-1] if notes else "It has no line at all."
-            raise RecordingError(f"{path}: has not one complete line, expected {EXAMPLE_HEADER}. {what}")
+            raise RecordingError(f"{path}: has not one complete line, expected {table.EXAMPLE_HEADER}. {what}")
         names = _column_names(path, head)
-        chosen = choose_columns(path, names, notes, f" in line {head.number}")
+        chosen = table.choose_columns(path, names, notes, f" in line {head.number}")
         use = [names.index(name) for name in chosen.values()]
         parts = list(_parse_pieces(path, head, texts, names, use, bad))
     rows = np.concatenate(parts) if parts else np.empty((0, len(use)))
@@ -97,11 +90,11 @@ def read_csv(path: Path) -> Table:
     if not len(rows):
         what = f". {notes[-1]}" if notes else ""
         raise RecordingError(f"{path}: has a header line but no complete line of samples after it{what}")
-    return Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
+    return table.Table({name: rows[:, i] for i, name in enumerate(chosen)}, None, notes)
 
 
 def count_csv_rows(path: Path) -> int:
-    """Return the number of lines of a text up to a truncation, after checking number and size against the limits."""
+    """Return the number of complete lines. Raise an error if the number of lines or the unpacked size is too large."""
     limit = memory_check.measure_read_limit(path)
     lines = unpacked = 0
     with open_regular(path) as file:
@@ -115,16 +108,16 @@ def count_csv_rows(path: Path) -> int:
 
 
 def _too_many_bad_lines(path: Path, bad: _BadLines, rows: int) -> RecordingError:
-    """Return the error for a file with mostly bad lines."""
+    """Return the error for a file in which most lines are bad."""
     return RecordingError(
         f"{path}: {bad.count} of {rows} lines are not samples ({bad.first}); every field must be a number, empty or nan"
     )
 
 
 def _decompressed(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
-    """Yield the text of a plain or gzip file up to a truncation or damage, in pieces of at most READ_BYTES.
+    """Yield the text of a plain or gzip file in pieces of at most READ_BYTES. Stop if the file is truncated or damaged.
 
-    The first bytes of the file, not its name, decide whether it is compressed.
+    The first bytes of the file, not the file name, determine whether the file is compressed.
     """
     zipped = file.read(2) == GZIP_MAGIC
     file.seek(0)
@@ -158,11 +151,8 @@ def _decompressed(file: IO[bytes], notes: list[str]) -> Iterator[bytes]:
 
 
 def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
-    """Yield the text in pieces that end with a complete line. A last line without a line end is left out.
-
-    Reading ends at a line that is longer than MAX_LINE_BYTES.
-    """
-    rest: list[bytes] = []  # parts of the beginning of a line
+    """Yield the text in pieces of complete lines. Stop at a line that is longer than MAX_LINE_BYTES."""
+    rest: list[bytes] = []  # parts of an incomplete line
     size = lines = 0
     for text in texts:
         whole, end, tail = text.rpartition(b"\n")
@@ -182,10 +172,10 @@ def _whole_lines(texts: Iterable[bytes], notes: list[str]) -> Iterator[bytes]:
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    """Header line of a text, and the complete lines that were read with it."""
+    """Header line, and the lines that were read together with the header line."""
 
     line: bytes
-    number: int
+    number: int  # line number of the header
     rest: bytes
     rest_number: int  # line number of the first line of ``rest``
 
@@ -193,8 +183,8 @@ class _Header:
 def _find_header(path: Path, texts: Iterator[bytes]) -> _Header | None:
     """Find the header line after blank lines and comments; None if the text has no complete line.
 
-    The header is the first line that is not a comment. If that line names no axis but the last comment before it does,
-    the comment is the header, as ``numpy.savetxt`` writes it.
+    The header is the first line that is not a comment. ``numpy.savetxt`` writes the header as a comment. The last
+    comment is therefore the header if the comment names an axis and the line after the comment does not.
     """
     number = size = 0
     comment: _Header | None = None
@@ -213,7 +203,7 @@ def _find_header(path: Path, texts: Iterator[bytes]) -> _Header | None:
             if size > MAX_PREAMBLE_BYTES:
                 raise RecordingError(
                     f"{path}: has no header line within its first {number} lines, only comments and blank lines; "
-                    f"expected {EXAMPLE_HEADER} within {MAX_PREAMBLE_BYTES} bytes"
+                    f"expected {table.EXAMPLE_HEADER} within {MAX_PREAMBLE_BYTES} bytes"
                 )
     if comment is None and number:
         return _Header(b"", number, b"", number + 1)
@@ -221,16 +211,17 @@ def _find_header(path: Path, texts: Iterator[bytes]) -> _Header | None:
 
 
 def _has_axis(line: bytes) -> bool:
-    """Return True if a field of this line, without its comment mark, is the name of an axis."""
+    """Return True if a field of the line is the name of an axis. Ignore a comment mark before the first field."""
     fields = line.lstrip(b"#% ").decode("utf-8", errors="replace").split(",")
     return any(field.strip(' \t"') in AXES for field in fields)
 
 
 def _column_names(path: Path, head: _Header) -> list[str]:
-    """Return the column names of the header line. Raise RecordingError if it is not a header."""
+    """Return the column names in a header line. Raise RecordingError if the line is not a header."""
     if b"\0" in head.line or not head.line:
         raise RecordingError(
-            f"{path}: is no CSV text, expected a first line such as {EXAMPLE_HEADER}{describe_content(path)}"
+            f"{path}: is no CSV text, expected a first line such as {table.EXAMPLE_HEADER}"
+            f"{table.describe_content(path)}"
         )
     text = head.line.decode("utf-8", errors="replace")
     for separator, word in ((";", "semicolons"), ("\t", "tabs")):
@@ -238,12 +229,12 @@ def _column_names(path: Path, head: _Header) -> list[str]:
             raise RecordingError(
                 f"{path}: the columns of line {head.number} are separated by {word}; separate them by commas"
             )
-    check_column_count(path, text.count(",") + 1)
+    table.check_column_count(path, text.count(",") + 1)
     names = [name.strip(' \t"') for name in _split_fields(text)]
     if all(_parse_number(name) is not None for name in names):
         raise RecordingError(
             f"{path}: the header line is missing: line {head.number} consists of numbers; "
-            f"expected a header line such as {EXAMPLE_HEADER}"
+            f"expected a header line such as {table.EXAMPLE_HEADER}"
         )
     return names
 
@@ -267,7 +258,7 @@ def _parse_pieces(
 
 
 def _parse_regular_lines(text: bytes, lines: list[str], width: int, use: Sequence[int]) -> Floats | None:
-    """Return an array [lines, used columns] if every line has all its fields and all are numbers, otherwise None."""
+    """Return an array [lines, used columns], or None if a line has missing fields or a field is not a number."""
     codes = np.frombuffer(text, np.uint8)
     commas_before = np.searchsorted(np.flatnonzero(codes == ord(",")), np.flatnonzero(codes == ord("\n")))
     if np.any(np.diff(commas_before, prepend=0) != width - 1):
@@ -281,7 +272,7 @@ def _parse_regular_lines(text: bytes, lines: list[str], width: int, use: Sequenc
 def _parse_line_by_line(
     lines: Sequence[str], number: int, names: Sequence[str], use: Sequence[int], bad: _BadLines
 ) -> Floats:
-    """Return an array [lines, used columns]. A line that is not a sample becomes a row of missing values."""
+    """Return an array [lines, used columns]. A bad line becomes a row of missing values."""
     missing = [np.nan] * len(use)
     rows: list[list[float]] = []
     for offset, line in enumerate(lines):
@@ -296,7 +287,7 @@ def _parse_line_by_line(
 
 
 def _parse_sample(line: str, names: Sequence[str], use: Sequence[int]) -> list[float]:
-    """Return the used fields of one line. Raise ValueError with the reason if the line is not a sample."""
+    """Return the numbers in the used fields of one line. Raise ValueError with the reason if the line is bad."""
     fields = _split_fields(line)
     if len(fields) != len(names):
         raise ValueError(f"{len(fields)} fields where the header has {len(names)}")
@@ -310,7 +301,7 @@ def _parse_sample(line: str, names: Sequence[str], use: Sequence[int]) -> list[f
 
 
 def _split_fields(line: str) -> list[str]:
-    """Return the fields of one line."""
+    """Split a line into fields."""
     if '"' not in line:
         return line.split(",")
     try:
@@ -320,7 +311,7 @@ def _split_fields(line: str) -> list[str]:
 
 
 def _parse_number(field: str) -> float | None:
-    """Return a number, NaN for an empty field, or None for text. ``float`` alone would accept 1_000."""
+    """Return the number in a field, NaN for an empty field, or None for text. Unlike ``float``, reject 1_000."""
     if not field or field.isspace():
         return float("nan")
     try:
@@ -330,18 +321,11 @@ def _parse_number(field: str) -> float | None:
 
 
 @contextmanager
-def open_csv_writer(path: Path, names: Sequence[str], packed: bool = False) -> Iterator[AppendColumns]:
-    """Write one header line and one line per sample. A missing value is written as ``nan``.
+def open_csv_writer(path: Path, names: Sequence[str], packed: bool = False) -> Iterator[table.AppendColumns]:
+    """Write a CSV file with one header line and one line per sample. A missing value is written as ``nan``.
 
-    Parameters
-    ----------
-    path
-        File to write.
-    names
-        Names of the columns.
-    packed
-        True if the file is compressed with gzip. The gzip header has no time stamp, so that equal columns give equal
-        bytes.
+    If ``packed`` is True, the file is compressed with gzip. The gzip header has no time stamp, so that equal data give
+    equal files.
     """
     with ExitStack() as stack:
         raw: IO[bytes] = stack.enter_context(path.open("wb"))
@@ -350,10 +334,10 @@ def open_csv_writer(path: Path, names: Sequence[str], packed: bool = False) -> I
         file = stack.enter_context(io.TextIOWrapper(raw, "ascii", newline=""))
         file.write(",".join(names) + "\n")
 
-        def append(columns: Columns) -> None:
-            """Append rows. ``repr`` gives the shortest text that reads back as the same float64."""
-            for start in range(0, columns[names[0]].size, BATCH_ROWS):
-                fields = [map(repr, columns[name][start : start + BATCH_ROWS].tolist()) for name in names]
+        def append(columns: table.Columns) -> None:
+            """Append rows. ``repr`` gives the shortest text from which the same float64 can be read."""
+            for start in range(0, columns[names[0]].size, table.BATCH_ROWS):
+                fields = [map(repr, columns[name][start : start + table.BATCH_ROWS].tolist()) for name in names]
                 file.writelines(",".join(row) + "\n" for row in zip(*fields, strict=True))
 
         yield append

@@ -1,16 +1,16 @@
-"""Limits on the memory that a reader allocates, and the available memory.
+"""Limits on the size of a recording, and the available memory.
 
 A reader checks the size of a recording before it allocates memory for the samples. If a process allocates more memory
-than the machine has, the kernel ends the process and possibly the daemon on the same machine. A compressed file of a
-few megabytes can hold gigabytes, so a check of the file size is not sufficient.
+than the machine has, the kernel kills the process and possibly the daemon on the same machine. A compressed file of a
+few megabytes can contain gigabytes of data, so a check of the file size is not sufficient.
 
-Four limits apply. The memory limit depends on the machine. The other three limits are constants, which
-docs/recording.md lists:
+Four limits apply (docs/recording.md). Only the first limit depends on the machine.
 
-- the samples and their copies fit into the available memory;
-- a file holds at most ``MIN_ROW_LIMIT`` rows, or ``MAX_ROWS_PER_BYTE`` rows per byte on disk if that is more;
-- a file unpacks to at most ``MIN_UNPACKED_LIMIT_BYTES``, or ``MAX_UNPACKING_RATIO`` times its size if that is more;
-- a file has at most ``MAX_COLUMNS`` columns.
+- The samples and their copies must fit into the available memory.
+- A file contains at most ``MIN_ROW_LIMIT`` rows or ``MAX_ROWS_PER_BYTE`` rows per byte on disk, whichever is more.
+- The unpacked size is at most ``MIN_UNPACKED_LIMIT_BYTES`` or ``MAX_UNPACKING_RATIO`` times the size on disk, whichever
+  is more.
+- A file has at most ``MAX_COLUMNS`` columns.
 """
 
 import os
@@ -28,12 +28,12 @@ OWN_CGROUPS: Final = Path("/proc/self/cgroup")
 STATM: Final = Path("/proc/self/statm")
 
 COPIES: Final = 3.0
-"""Minimum number of copies of the samples that an analysis holds at once."""
+"""Minimum number of copies of the samples in memory during an analysis."""
 ROW_BYTES: Final = 64
 """Size of one sample in memory: time, six axes and temperature as float64."""
 MIN_ROW_LIMIT: Final = 20_000_000
 MAX_ROWS_PER_BYTE: Final = 8
-"""Maximum number of rows per byte. A row of measured values needs more than one bit in every format."""
+"""Maximum number of rows per byte on disk. In every format, a row of measured values needs more than one bit."""
 MIN_UNPACKED_LIMIT_BYTES: Final = 2_000_000_000
 MAX_UNPACKING_RATIO: Final = 100
 MAX_COLUMNS: Final = 10_000
@@ -41,31 +41,21 @@ MAX_COLUMNS: Final = 10_000
 
 @dataclass(frozen=True, slots=True)
 class ReadLimit:
-    """Limits on one file, or on a folder of files.
-
-    Parameters
-    ----------
-    path
-        File or folder that error messages name.
-    size_bytes
-        Size on disk.
-    free
-        Available memory in bytes. None if the system does not state it.
-    """
+    """Limits on the size of one file or one folder."""
 
     path: Path
-    size_bytes: int
-    free: int | None
+    size_bytes: int  # size on disk
+    free: int | None  # available memory in bytes; None if unknown
 
     def check_rows(self, rows: int) -> None:
-        """Check a number of samples before they are read.
+        """Check the number of samples before the samples are read.
 
         Raises
         ------
         RecordingError
             If the file is too small to contain this number of measured samples.
         ConfigError
-            If the samples and the copies that an analysis makes of them do not fit into the available memory.
+            If the samples and the copies for an analysis do not fit into the available memory.
         """
         if rows > max(MIN_ROW_LIMIT, MAX_ROWS_PER_BYTE * self.size_bytes):
             raise RecordingError(
@@ -80,13 +70,7 @@ class ReadLimit:
             )
 
     def check_unpacked(self, unpacked_bytes: int) -> None:
-        """Check the number of bytes that have been unpacked so far.
-
-        Raises
-        ------
-        RecordingError
-            If the file unpacks to more than the limit.
-        """
+        """Raise RecordingError if the unpacked size so far exceeds the limit."""
         if unpacked_bytes > max(MIN_UNPACKED_LIMIT_BYTES, MAX_UNPACKING_RATIO * self.size_bytes):
             raise RecordingError(
                 f"{self.path}: unpacks to more than {unpacked_bytes / 1e9:.1f} GB from {self.size_bytes / 1e6:.1f} MB; "
@@ -96,15 +80,15 @@ class ReadLimit:
 
 
 def measure_read_limit(path: Path) -> ReadLimit:
-    """Return the limits on a file, with the memory that is available now. Raise OSError if the file does not exist."""
+    """Return the limits on a file with the presently available memory. Raise OSError if the file does not exist."""
     return ReadLimit(path, path.stat().st_size, available_bytes())
 
 
 def available_bytes() -> int | None:
-    """Return the memory that is available to this process in bytes; None if the system states no limit.
+    """Return the memory that is available to this process in bytes; None if unknown.
 
-    The available memory is the minimum of the available memory of the system, of the control groups of the process
-    (container or service limits) and of the limits of the process (``ulimit -v``, ``ulimit -d``).
+    The result is the minimum of the memory that the system, the control groups of the process (container or service
+    limits) and the resource limits of the process (``ulimit -v``, ``ulimit -d``) leave available.
     """
     stated = (available_system_bytes(), available_cgroup_bytes(), available_process_bytes())
     known = [n for n in stated if n is not None]
@@ -112,15 +96,15 @@ def available_bytes() -> int | None:
 
 
 def available_system_bytes(meminfo: Path = MEMINFO) -> int | None:
-    """Return the available memory of the system in bytes; None if the system does not state it."""
+    """Return the available memory of the system in bytes; None if unknown."""
     found = _parse_fields(meminfo, ":").get("MemAvailable")
     return None if found is None else 1024 * found
 
 
 def available_cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int | None:
-    """Return the memory that the control groups of this process leave available, in bytes; None without a limit.
+    """Return the memory in bytes that the control groups of this process leave available; None without a limit.
 
-    Page cache counts as available, since the kernel drops it when the group reaches its limit.
+    The page cache counts as available memory, since the kernel can drop the cache.
 
     Parameters
     ----------
@@ -134,7 +118,7 @@ def available_cgroup_bytes(own: Path = OWN_CGROUPS, root: Path = CGROUPS) -> int
 
 
 def available_process_bytes(statm: Path = STATM) -> int | None:
-    """Return the bytes of address space and data that the limits of the process leave; None without a limit."""
+    """Return the memory in bytes that the resource limits of the process leave available; None without a limit."""
     try:
         pages = [int(n) for n in statm.read_text().split()]
     except (OSError, ValueError):
@@ -165,7 +149,7 @@ def _cgroup_folders(own: Path, root: Path) -> Iterator[Path]:
 
 
 def _left_in_cgroup(folder: Path) -> int | None:
-    """Return the bytes that one control group leaves available. Version 2 is tried first, then version 1."""
+    """Return the memory in bytes that a control group of version 2 or 1 leaves available; None without a limit."""
     for limit, usage, prefix in (
         ("memory.max", "memory.current", ""),
         ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_"),
@@ -180,7 +164,7 @@ def _left_in_cgroup(folder: Path) -> int | None:
 
 
 def _parse_fields(path: Path, separator: str) -> dict[str, int]:
-    """Return the whole numbers of a file of ``name value`` lines. Unreadable numbers are left out."""
+    """Return the whole numbers in a file of ``name value`` lines. Omit unreadable numbers."""
     found: dict[str, int] = {}
     try:
         lines = path.read_text().splitlines()

@@ -1,8 +1,8 @@
-"""Reading and writing of .npz recordings, with one array per column. ``fs`` (Hz) can replace ``t``.
+"""Reading and writing of .npz recordings, with one array per column. The rate ``fs`` in Hz can replace ``t``.
 
 Arrays of Python objects are refused and never unpickled. The headers of all columns are checked against the limits of
-``drivers.recordings.memory_check`` before the data of a column are read. The index of a zip archive is at the end of
-the file. In a truncated file, the arrays are therefore found by the header before each array.
+``drivers.recordings.memory_check`` before data are read. The index of a zip archive is at the end of the file. In a
+truncated file, the reader therefore searches for the local header of each array.
 """
 
 import io
@@ -28,17 +28,7 @@ from numpy.typing import NDArray
 
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular
-from drivers.recordings import memory_check
-from drivers.recordings.table import (
-    ALIASES,
-    COLUMNS,
-    AppendColumns,
-    Columns,
-    Table,
-    check_column_count,
-    choose_columns,
-    describe_content,
-)
+from drivers.recordings import memory_check, table
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
 LOCAL_MAGIC: Final = b"PK\3\4"
@@ -46,7 +36,7 @@ ITEM_DTYPE: Final = np.dtype("<f8")
 NPY_ERRORS: Final = (
     ValueError, TypeError, SyntaxError, EOFError, MemoryError, OverflowError, RuntimeError, TokenError, zlib.error
 )  # fmt: skip
-"""Exceptions that NumPy and zlib raise for a damaged array."""
+"""Exceptions that NumPy and zlib raise if an array is damaged."""
 COPY_BYTES: Final = 1 << 18
 MAX_INDEX_BYTES: Final = 4_000_000
 """Maximum size of the index of an archive, about 50 000 arrays."""
@@ -54,24 +44,24 @@ MAX_HEADER_BYTES: Final = 1 << 16
 MAX_DEFLATE_RATIO: Final = 1032
 """Highest compression ratio of deflate, https://zlib.net/zlib_tech.html."""
 NUMERIC_KINDS: Final = "fiu"
-"""Kinds of NumPy types that a column may have."""
+"""Characters of ``numpy.dtype.kind`` for the types that a column may have."""
 NPY_MAGIC: Final = b"\x93NUMPY"
-KNOWN_KEYS: Final = frozenset((*COLUMNS, *ALIASES, "fs"))
+KNOWN_KEYS: Final = frozenset((*table.COLUMNS, *table.ALIASES, "fs"))
 NPY_HEADER: Final = re.compile(
     rb"\x93NUMPY\x01\x00..{'descr': '(?P<kind>[<>|](?:f[248]|[iu][1248]))', 'fortran_order': (?:False|True), "
     rb"'shape': \((?:(?P<n>\d{1,18}),)?\), } *\n",
     re.DOTALL,
 )
-"""Header of a numeric array with at most one dimension, as every version of NumPy writes it.
+"""Header of a numeric array with at most one dimension, as all versions of NumPy write the header.
 
-The header is matched and not evaluated as Python.
+The header is matched by a pattern and not evaluated as Python code.
 """
 
 
 class _BoundedFile(FileIO):
-    """File that refuses reads of more than MAX_INDEX_BYTES.
+    """File that refuses to read more than MAX_INDEX_BYTES at once.
 
-    ``zipfile`` reads the whole index of an archive at once, and needs about 500 bytes of memory for an entry of 50
+    ``zipfile`` reads the whole index of an archive at once, and needs about 500 bytes of memory for an entry with 50
     bytes.
     """
 
@@ -84,7 +74,7 @@ class _BoundedFile(FileIO):
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    """Content of the header of a .npy array."""
+    """Header of an array in the .npy format."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -92,26 +82,26 @@ class _Header:
 
     @property
     def values(self) -> int:
-        """Number of values."""
+        """Number of values in the array."""
         return math.prod(self.shape)
 
 
 def count_npz_rows(path: Path) -> int:
-    """Return the number of rows that the headers of the columns state; 0 for a truncated file."""
+    """Return the number of rows according to the headers of the columns; 0 if the file is truncated."""
     with _BoundedFile(path) as file:
         if not _has_index(path, file):
-            return 0  # a truncated archive is measured while it is read
+            return 0  # the number of rows of a truncated archive is checked during reading
         with _open_archive(path, file) as archive:
-            return _check_columns(path, archive, choose_columns(path, _array_names(archive), []))
+            return _check_columns(path, archive, table.choose_columns(path, _array_names(archive), []))
 
 
-def read_npz(path: Path) -> Table:
-    """Read the known arrays of a .npz file. A truncated file is read up to the cut.
+def read_npz(path: Path) -> table.Table:
+    """Read the known arrays of a .npz file. If the file is truncated, read the values before the truncation.
 
     Raises
     ------
     RecordingError
-        If the file is not a .npz file, is damaged before its first number, or exceeds a limit.
+        If the file is not a .npz file, contains no readable number, or exceeds a limit.
     ConfigError
         If the samples do not fit into the memory.
     """
@@ -119,11 +109,11 @@ def read_npz(path: Path) -> Table:
     with _BoundedFile(path) as file:
         if _has_index(path, file):
             with _open_archive(path, file) as archive:
-                chosen = choose_columns(path, _array_names(archive), notes)
+                chosen = table.choose_columns(path, _array_names(archive), notes)
                 _check_columns(path, archive, chosen)
                 with np.errstate(over="ignore"):  # a long double beyond the range of float64 becomes infinite
                     columns = {n: _read_array(path, archive, key).astype(np.float64) for n, key in chosen.items()}
-                return Table(columns, _read_fs(path, archive, notes), notes)
+                return table.Table(columns, _read_fs(path, archive, notes), notes)
     arrays, cut = _recover_arrays(path)
     if not arrays:
         raise RecordingError(f"{path}: is damaged or cut off before its first number")
@@ -133,10 +123,10 @@ def read_npz(path: Path) -> Table:
 
 
 def _has_index(path: Path, file: IO[bytes]) -> bool:
-    """Return True for a complete zip archive, False for an archive without index. Raise an error for any other file."""
+    """Return True if a zip archive has an index, False if the archive is truncated. Raise an error for other files."""
     if file.read(len(LOCAL_MAGIC)) != LOCAL_MAGIC:
         raise RecordingError(
-            f"{path}: is no .npz file, which is a zip archive with one array per column{describe_content(path)}"
+            f"{path}: is no .npz file, which is a zip archive with one array per column{table.describe_content(path)}"
         )
     file.seek(0)
     complete = zipfile.is_zipfile(file)
@@ -145,7 +135,7 @@ def _has_index(path: Path, file: IO[bytes]) -> bool:
 
 
 def _open_archive(path: Path, file: IO[bytes]) -> zipfile.ZipFile:
-    """Open a zip archive. Raise RecordingError if its index is damaged."""
+    """Open a zip archive. Raise RecordingError if the index is damaged."""
     try:
         return zipfile.ZipFile(file)
     except (zipfile.BadZipFile, ValueError, NotImplementedError) as error:
@@ -153,7 +143,7 @@ def _open_archive(path: Path, file: IO[bytes]) -> zipfile.ZipFile:
 
 
 def _array_names(archive: zipfile.ZipFile) -> list[str]:
-    """Return the names of the arrays."""
+    """Return the names of the arrays in an archive."""
     return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
@@ -164,7 +154,7 @@ def _find_member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
 
 
 def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str]) -> int:
-    """Return the rows of the longest column, after checking the headers of all columns against the limits."""
+    """Check the headers of all columns, and return the number of rows of the longest column."""
     rows = 0
     limit = memory_check.measure_read_limit(path)
     for key in chosen.values():
@@ -180,7 +170,7 @@ def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, st
 
 
 def _check_size(path: Path, limit: memory_check.ReadLimit, member: zipfile.ZipInfo, key: str, header: _Header) -> None:
-    """Raise RecordingError if the member cannot hold the values that the header of its array states."""
+    """Raise RecordingError if a zip member is too small for the number of values that the array header states."""
     ratio = 1 if member.compress_type == zipfile.ZIP_STORED else MAX_DEFLATE_RATIO
     packed = min(member.compress_size, limit.size_bytes)
     data_bytes = max(min(member.file_size, ratio * packed) - header.size_bytes, 0)
@@ -232,9 +222,9 @@ def _read_array(path: Path, archive: zipfile.ZipFile, key: str) -> NDArray[Any]:
 
 @contextmanager
 def _member_errors(path: Path, key: str) -> Iterator[None]:
-    """Raise the exceptions of NumPy and zipfile for a damaged member as RecordingError."""
+    """Convert the exceptions that NumPy and zipfile raise for a damaged member to RecordingError."""
     try:
-        with warnings.catch_warnings():  # warnings about the age of a file do not matter here
+        with warnings.catch_warnings():  # NumPy warns about headers of old versions
             warnings.simplefilter("ignore")
             yield
     except zipfile.BadZipFile as error:
@@ -244,7 +234,7 @@ def _member_errors(path: Path, key: str) -> Iterator[None]:
 
 
 def _read_fs(path: Path, archive: zipfile.ZipFile, notes: list[str]) -> float | None:
-    """Return ``fs`` of an archive in Hz; None if there is none."""
+    """Return the rate ``fs`` in Hz; None if the archive contains no usable rate."""
     if "fs" not in _array_names(archive):
         return None
     header = _read_header(path, archive, "fs")
@@ -255,7 +245,7 @@ def _read_fs(path: Path, archive: zipfile.ZipFile, notes: list[str]) -> float | 
 
 
 def _single_number(fs: NDArray[Any], notes: list[str]) -> float | None:
-    """Return ``fs`` in Hz. Return None and add a note if it is not a single number."""
+    """Return the rate ``fs`` in Hz. If ``fs`` is not a single number, return None and add a note."""
     if fs.size == 1 and fs.dtype.kind in NUMERIC_KINDS:
         return float(fs.item())
     notes.append("fs is not one number in Hz and is not used.")
@@ -265,9 +255,11 @@ def _single_number(fs: NDArray[Any], notes: list[str]) -> float | None:
 # --- archives without an index -------------------------------------------------------------------
 
 
-def _table_of_recovered(path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, notes: list[str]) -> Table:
-    """Return recovered arrays as a ``Table``. The truncated column is padded with NaN."""
-    chosen = choose_columns(path, list(arrays), notes)
+def _table_of_recovered(
+    path: Path, arrays: Mapping[str, NDArray[Any]], cut: str | None, notes: list[str]
+) -> table.Table:
+    """Return the arrays of a truncated file as a ``Table``. Pad the truncated column with NaN."""
+    chosen = table.choose_columns(path, list(arrays), notes)
     columns = {}
     for name, key in chosen.items():
         if arrays[key].ndim != 1:
@@ -278,11 +270,11 @@ def _table_of_recovered(path: Path, arrays: Mapping[str, NDArray[Any]], cut: str
         column = columns[short]
         n = max(other.size for other in columns.values())
         columns[short] = np.concatenate([column, np.full(n - column.size, np.nan)])
-    return Table(columns, _single_number(arrays["fs"], notes) if "fs" in arrays else None, notes)
+    return table.Table(columns, _single_number(arrays["fs"], notes) if "fs" in arrays else None, notes)
 
 
 def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
-    """Read the arrays of a truncated .npz file by the header before each array.
+    """Find the arrays in a truncated .npz file by their local headers.
 
     Return the arrays by name, and the name of the truncated array if there is one. Arrays with unknown names are empty.
     """
@@ -293,7 +285,7 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
         at = data.find(LOCAL_MAGIC)
         while 0 <= at <= len(data) - LOCAL_HEADER.size:
             members += 1
-            check_column_count(path, members)
+            table.check_column_count(path, members)
             _, _, flags, method, _, _, _, packed, _, name_size, extra_size = LOCAL_HEADER.unpack_from(data, at)
             start = at + LOCAL_HEADER.size + name_size
             key = data[start - name_size : start].decode("utf-8", errors="replace").removesuffix(".npy")
@@ -313,9 +305,9 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
 
 
 class _MemberReader:
-    """Iterator of the unpacked content of a zip member in pieces. The header of the member may lack the size.
+    """Iterator over the unpacked content of a zip member in pieces. ``size`` is None if the header lacks the size.
 
-    ``end`` is the offset after the member. It is known after all pieces have been taken, and None if the file is
+    After the last piece, ``end`` is the offset of the end of the member in the file. ``end`` is None if the file is
     truncated inside the member.
     """
 
@@ -336,7 +328,7 @@ class _MemberReader:
             yield from self._inflated()
 
     def _inflated(self) -> Iterator[bytes]:
-        """Yield the pieces of a compressed member."""
+        """Yield the content of a compressed member in pieces."""
         unzip = zlib.decompressobj(-zlib.MAX_WBITS)
         while not unzip.eof:
             packed = self._data[self._at : self._at + COPY_BYTES]
@@ -357,18 +349,18 @@ class _MemberReader:
 def _read_up_to_cut(
     pieces: _MemberReader, limit: memory_check.ReadLimit, unpacked: int, *, wanted: bool
 ) -> NDArray[Any] | None:
-    """Return the numbers of a .npy member up to a truncation; None if the member is not an array.
+    """Return the complete numbers in a member; None if the member is not an array of numbers.
 
-    ``unpacked`` is the unpacked size of all earlier members in bytes. If ``wanted`` is False, the array is empty, and
-    only the end of the member is searched.
+    ``unpacked`` is the unpacked size of all earlier members in bytes. If ``wanted`` is False, read the member only to
+    find its end, and return an empty array.
     """
     raw = bytearray()
     header: re.Match[bytes] | None = None
-    most = MAX_HEADER_BYTES  # number of bytes that are needed
+    most = MAX_HEADER_BYTES  # number of bytes to keep
     for part in pieces:
         limit.check_unpacked(unpacked + pieces.unpacked)
         if len(raw) >= most:
-            continue  # the next member begins after the last piece
+            continue  # read on to find the end of the member
         raw += part
         if header is None and (header := NPY_HEADER.match(raw)) is not None:
             header = NPY_HEADER.match(bytes(raw[: header.end()]))
@@ -385,23 +377,16 @@ def _read_up_to_cut(
 
 
 @contextmanager
-def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[AppendColumns]:
+def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[table.AppendColumns]:
     """Write a compressed .npz file.
 
-    An archive contains one array after the other. The columns are therefore collected in unnamed temporary files, which
-    need 8 bytes per number in the folder of ``path``.
-
-    Parameters
-    ----------
-    path
-        File to write.
-    names
-        Names of the columns.
+    The arrays of an archive must be written one after the other. The columns are therefore first written to unnamed
+    temporary files in the folder of ``path``, with 8 bytes per number.
     """
     with ExitStack() as stack:
         collected = {name: stack.enter_context(TemporaryFile(dir=path.parent)) for name in names}
 
-        def append(columns: Columns) -> None:
+        def append(columns: table.Columns) -> None:
             """Append rows to the temporary files."""
             for name, file in collected.items():
                 file.write(np.ascontiguousarray(columns[name]).data)
@@ -413,7 +398,7 @@ def open_npz_writer(path: Path, names: Sequence[str]) -> Iterator[AppendColumns]
 
 
 def _write_array(archive: zipfile.ZipFile, name: str, numbers: IO[bytes]) -> None:
-    """Write a member like ``numpy.savez_compressed``, without the array in memory."""
+    """Write an array like ``numpy.savez_compressed``, but from a file and not from memory."""
     shape = (numbers.tell() // ITEM_DTYPE.itemsize,)
     numbers.seek(0)
     member = zipfile.ZipInfo(f"{name}.npy")  # dated 1980, so that equal columns give equal bytes

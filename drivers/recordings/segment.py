@@ -1,15 +1,15 @@
-"""Segments: the recording files of the daemon. A segment is an Arrow IPC stream that grows while samples arrive.
+"""Segments, which are the recording files of the daemon. A segment is an Arrow IPC stream that grows during recording.
 
 The folder of a device contains segments such as ``00000042_2026-11-22T03-00-00Z.arrows``. The number gives the order of
-the segments and does not depend on the clock of the host. The time in the name is the time of the first sample. The
-columns are ``t`` (Unix time in s), six axes and ``temperature``. With the columns ``ticks`` and ``lost`` (samples
-missing just before the row), the daemon can continue from a segment. Every batch contains the state of the daemon after
-the batch (``DaemonState``). A segment of raw bytes contains chunks as they were received, with the columns ``t_ns``
-(Unix time), ``address``, ``data`` and ``attachment``.
+the segments independently of the clock of the host. The time in the file name is the time of the first sample. The
+columns are ``t`` (Unix time in s), six axes, ``temperature``, ``ticks`` (device counter) and ``lost`` (samples missing
+just before the row). Every batch contains the state of the daemon after the batch (``DaemonState``), so that the daemon
+can continue after a restart. A segment of raw data contains the received chunks, with the columns ``t_ns`` (Unix time),
+``address``, ``data`` and ``attachment``.
 
-A growing segment is not compressed, so that each batch can be read on its own. The segment can be read up to its last
-complete batch. A segment that has ended is written again in large compressed batches. The new file replaces the old
-file completely or not at all.
+The daemon appends small batches without compression, and all complete batches of an unfinished segment can be read.
+After a segment has ended, the daemon replaces the file by a copy with large compressed batches. The replacement is
+atomic.
 """
 
 import errno
@@ -42,9 +42,9 @@ NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
 SCHEMA: Final = "imu-monitor/recording/1"
 RAW_BATCH_BYTES: Final = 4_000_000
 MAX_BATCH_BYTES: Final = 64_000_000
-"""Maximum unpacked size of a batch, far above what ``SingleSegmentWriter`` and ``compress_segment`` write."""
+"""Maximum unpacked size of a batch, far above the size of the batches that the daemon writes."""
 MAX_LOST_SAMPLES: Final = 10**11
-"""Maximum number of consecutive missing samples. No clock reports a larger number."""
+"""Maximum number of consecutive missing samples, more than the sample clock can report."""
 
 Kind = Literal["samples", "raw"]
 
@@ -54,28 +54,29 @@ class SegmentMetadata(msgspec.Struct, frozen=True):
 
     device: str
     kind: Kind
-    axes: str = ""  # mounting of the sensor; samples of another mounting begin a new recording
-    carrier: str = ""  # for raw bytes: the carrier that their decoder reads
+    axes: str = ""  # mounting of the sensor; a change of the mounting begins a new recording
+    carrier: str = ""  # carrier of the link, for raw data
     decoder: str = ""
     packed: bool = False  # True if the segment has been written again with compression
     schema: str = SCHEMA
 
 
 class DaemonState(msgspec.Struct, frozen=True):
-    """State of the daemon at the end of a batch. A later run continues from the state."""
+    """State of the daemon at the end of a batch, from which the daemon continues after a restart."""
 
-    rate: float | None = None  # Hz
+    rate: float | None = None  # sample rate in Hz
     since: tuple[float | None, ...] = (None,) * 6
-    """Unix time in s from which the samples of an axis count, after a noise change or a cleared window."""
+    """Unix time in s before which the samples of an axis are not used, after a noise change or a cleared window."""
     tick_step: float | None = None  # ticks of the device counter per sample
     theta: tuple[float | None, ...] = ()
+    """Coefficients [5, 6] of the newest fit, row by row."""
     entered: tuple[bool, ...] = ()
-    """Coefficients of the newest fit and whether each term is included, both [5, 6] row by row."""
+    """True for each term that the newest fit includes [5, 6], row by row."""
 
 
 @dataclass(frozen=True, slots=True)
 class SegmentPiece:
-    """Consecutive samples from one batch of a segment."""
+    """Consecutive samples in one batch of a segment."""
 
     samples: SampleBlock  # t_ns are Unix times
     state: DaemonState
@@ -94,7 +95,7 @@ class SingleSegmentWriter:
     Raises
     ------
     OSError
-        If writing to the disk failed. Every method can raise this error. Complete batches stay readable.
+        If writing to the disk fails. Every method can raise this error. Complete batches remain readable.
     """
 
     def __init__(self, path: Path, origin: SegmentMetadata) -> None:
@@ -103,10 +104,10 @@ class SingleSegmentWriter:
         self._schema = _schema(self._pa, origin)
         self._state = DaemonState()
         self._temporary_path = path.with_name(path.name + PARTIAL_SUFFIX)
-        self._temporary_path.unlink(missing_ok=True)  # left by a program that was killed
+        self._temporary_path.unlink(missing_ok=True)  # the file of a program that was killed
         self._file: IO[bytes] = self._temporary_path.open("xb", buffering=0)
         self._writer = self._pa.ipc.new_stream(self._file, self._schema)
-        self._valid_bytes = 0  # length in bytes of all complete batches
+        self._valid_bytes = 0  # total length of all complete batches
 
     def write_samples(self, blocks: Sequence[SampleBlock], state: DaemonState) -> None:
         """Write one batch of samples.
@@ -125,11 +126,11 @@ class SingleSegmentWriter:
         self._write_batch(_chunk_batch(self._pa, self._schema, chunks), None)
 
     def flush_to_disk(self) -> None:
-        """Flush the written data to the disk, so that they survive a power failure."""
+        """Flush the written data to the disk, so that a power failure does not destroy them."""
         os.fdatasync(self._file.fileno())
 
     def describe_external_change(self) -> str:
-        """Return how another program has changed the file that is being written; "" if it has not."""
+        """Describe how another program has changed the open file; "" if the file is unchanged."""
         try:
             named = os.stat(self.path if self._valid_bytes else self._temporary_path, follow_symlinks=False)
         except OSError:
@@ -140,7 +141,7 @@ class SingleSegmentWriter:
         return "was cut or written by another program" if self._valid_bytes and own.st_size != self._valid_bytes else ""
 
     def close_changed_file(self) -> None:
-        """Close a file that another program has changed. If its length is unchanged, the stream is ended properly."""
+        """Close a file that another program has changed. Write the end mark only if the length is unchanged."""
         try:
             if os.fstat(self._file.fileno()).st_size == self._valid_bytes:
                 self._writer.close()
@@ -148,7 +149,7 @@ class SingleSegmentWriter:
             self._file.close()
 
     def close(self) -> None:
-        """End the stream and close the file. The data already written remain even if ending the stream fails."""
+        """Write the end of the stream and close the file. An error does not affect data that were already written."""
         try:
             self._writer.close()
         finally:
@@ -157,7 +158,7 @@ class SingleSegmentWriter:
                 self._temporary_path.unlink(missing_ok=True)
 
     def _write_batch(self, batch: Any, meta: dict[bytes, bytes] | None) -> None:
-        """Write one batch. After an error, truncate the file to its complete batches."""
+        """Write one batch. After an error, truncate the file to the complete batches."""
         try:
             self._writer.write_batch(batch, custom_metadata=meta)
         except OSError:
@@ -188,13 +189,13 @@ def format_segment_name(number: int, unix_s: float) -> str:
     """
     try:
         when = f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%dT%H-%M-%SZ}"
-    except (ValueError, OverflowError, OSError):  # times given by a sender may be invalid as a date
+    except (ValueError, OverflowError, OSError):  # the time of a sender may not be a valid date
         when = "0000-00-00T00-00-00Z"
     return f"{number:08d}_{when}{SUFFIX}"
 
 
 def parse_segment_start_s(path: Path) -> float:
-    """Return the Unix time in the name of a segment in whole seconds; 0 if the name contains none.
+    """Return the Unix time in the name of a segment in s; 0 if the name contains no time.
 
     >>> parse_segment_start_s(Path("00000042_2023-11-14T22-13-20Z.arrows"))
     1700000000.0
@@ -206,14 +207,14 @@ def parse_segment_start_s(path: Path) -> float:
 
 
 def list_segments(folder: Path) -> list[Path]:
-    """Return the segments of a folder, oldest first. The list is empty if there is no such folder."""
+    """Return the segments in a folder, oldest first; an empty list if the folder does not exist."""
     if not folder.is_dir():
         return []
     return sorted(path for path in folder.iterdir() if NAME.fullmatch(path.name))
 
 
 def parse_segment_number(path: Path) -> int:
-    """Return the number of a segment in its folder; 0 if the file name is not the name of a segment."""
+    """Return the number in the name of a segment; 0 if the file name is not the name of a segment."""
     found = NAME.fullmatch(path.name)
     return int(found[1]) if found else 0
 
@@ -226,10 +227,10 @@ def read_metadata(path: Path) -> SegmentMetadata:
 
 
 def read_last_piece(path: Path) -> SegmentPiece | None:
-    """Read the last piece of a segment that is no longer written; None if the segment is empty.
+    """Return the last piece of a segment that has ended; None if the segment is empty.
 
-    The file is mapped into memory, so that the other batches are not read. The function raises RecordingError if the
-    file is not a segment.
+    The file is mapped into memory, so that the other batches are not read. Raise RecordingError if the file is not a
+    segment.
     """
     last = deque(_read_batches(path, "samples", mapped=True), maxlen=1)
     pieces = [piece for batch in last for piece in _split_batch(*batch)]
@@ -237,13 +238,13 @@ def read_last_piece(path: Path) -> SegmentPiece | None:
 
 
 def read_samples(path: Path) -> Iterator[SegmentPiece]:
-    """Yield the pieces of a segment up to a truncation. Raise RecordingError if the file contains no samples."""
+    """Yield the pieces in the complete batches of a segment. Raise RecordingError for any other file."""
     for batch, meta in _read_batches(path, "samples"):
         yield from _split_batch(batch, meta)
 
 
 def _split_batch(batch: Any, meta: Any) -> Iterator[SegmentPiece]:
-    """Yield the samples of a batch, split where samples are missing. Yield nothing if the values are implausible."""
+    """Yield the samples of a batch, divided where samples are missing. Yield nothing if the batch is implausible."""
     columns = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
     values = np.column_stack([columns[axis] for axis in AXES])
     if not _is_plausible(columns) or np.isinf(values).any():
@@ -258,17 +259,15 @@ def _split_batch(batch: Any, meta: Any) -> Iterator[SegmentPiece]:
 
 
 def _is_plausible(columns: Mapping[str, Any]) -> bool:
-    """Return True if times, counters and losses are in the ranges that are written.
-
-    A null value turns a column of integers into floats, which is implausible as well.
-    """
+    """Return True if times and numbers of lost samples are in the supported ranges."""
+    # a null value converts a column of integers to floats
     lost, ticks = columns["lost"], columns["ticks"]
     whole = lost.dtype == ticks.dtype == np.int64
     return bool(whole and (np.abs(columns["t"]) < T_LIMIT_S).all() and ((lost >= 0) & (lost <= MAX_LOST_SAMPLES)).all())
 
 
 def _decode_state(meta: Any) -> DaemonState:
-    """Return the state in the metadata of a batch; an empty state if it cannot be read."""
+    """Return the state in the metadata of a batch; an empty state if the metadata are invalid."""
     try:
         found = msgspec.json.decode(meta.get(b"state", b"{}"), type=DaemonState) if meta else DaemonState()
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -280,9 +279,9 @@ def _decode_state(meta: Any) -> DaemonState:
 
 
 def read_chunks(path: Path) -> Iterator[Chunk]:
-    """Yield the chunks of a segment up to a truncation. ``t_ns`` are Unix times.
+    """Yield the chunks in the complete batches of a segment of raw data, with Unix times.
 
-    The function raises RecordingError if the file is not a segment of raw bytes.
+    Raise RecordingError if the file is not a segment of raw data.
     """
     for batch, _ in _read_batches(path, "raw"):
         for start in range(0, batch.num_rows, BATCH_ROWS):
@@ -296,14 +295,14 @@ def read_chunks(path: Path) -> Iterator[Chunk]:
 def compress_segment(path: Path) -> Iterator[None]:
     """Replace a segment that has ended by a compressed copy.
 
-    The generator yields after each batch, so that the caller can spread the work.
+    The generator yields after each batch, so that the caller can do other work between two batches.
 
     Raises
     ------
     RecordingError
         If the file is not a segment.
     OSError
-        If the disk is full. The original segment is then unchanged.
+        If the disk is full. The original segment remains unchanged.
     """
     pa = import_pyarrow(path)
     own = read_metadata(path)
@@ -327,7 +326,7 @@ def compress_segment(path: Path) -> Iterator[None]:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Flush the entries of a folder to the disk. Otherwise a power failure can remove a new file."""
+    """Flush the entries of a folder to the disk, so that a power failure does not remove a new file."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -336,7 +335,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 def _merged_batches(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tuple[Any, dict[bytes, bytes] | None]]:
-    """Yield small batches merged into large ones, each with the state of its last row."""
+    """Yield large batches that are combined from small batches, each with the state after the last row."""
     waiting: list[Any] = []
     rows = size = 0
     meta: dict[bytes, bytes] | None = None
@@ -352,18 +351,18 @@ def _merged_batches(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tu
 
 
 def _combine_batches(pa: Any, schema: Any, batches: list[Any]) -> Any:
-    """Combine batches into one."""
+    """Combine batches into one batch."""
     table = pa.Table.from_batches(batches).combine_chunks()
     return pa.RecordBatch.from_arrays([column.chunk(0) for column in table.columns], schema=schema)
 
 
 def _read_batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any, Any]]:
-    """Yield batches with their metadata, up to a truncation or a batch with an implausible size.
+    """Yield the complete batches with their metadata. Stop before a batch with an implausible size.
 
     If ``mapped`` is True, the file is mapped into memory, so that unused rows are not read from the disk.
     """
     pa = import_pyarrow(path)
-    # The file is opened only once, because the daemon may replace it by a compressed file meanwhile.
+    # the file is opened only once, because the daemon may replace the file by a compressed file at any time
     with _arrow_errors(path), open_regular(path) as file:
         count = _count_regular_batches(file)
         file.seek(0)
@@ -376,13 +375,13 @@ def _read_batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tupl
                 batch, meta = reader.read_next_batch_with_custom_metadata()
                 batch.validate(full=not mapped)
             except (StopIteration, pa.ArrowException, OSError):
-                return  # the regular end or a truncation: all complete batches have been yielded
+                return  # the stream has ended or is truncated
             if batch.num_rows:
                 yield batch, meta
 
 
 def _count_regular_batches(file: IO[bytes]) -> int:
-    """Return the number of batches before the first one whose stated size the daemon would not write."""
+    """Return the number of batches before the first batch with an implausible size."""
     count = 0
     for size in iter_batch_sizes(file):
         large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
@@ -393,7 +392,7 @@ def _count_regular_batches(file: IO[bytes]) -> int:
 
 
 def _memory_map(pa: Any, file: IO[bytes]) -> Any:
-    """Map a file into memory. An empty file cannot be mapped and is returned unchanged."""
+    """Map a file into memory. Return an empty file unchanged, since an empty file cannot be mapped."""
     if not os.fstat(file.fileno()).st_size:
         return file
     return pa.BufferReader(pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
@@ -401,7 +400,7 @@ def _memory_map(pa: Any, file: IO[bytes]) -> Any:
 
 @contextmanager
 def _arrow_errors(path: Path) -> Iterator[None]:
-    """Raise the errors of pyarrow and msgspec for a file that is not a segment as RecordingError."""
+    """Convert the errors of pyarrow and msgspec for a file that is not a segment to RecordingError."""
     try:
         yield
     except ImuError:
@@ -414,14 +413,14 @@ def _arrow_errors(path: Path) -> Iterator[None]:
         raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
     except (import_pyarrow(path).ArrowException, UnicodeDecodeError, RecursionError, msgspec.DecodeError) as error:
         raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
-    except MemoryError as error:  # the first bytes are read as a length, which can be gigabytes in a foreign file
+    except MemoryError as error:  # in a file of another type, the first bytes may be read as a length of gigabytes
         raise RecordingError(
             f"{path}: is no segment of a recording (it claims more bytes than the memory holds)"
         ) from error
 
 
 def _check_schema(path: Path, schema: Any) -> SegmentMetadata:
-    """Return the source of a segment from its schema. Raise RecordingError if it is not a segment."""
+    """Return the source of the data according to the schema. Raise RecordingError if the file is not a segment."""
     meta = (schema.metadata or {}).get(METADATA_KEY)
     if meta is None:
         raise RecordingError(f"{path}: is no segment of a recording: it does not state its device")

@@ -1,7 +1,4 @@
-"""The table that a reader returns, the function that a writer yields, and the selection of known columns.
-
-Every format module uses these definitions.
-"""
+"""Types and functions that all recording formats share: tables, writers and the selection of columns."""
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -22,54 +19,38 @@ ALIASES: Final = {"temp": "temperature"}
 """Alternative names of known columns."""
 
 EXAMPLE_HEADER: Final = "t,gx,gy,gz,ax,ay,az"
-"""Header line that error messages show as an example."""
+"""Example of a header line in error messages."""
 
 BATCH_ROWS: Final = 1 << 16
-"""Number of rows written at a time. A truncated Arrow file loses at most this number of rows."""
+"""Maximum number of rows that are written at once. A truncated Arrow file loses at most this number of rows."""
 
 T_LIMIT_S: Final = 4.6e9
-"""Largest absolute time in s. The difference of two times fits into int64 nanoseconds, 9.22e9 s.
-
-A larger number is not a time in seconds.
-"""
+"""Largest absolute time in s. The difference of two times fits into int64 nanoseconds."""
 
 PARTIAL_SUFFIX: Final = ".part"
-"""Suffix that is appended to a file name while the file is being written."""
+"""Suffix that is added to a file name while the file is being written."""
 
 Columns = Mapping[str, Floats]
-"""Columns as float64 arrays [n] of equal length, by their names in COLUMNS."""
+"""Columns as float64 arrays [n] of equal length. The keys are names in COLUMNS."""
 
 AppendColumns = Callable[[Columns], None]
 """Function that appends rows to a file that is being written."""
 
 OpenWriter = Callable[[Path, Sequence[str]], AbstractContextManager[AppendColumns]]
-"""Function that begins a file with columns of these names. The file is complete when the context has been left."""
+"""Function that creates a file with the given columns. The file is complete when the context ends."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Columns as float64 arrays [n], by their names in COLUMNS. Missing values are NaN."""
+    """Columns of a file, the stated sample rate, and notes about irregularities."""
 
-    columns: dict[str, Floats]
-    fs: float | None  # Hz; None if the file does not state it
+    columns: dict[str, Floats]  # float64 arrays [n]; the keys are names in COLUMNS; NaN = missing
+    fs: float | None  # sample rate in Hz; None if the file states no rate
     notes: list[str]
 
 
 def check_column_count(path: Path, columns: int) -> None:
-    """Check the number of columns of a file.
-
-    Parameters
-    ----------
-    path
-        File that the message names.
-    columns
-        Number of columns.
-
-    Raises
-    ------
-    RecordingError
-        If the file has more columns than any recording.
-    """
+    """Raise RecordingError if the number of columns of a file exceeds the limit."""
     if columns > memory_check.MAX_COLUMNS:
         raise RecordingError(
             f"{path}: has {columns} columns, expected at most {memory_check.MAX_COLUMNS}; keep only {' '.join(COLUMNS)}"
@@ -82,18 +63,18 @@ def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: st
     Parameters
     ----------
     path
-        File that messages name.
+        Path of the file for error messages.
     names
         Names of all columns in the file.
     notes
         List to which a note about unused columns is appended.
     where
-        Position of the names in the file, such as " in line 3".
+        Position of the names in the file for error messages, such as " in line 3".
 
     Returns
     -------
     dict
-        Name in the file for each known column.
+        Name in the file of each known column.
 
     Raises
     ------
@@ -134,13 +115,13 @@ CONTENTS: Final = (
     (b"\x89PNG", "a picture", ()),
     (b"%PDF", "a PDF document", ()),
 )
-"""First bytes of a file, the content that they indicate, and the suffixes of recordings with this content."""
+"""First bytes of a file, type of the content, and file suffixes of recordings with this content."""
 
 
 def describe_content(path: Path) -> str:
-    """Return the end of a message that describes the content of a file and the remedy.
+    """Return a text to append to an error message if the content of a file does not match the suffix.
 
-    The text is empty if the content matches the suffix, or if the kind of content is unknown.
+    The text states the type of the content and the remedy. The text is empty if the type is unknown.
     """
     try:
         with open_regular(path) as file:
@@ -160,7 +141,7 @@ def describe_content(path: Path) -> str:
 
 
 def format_names(names: Sequence[str], most: int = 12) -> str:
-    """Return names as a list for a message, shortened and without control characters.
+    """Return a list of names for a message. The list and the names are shortened, without control characters.
 
     Parameters
     ----------

@@ -1,7 +1,8 @@
-"""Writing of recordings. A file appears complete or not at all.
+"""Writing of recordings. A file appears only when it is complete.
 
 A file is written under a temporary name and renamed when it is complete. If writing fails or is interrupted (Ctrl-C),
-the temporary file is removed, and an existing recording stays unchanged. Memory does not grow with the number of rows.
+the temporary file is removed, and an existing recording stays unchanged. The memory use does not depend on the number
+of rows.
 """
 
 import os
@@ -37,12 +38,12 @@ class AppendSamples(Protocol):
 
 @contextmanager
 def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) -> Iterator[AppendSamples]:
-    """Write a recording in blocks of rows, in the format of the path's suffix.
+    """Write a recording in blocks of rows. The suffix of the path determines the format.
 
     Parameters
     ----------
     path
-        File to write. The file appears when the context is left without an exception.
+        File to write. The file appears when the context ends without an exception.
     axes
         Columns to write, some of AXES.
     temperature
@@ -80,12 +81,12 @@ def save_samples(
     temperature_c: Floats | None = None,
     axes: Sequence[str] | None = None,
 ) -> None:
-    """Write a recording in the format of the path's suffix. Values of float64 are stored without loss.
+    """Write a recording without loss of precision. The suffix of the path determines the format.
 
     Parameters
     ----------
     path
-        File to write. The file appears complete or not at all.
+        File to write.
     t_s
         [n] float64, times in s.
     values
@@ -93,7 +94,7 @@ def save_samples(
     temperature_c
         [n] float64 in °C. None if no temperature was measured.
     axes
-        Columns to write. None for all axes with at least one value.
+        Axes to write. If None, all axes that have at least one value are written.
 
     Raises
     ------
@@ -112,7 +113,7 @@ def save_samples(
 
 @contextmanager
 def atomic_write_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary path that is renamed to ``path`` at the end, and removed after an exception.
+    """Yield a temporary path. At the end, rename the temporary file to ``path``, or remove it after an exception.
 
     Raises
     ------
@@ -121,11 +122,11 @@ def atomic_write_path(path: Path) -> Iterator[Path]:
     """
     if not path.parent.is_dir():
         raise ConfigError(f"{path}: cannot be written: there is no folder {path.parent}")
-    if path.is_dir():  # report the error before the work rather than after it
+    if path.is_dir():  # otherwise the error would be reported only after writing
         raise ConfigError(f"{path}: cannot be written: it is a folder")
     part = path.with_name(path.name + PARTIAL_SUFFIX)
     try:
-        if part.exists() and not part.is_file():  # opening a FIFO would wait for its reader
+        if part.exists() and not part.is_file():  # opening a FIFO would wait for a reader
             part.unlink()
         part.touch()
     except OSError as error:
@@ -143,7 +144,7 @@ def atomic_write_path(path: Path) -> Iterator[Path]:
 
 
 def _check_arrays(path: Path, t_s: Floats, values: Floats, temperature_c: Floats | None) -> None:
-    """Raise RecordingError if arrays have different lengths or a time is missing."""
+    """Raise RecordingError if the arrays have different lengths, or if a time is missing."""
     n = len(t_s)
     if n == 0 or values.shape != (n, len(AXES)):
         raise RecordingError(f"{path}: {n} times and values of shape {values.shape}, expected shape [n, 6] with n ≥ 1")

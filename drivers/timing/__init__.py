@@ -1,1 +1,1 @@
-"""Time-stamping of samples: sample clock, regression of arrival times, duplicate and late rows, and rate check."""
+"""Time-stamping of samples, detection of missing, repeated and late samples, and check of the sample rate."""

@@ -6,22 +6,24 @@ from typing import Final
 import numpy as np
 
 FORGET_S: Final = 30.0
-"""Time constant of the fitted line. It is long compared with arrival jitter and short compared with crystal warm-up."""
+"""Time constant of the fitted line, long compared with arrival jitter and short compared with crystal warm-up."""
 MIN_SPAN_S: Final = 2.0
+"""Minimum duration of the points from which the rate is determined."""
 MIN_SAMPLES: Final = 20
-"""The rate is known from the data after both the time MIN_SPAN_S and this number of samples."""
+"""Minimum number of samples from which the rate is determined."""
 MIN_FORGETTING_FACTOR: Final = 0.9
-"""Smallest weight of the earlier points per new point. With slow sensors or long blocks, the line still rests on ten
-points or more.
+"""Smallest factor by which a new point reduces the weight of earlier points.
+
+The limit ensures that the line depends on ten points or more, also for slow sensors and long blocks.
 """
 MIN_POINTS: Final = 5
-"""Minimum number of points that show the scatter about the line."""
+"""Minimum number of points from which the scatter about the line is determined."""
 UNCERTAINTY_FACTOR: Final = 2.0
-"""Factor from the scatter about the line to the plausible error of the rate.
+"""Ratio of the plausible error of the rate to the error that the residuals of the line indicate.
 
-The points scatter by the delays that the line has not followed. The delays that it has followed are assumed to be as
-large. The factor is empirical: of simulated stalls, bursts and slowly varying delays, only the last exceed it, in the
-first seconds.
+The residuals are the delays that the line has not followed. The delays that the line has followed are assumed to be of
+the same magnitude. The factor is empirical. In simulations with stalls, bursts and slowly varying delays, only slowly
+varying delays caused larger errors, in the first seconds.
 """
 STANDARD_RATE_TOLERANCE: Final = 0.002
 """Relative difference up to which a measured rate is replaced by the nearest standard rate.
@@ -40,7 +42,7 @@ STANDARD_RATES_HZ: Final = np.array([
 class ArrivalRegression:
     """Least-squares line of time on sample index with exponential forgetting.
 
-    The sums are kept relative to the newest point.
+    The sums are stored relative to the newest point.
     """
 
     def __init__(self) -> None:
@@ -55,18 +57,18 @@ class ArrivalRegression:
         Parameters
         ----------
         index
-            Sample index. Missing samples count.
+            Sample index, including missing samples.
         t_s
             Time of the sample in s.
         nominal_hz
-            Nominal rate in Hz, used for the slope until the points show one. None if it is unknown.
+            Nominal sample rate in Hz, which determines the slope while there are too few points. None if unknown.
         """
         if self.count == 0:
             self._first_x, self._first_t = index, t_s
             self._nominal_s = 1.0 / nominal_hz if nominal_hz else None
         dx, dt = index - self._x0, t_s - self._t0
         keep = max(exp(-max(dt, 0.0) / FORGET_S), MIN_FORGETTING_FACTOR) if self.count else 0.0
-        # shift the means to the new origin, then update them (West 1979)
+        # shift the means to the new origin, then update the means (West 1979)
         self._mx -= dx
         self._mt -= dt
         self._x0, self._t0 = index, t_s
@@ -82,12 +84,12 @@ class ArrivalRegression:
         self.count += 1
 
     def shift_points(self, samples: float) -> None:
-        """Shift all points by a number of samples that are known to be missing before the first point."""
+        """Increase the index of all points by a number of samples that are missing before the first point."""
         self._x0 += samples
         self._first_x += samples
 
     def elapsed_s(self) -> float:
-        """Return the time from the first point to the newest one in seconds."""
+        """Return the time from the first point to the newest point in seconds."""
         return self._t0 - self._first_t
 
     def can_tell_gap_from_jitter(self) -> bool:
@@ -95,20 +97,21 @@ class ArrivalRegression:
         return self._x0 - self._first_x >= MIN_SAMPLES and self.elapsed_s() >= MIN_SPAN_S
 
     def measure_rate(self, final: bool = False) -> tuple[float, float] | None:
-        """Return the rate that the points alone show, and its uncertainty.
+        """Return the sample rate according to the points, without the nominal rate, and the uncertainty.
+
+        Delays with the standard deviation s change the slope of the line by at most the ratio s/S, where S is the
+        standard deviation of the times (Cauchy-Schwarz inequality). For the residuals of the line, this ratio is
+        √(1/r² − 1), where r is the correlation of time and index.
 
         Parameters
         ----------
         final : bool
-            True if no more points will be added. MIN_SAMPLES are then enough, however short the time.
+            True if no more points will be added. MIN_SAMPLES are then sufficient, even in less than MIN_SPAN_S.
 
         Returns
         -------
         tuple of float, or None
-            Rate in Hz and its plausible relative error. None until the points show a rate. Delays whose standard
-            deviation is s change the slope by at most s/S, where S is the standard deviation of the times
-            (Cauchy-Schwarz inequality). For the remaining delays about the line, s/S = √(1/r² − 1), where r is the
-            correlation of time and index.
+            Rate in Hz and plausible relative error of the rate. None if there are too few points.
         """
         enough = (
             self._x0 - self._first_x >= MIN_SAMPLES - 1
@@ -121,23 +124,23 @@ class ArrivalRegression:
         return self._sxx / self._sxt, UNCERTAINTY_FACTOR * sqrt(max(1.0 / r2 - 1.0, 0.0)) if r2 > 0.0 else inf
 
     def is_slower_than(self, period_s: float) -> bool:
-        """Return True if the points show with certainty a longer period than ``period_s``."""
+        """Return True if the sample period is longer than ``period_s`` by more than the uncertainty."""
         found = self.measure_rate()
         return found is not None and found[0] * period_s < 1.0 - found[1]
 
     def period_s(self) -> float | None:
-        """Return the sample period in seconds; None before the second point if there is no nominal rate."""
+        """Return the sample period in seconds; None if there are too few points and no nominal rate."""
         if self.count >= 2 and self._sxt > 0.0 and (self.can_tell_gap_from_jitter() or self._nominal_s is None):
             return self._sxt / self._sxx
         return self._nominal_s if self.count else None
 
     def rate_hz(self) -> float | None:
-        """Return the sample rate in Hz; None until it is known."""
+        """Return the sample rate in Hz; None if the rate is unknown."""
         period = self.period_s()
         return 1.0 / period if period else None
 
     def time_at_index_s(self, index: float) -> float:
-        """Return the time of the line at a sample index in seconds."""
+        """Return the fitted time at a sample index in seconds."""
         period = self.period_s() or 0.0
         return self._t0 + self._mt + (index - self._x0 - self._mx) * period
 

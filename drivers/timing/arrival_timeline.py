@@ -1,10 +1,11 @@
-"""Placement of samples on a line of arrival times, and gaps that the arrival times alone show.
+"""Sample times from a line fitted to arrival times, and detection of gaps from arrival times.
 
-A line is fitted with slow forgetting to the sample index and the arrival time of the last sample of each chunk. Samples
-are placed on this line. The jitter of a USB port or of the scheduler of the host therefore does not become jitter of
-the samples.
+A line of arrival time against sample index is fitted to the last sample of each chunk, with exponential forgetting. The
+line gives the sample times. The jitter of a USB port or of the scheduler of the host therefore has little effect on the
+sample times.
 
-A delay that is caught up within CATCH_UP_S was caused by the scheduler of the host. A delay that remains is a gap.
+If later arrivals catch up with the line within CATCH_UP_S, a delay was caused by the scheduler of the host. If the
+delay persists, samples are missing.
 """
 
 from dataclasses import dataclass
@@ -18,25 +19,25 @@ from drivers.timing.arrival_regression import ArrivalRegression
 from drivers.timing.earliest_sample_time import EarliestSampleTime
 
 CATCH_UP_S: Final = 3.0
-"""Time within which a delay of the host must be caught up. Otherwise samples are missing."""
+"""Time after which a delay that persists means that samples are missing."""
 MIN_GAP_PERIODS: Final = 3.0
 """Shortest pause of the arrivals, in sample periods, that can be a gap."""
 MIN_GAP_S: Final = 0.05
 """Shortest pause of the arrivals, in seconds, that can be a gap."""
 JUMP_S: Final = 1.0
-"""A device counter has jumped if one step is ahead of the clock of the host by more than this time."""
+"""Time by which a step of the device counter may exceed the elapsed time of the host. A larger step is a jump."""
 PERIOD_TOLERANCE: Final = 0.05
 """Plausible relative error of the sample period when the missing samples of a gap are compared with a time."""
 MAX_RATE_HZ: Final = 32_000.0
-"""Highest sample rate of an inertial sensor. It limits the number of missing samples if the rate is implausible."""
+"""Highest sample rate of an inertial sensor, which limits the number of missing samples."""
 MAX_GAP_SAMPLES: Final = 10**10
-"""Longest gap in samples, 116 days at 1 kHz. Sender times that advance by more were set, and the gap is limited."""
+"""Maximum number of missing samples in one gap, 116 days at 1 kHz."""
 MAX_OFFSET_S: Final = 4.6e9
-"""Largest time from the first sample: half of the range of int64 nanoseconds."""
+"""Largest time since the first sample, half of the range of int64 nanoseconds."""
 
 
 class ArrivalTimeline:
-    """Sample index, and line of arrival time against sample index.
+    """Number of samples so far, and a fitted line of arrival time against sample index.
 
     Parameters
     ----------
@@ -47,25 +48,25 @@ class ArrivalTimeline:
     def __init__(self, nominal_hz: float | None) -> None:
         self.nominal_hz = nominal_hz
         self.assumed_hz = nominal_hz
-        """Rate in Hz until the line shows one: the configured rate, or the rate before a restart of the program."""
+        """Sample rate in Hz until the line gives a rate: the configured rate, or the rate before a restart."""
         self.line = ArrivalRegression()
         self.earliest_time = EarliestSampleTime()
         self.index = 0.0
-        """Number of samples since the start, missing samples included."""
+        """Number of samples since the start, including missing samples."""
         self.arrived_ns = 0
-        """Time of the newest arrival."""
+        """Newest arrival time."""
         self.last_t_ns = -(1 << 62)
         """Time of the newest sample."""
         self.origin_ns: int | None = None
-        """Origin of the times in seconds. A float64 of Unix time would resolve only 240 ns."""
+        """Origin of the times in seconds. Unix time in float64 would have a resolution of only 240 ns."""
         self._delay: _Delay | None = None
 
     def seconds_since_origin(self, t_ns: int) -> float:
-        """Return the seconds since the first sample."""
+        """Return the time since the first sample in seconds."""
         return (t_ns - (self.origin_ns or 0)) / NS_PER_S
 
     def restart_line(self) -> None:
-        """Begin a new line, because the number of missing samples is unknown or the clock has jumped."""
+        """Fit a new line, because the number of missing samples is unknown or the clock has jumped."""
         self.line = ArrivalRegression()
 
     def undelayed_period_s(self) -> float | None:
@@ -79,12 +80,12 @@ class ArrivalTimeline:
         return None if self.earliest_time.period_s or not self.assumed_hz else 1.0 / self.assumed_hz
 
     def assign_line_times(self, samples: SampleBlock, missing: Ints) -> list[SampleBlock]:
-        """Add the newest arrival to the line, and give the samples their times on it.
+        """Add the newest arrival to the fitted line, and assign times on the line to the samples.
 
         Parameters
         ----------
         samples : SampleBlock
-            Samples with their arrival times.
+            Samples with arrival times.
         missing : array of int64, shape (n,)
             Number of missing samples before each row.
         """
@@ -93,33 +94,33 @@ class ArrivalTimeline:
         self.index = float(index[-1])
         self.arrived_ns = int(samples.t_ns[-1])
         arrived_s = self.seconds_since_origin(self.arrived_ns)
-        if self._delay is None:  # a possible gap must not bend the line
-            # the last sample of a chunk has waited for the shortest time
+        if self._delay is None:  # a possible gap must not affect the line
+            # the last sample of a chunk has the shortest delay
             self.line.add_point(self.index, arrived_s, self.nominal_hz)
         self.earliest_time.advance_clock(passed, arrived_s, self.undelayed_period_s())
-        period_s = self.line.period_s() or 1.0 / NS_PER_S  # the first samples of an unknown rate are at least in order
-        # no sample is newer than its arrival, apart from the scatter of the line
+        period_s = self.line.period_s() or 1.0 / NS_PER_S  # without a known rate, only the order is preserved
+        # a sample is not taken after its arrival; the tolerance allows for the scatter of the arrivals
         newest_s = min(self.line.time_at_index_s(self.index), arrived_s + JUMP_S)
         t_s = newest_s - (self.index - index) * period_s
-        if t_s[0] < -MAX_OFFSET_S or t_s[-1] > MAX_OFFSET_S:  # arrivals decades apart must stay within int64
+        if t_s[0] < -MAX_OFFSET_S or t_s[-1] > MAX_OFFSET_S:  # the times must fit into int64 nanoseconds
             t_s = np.clip(t_s, -MAX_OFFSET_S, MAX_OFFSET_S)
         t_ns = np.rint(t_s * NS_PER_S).astype(np.int64) + (self.origin_ns or 0)
         if t_ns[0] <= self.last_t_ns or (t_ns[1:] <= t_ns[:-1]).any():
-            # the line was corrected backwards, or is coarser than a period far from its origin: keep the order
+            # the line has moved backwards, or float64 is too coarse: keep the times increasing
             order = np.arange(len(samples))
             t_ns = np.maximum.accumulate(np.maximum(t_ns - order, self.last_t_ns + 1)) + order
         self.last_t_ns = int(t_ns[-1])
         return split_at_gaps(samples, t_ns, missing)
 
     def count_missing_since_arrival(self, arrived_ns: int, arrived: int) -> int:
-        """Return the number of samples missing since the last arrival if ``arrived`` samples arrive at ``arrived_ns``.
+        """Return the number of missing samples according to the time since the previous arrival.
 
         Parameters
         ----------
         arrived_ns : int
             Arrival time of the newest sample in ns.
         arrived : int
-            Number of samples that have arrived since the last arrival.
+            Number of samples that have arrived since the previous arrival.
         """
         rate_hz = self.line.rate_hz() or self.assumed_hz
         if not rate_hz or not self.arrived_ns:
@@ -128,20 +129,20 @@ class ArrivalTimeline:
         return min(max(0, round(elapsed_s * min(rate_hz, MAX_RATE_HZ)) - arrived), MAX_GAP_SAMPLES)
 
     def forget_delay(self) -> None:
-        """Discard a delay that was not decided yet, because the link was closed in the meantime."""
+        """Discard a delay whose cause is not yet known, because the link was closed."""
         self._delay = None
 
     def count_missing_after_delay(self, arrived_ns: int, counted: int, least: float = MIN_GAP_PERIODS) -> int:
-        """Return the number of samples missing because of a sudden delay that was not caught up within CATCH_UP_S.
+        """Return the number of missing samples if a sudden delay of the arrivals has persisted for CATCH_UP_S.
 
         Parameters
         ----------
         arrived_ns : int
             Arrival time of the newest sample in ns.
         counted : int
-            Samples that have arrived or are known to be missing since the last call.
+            Number of samples since the last call that have arrived or are known to be missing.
         least : float
-            Smallest number of missing samples that counts as a gap.
+            Smallest number of missing samples in a gap.
         """
         period_s = self.line.period_s()
         if period_s is None or not self.line.can_tell_gap_from_jitter():
@@ -158,7 +159,7 @@ class ArrivalTimeline:
         delay = self._delay
         delay.least_s = min(delay.least_s, behind_s)
         delay.line.add_point(index, arrived_s, self.nominal_hz)
-        if delay.least_s < least_s:  # caught up: the host was late
+        if delay.least_s < least_s:  # the arrivals have caught up, so the host was delayed
             self._delay = None
             return 0
         if arrived_ns - delay.since_ns < CATCH_UP_S * NS_PER_S:
@@ -166,7 +167,7 @@ class ArrivalTimeline:
         gap = min(round(delay.least_s / max(period_s, 1.0 / MAX_RATE_HZ)), MAX_GAP_SAMPLES)
         delay.line.shift_points(gap)
         rest_s = behind_s - gap * period_s
-        if delay.line.is_slower_than(period_s):  # the delay grows since the period is wrong
+        if delay.line.is_slower_than(period_s):  # the delay grows because the period is wrong
             self.line, self._delay = delay.line, None
         elif rest_s > least_s:  # another delay may have begun in the meantime
             delay.since_ns, delay.least_s = arrived_ns, rest_s
@@ -177,15 +178,15 @@ class ArrivalTimeline:
 
 @dataclass(slots=True)
 class _Delay:
-    """Sudden delay of the arrivals that may turn out to be a gap."""
+    """Sudden delay of the arrivals, whose cause may be a gap."""
 
-    since_ns: int  # first late arrival, or the arrival at which a gap was last reported
-    least_s: float  # minimum lag of all arrivals since then relative to the line
-    line: ArrivalRegression  # fitted to all arrivals since the first late one
+    since_ns: int  # time of the first delayed arrival, or of the last reported gap
+    least_s: float  # minimum delay of the arrivals since ``since_ns`` relative to the fitted line
+    line: ArrivalRegression  # line fitted to the arrivals since the first delayed arrival
 
 
 def split_at_gaps(samples: SampleBlock, t_ns: Ints, missing: Ints) -> list[SampleBlock]:
-    """Return blocks with new sample times. A new block begins wherever samples are missing.
+    """Return the samples with new times, in blocks that begin where samples are missing.
 
     Parameters
     ----------

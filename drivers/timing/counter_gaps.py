@@ -1,7 +1,7 @@
 """Missing samples according to the counter of a device.
 
-The counter shows missing samples exactly, apart from whole turns of a short counter. A pause of the link or a delay
-that is not caught up shows these turns (``drivers.timing.arrival_timeline``).
+The counter gives the exact number of missing samples, unless a short counter wraps more than once in a gap. The number
+of wraps is then estimated from the duration of the gap (``drivers.timing.arrival_timeline``).
 
 A sample may be read late but never early. ``drivers.timing.earliest_sample_time`` gives the earliest time at which the
 last sample can have been taken. A counter step is a gap if the missing samples fit between this time and the arrival
@@ -21,11 +21,11 @@ from drivers.timing.event_rate_limiter import EventRateLimiter
 MAX_STEP_TICKS: Final = 1 << 62
 """Largest step of the counter."""
 MIN_STUCK_SAMPLES: Final = 10
-"""Consecutive samples with the same counter value after which the counter is reported as stuck."""
+"""Number of consecutive samples with the same counter value after which the counter is reported as stuck."""
 STEP_HISTORY: Final = 255
 """Number of recent counter steps from which the typical step is determined."""
 STEP_TOLERANCE: Final = 0.25
-"""Relative tolerance within which a counter step equals the typical step."""
+"""Maximum relative difference of a counter step from the typical step."""
 
 
 class CounterGaps:
@@ -38,19 +38,19 @@ class CounterGaps:
     timeline : ArrivalTimeline
         Arrival times of the samples.
     events : EventRateLimiter
-        Receiver of the events about jumps and a stuck counter.
+        Queue for the events about counter jumps and a stuck counter.
     """
 
     def __init__(self, counter: CounterTimedFormat, timeline: ArrivalTimeline, events: EventRateLimiter) -> None:
-        self.typical_step = TypicalStep()
+        self.typical_step = _TypicalStep()
         self.clock_line = ArrivalRegression()
-        """Line of device time against sample index. It is empty if the length of a tick is unknown."""
+        """Fitted line of device time against sample index. The line has no points if the tick length is unknown."""
         self._counter = counter
         self._timeline = timeline
         self._events = events
         self._tick: int | None = None  # last counter value
         self._clock_s = self._clock_index = 0.0
-        self._stuck = 0  # samples since the counter last advanced
+        self._stuck = 0  # number of samples since the counter last advanced
 
     def resume(self, tick: int, ticks_per_sample: float) -> None:
         """Continue from the last counter value before a restart of the program.
@@ -75,7 +75,7 @@ class CounterGaps:
         Parameters
         ----------
         samples : SampleBlock
-            Samples with their arrival times and counter values.
+            Samples with arrival times and counter values.
         paused : bool
             True if the link was closed before these samples.
         """
@@ -97,7 +97,7 @@ class CounterGaps:
             counted = np.rint(np.minimum(steps / ticks_per_sample, MAX_GAP_SAMPLES)).astype(np.int64)
             missing = np.maximum(counted - 1 - waited, 0)
         unseen = self._timeline.count_missing_since_arrival(arrived_ns, len(samples)) if first and paused else 0
-        if not steps.any():  # a stuck counter shows nothing
+        if not steps.any():  # a stuck counter gives no information
             missing[0] = max(samples.lost, unseen)
         elif self._has_jumped(missing, steps, arrived_ns):
             self._discard_jump(samples, missing, steps, first)
@@ -110,7 +110,7 @@ class CounterGaps:
         return missing
 
     def _discard_jump(self, samples: SampleBlock, missing: Ints, steps: Ints, first: bool) -> None:
-        """Report a jump of the counter, and correct ``missing`` and ``steps`` by the arrival time."""
+        """Report a jump of the counter, and correct ``missing`` and ``steps`` in place by the arrival time."""
         arrived_ns, ahead = int(samples.t_ns[-1]), int(steps.max())
         modulus = self._counter.modulus
         elapsed_s = (arrived_ns - self._timeline.arrived_ns) / NS_PER_S
@@ -120,22 +120,22 @@ class CounterGaps:
         self.clock_line = ArrivalRegression()
         at = int(np.argmax(steps))
         missing[at] = steps[at] = 0
-        if self._has_jumped(missing, steps, arrived_ns):  # more than one jump: no step is reliable
+        if self._has_jumped(missing, steps, arrived_ns):  # there is another jump, so no step is reliable
             missing[:] = 0
         if not first:
             missing[at] = self._timeline.count_missing_since_arrival(arrived_ns, len(samples) + int(missing.sum()))
 
     def _ticks_per_sample(self) -> float | None:
-        """Return the ticks per sample; None if they are unknown."""
+        """Return the number of ticks per sample; None if the number is unknown."""
         seen, rate_hz = self.typical_step.mean, self._timeline.nominal_hz
         if self._counter.tick_s is None or rate_hz is None:
             return seen
         nominal = 1.0 / (rate_hz * self._counter.tick_s)
-        # the counter overrides a nominal rate that is far off
+        # if the nominal rate is far from the typical step, the typical step is used
         return nominal if seen is None or abs(seen - nominal) < 0.5 * nominal else seen
 
     def _hidden_wraps(self, steps: Ints, ticks_per_sample: float | None, arrived_ns: int, paused: bool) -> int:
-        """Return how often a short counter wrapped unseen during a pause of the link or a delay not caught up."""
+        """Return the number of unseen wraps of a short counter while the link was closed or samples were missing."""
         if ticks_per_sample is None:
             return 0
         counter, timeline = self._counter, self._timeline
@@ -154,7 +154,7 @@ class CounterGaps:
         return turns if turns * counter.modulus < MAX_STEP_TICKS else 0
 
     def _find_stuck_counter(self, samples: SampleBlock, steps: Ints) -> Ints:
-        """Return the number of samples [n] that arrived with a stuck counter, at the row where it advances again."""
+        """Return the number of samples with a stuck counter before each row [n] at which the counter advances again."""
         before = self._stuck
         if not before and steps.all():
             return np.zeros(len(samples), np.int64)
@@ -170,10 +170,10 @@ class CounterGaps:
         return np.where(waited >= MIN_STUCK_SAMPLES, waited, 0)
 
     def _has_jumped(self, missing: Ints, steps: Ints, arrived_ns: int) -> bool:
-        """Return True if more samples are missing than can have been sent in the elapsed time of the host.
+        """Return True if more samples are missing than the device can have sent since the previous sample.
 
-        The time begins at the earliest time at which the last sample can have been taken. Its arrival time is not used,
-        as the sample may have waited in a buffer until the reading process got processor time.
+        The elapsed time is counted from the earliest time at which the previous sample can have been taken. The arrival
+        time of the previous sample is not used, since the sample may have waited in a buffer.
         """
         counter, timeline = self._counter, self._timeline
         period_s = timeline.earliest_time.period_s or timeline.undelayed_period_s()
@@ -183,15 +183,15 @@ class CounterGaps:
             lasted_s = max(lost * (1.0 - PERIOD_TOLERANCE) * period_s, lasted_s)
         elif counter.tick_s is not None:
             lasted_s = max(float(steps.sum(dtype=np.float64)) * counter.tick_s, lasted_s)
-        elif 2 * int(steps.max()) > counter.modulus:  # a step of more than half the modulus is more likely a step back
+        elif 2 * int(steps.max()) > counter.modulus:  # a step of more than half the modulus is probably a step back
             return True
         arrived_s = timeline.seconds_since_origin(arrived_ns)
         taken_s = timeline.earliest_time.newest_sample_not_before_s
         return lasted_s > max(arrived_s - (arrived_s if taken_s is None else taken_s), 0.0) + JUMP_S
 
 
-class TypicalStep:
-    """Typical step of a counter: the mean of all steps near the median of the recent ones."""
+class _TypicalStep:
+    """Typical step of a counter, which is the mean of all steps near the median of the recent steps."""
 
     def __init__(self) -> None:
         self._recent: deque[int] = deque(maxlen=STEP_HISTORY)
@@ -199,7 +199,7 @@ class TypicalStep:
 
     @property
     def mean(self) -> float | None:
-        """Ticks per sample; None until the counter has advanced."""
+        """Number of ticks per sample; None until the counter has advanced."""
         return self._sum / self._count if self._count else None
 
     def update(self, steps: Ints) -> None:
@@ -210,7 +210,7 @@ class TypicalStep:
         self._add(near)
         if near.size < moved.size:
             recent = np.array(self._recent)
-            if 2 * self._near(recent).size < recent.size:  # most recent steps differ: start again
+            if 2 * self._near(recent).size < recent.size:  # most of the recent steps differ: start again
                 self._sum = self._count = 0
                 self._add(recent[np.abs(recent / np.median(recent) - 1.0) < STEP_TOLERANCE])
 

@@ -1,7 +1,7 @@
-"""Detection of repeated rows by their keys (sender times or device counters) and values.
+"""Detection of repeated rows by a key, which is the sender time or the device counter, and by the values.
 
-A row is a repeat if an earlier row has the same key and the same values. If many rows share a key but differ in their
-values, the keys are too coarse to distinguish rows. In this case no row is called a repeat.
+A row is a repeat if an earlier row has the same key and the same values. If many rows with equal keys have different
+values, the resolution of the keys is too low to distinguish rows. In this case, no row is treated as a repeat.
 """
 
 from collections import deque
@@ -26,9 +26,9 @@ from drivers.timing.event_rate_limiter import EventRateLimiter
 Mask = NDArray[np.bool_]
 
 MIN_NEW_KEYS: Final = 20
-"""Minimum number of rows with a new key. With fewer rows, no row is called a repeat."""
+"""Minimum number of rows with different keys before a row is treated as a repeat."""
 MAX_SHARED_FRACTION: Final = 0.05
-"""Maximum fraction of rows that share a key with another row but differ in values. Above it, keys are too coarse."""
+"""Maximum fraction of rows with the key of another row but other values, up to which repeats are detected."""
 SHARED_FRACTION_ROWS: Final = 2000
 """Number of recent rows over which the fraction of shared keys is computed."""
 SEARCH_ROWS: Final = 256
@@ -41,8 +41,8 @@ class DuplicateDetector:
     Parameters
     ----------
     ordered : bool
-        True if keys only increase. A repeat may then follow after other rows. False for a counter that wraps. A repeat
-        of a counter value must follow the first row immediately.
+        True for sender times, which increase. Other rows may then precede the repeat of a row. False for a counter that
+        wraps. A repeat must then follow the row immediately.
     """
 
     def __init__(self, ordered: bool) -> None:
@@ -67,7 +67,7 @@ class DuplicateDetector:
         repeats : array of bool, shape (n,), or None
             True for each repeat. None if there are no repeats.
         shared : int
-            Number of other rows that share a key with an earlier row. These rows are not repeats.
+            Number of rows with the key of an earlier row but other values.
         """
         n = len(keys)
         fresh = int(keys[0]) > self._last if self._ordered else int(keys[0]) != self._last
@@ -75,7 +75,7 @@ class DuplicateDetector:
             steps = np.diff(keys)
             fresh = bool((steps > 0).all() if self._ordered else (steps != 0).all())
         newest = int(keys[-1])
-        if self._ordered and newest > self._last - NS_PER_S:  # a clock set back by more than a second restarts
+        if self._ordered and newest > self._last - NS_PER_S:  # otherwise the clock was set back
             newest = max(self._last, newest if n == 1 else int(keys.max()))
         self._last = newest
         if fresh:
@@ -97,7 +97,7 @@ class DuplicateDetector:
         return (repeats if repeats.any() else None), int((~same).sum())
 
     def _same_key(self, keys: Ints, at: int) -> tuple[Ints, Ints]:
-        """Return pairs of rows with the same key whose later row is at ``at`` or after."""
+        """Return the indices of pairs of rows with the same key. The index of the later row is at least ``at``."""
         order = np.argsort(keys, kind="stable") if self._ordered else np.arange(len(keys))
         pairs = np.flatnonzero(np.diff(keys[order]) == 0)
         of, row = order[pairs], order[pairs + 1]
@@ -105,7 +105,7 @@ class DuplicateDetector:
         return of[known], row[known]
 
     def _update_shared_fraction(self, fresh: int, shared: int) -> None:
-        """Add rows to the counts of new and shared keys, and scale both down to the last SHARED_FRACTION_ROWS."""
+        """Count rows with new and shared keys. Scale the counts down if their sum exceeds SHARED_FRACTION_ROWS."""
         self._fresh += fresh
         self._shared += shared
         if self._fresh + self._shared > SHARED_FRACTION_ROWS:
@@ -121,23 +121,23 @@ class DuplicateDetector:
 
 
 class RowFilter:
-    """Filter that removes rows from blocks and carries their ``lost`` counts on to the next row.
+    """Filter that removes rows from blocks and adds their ``lost`` counts to the next row.
 
     Parameters
     ----------
     timing : Timing
-        Timing of the wire format. It decides which key identifies a row.
+        Source of the sample times, which determines the key of a row.
     events : EventRateLimiter
-        Receiver of the events about repeated rows.
+        Queue for the events about repeated rows.
     """
 
     def __init__(self, timing: Timing, events: EventRateLimiter) -> None:
         self.dropped_repeated_rows = 0
-        """Number of rows removed because they repeat an earlier row."""
+        """Number of rows that were removed because they repeat an earlier row."""
         self._timing = timing
         self._events = events
         self._detector = DuplicateDetector(ordered=isinstance(timing, SenderTimedFormat))
-        self._carried_lost = 0  # missing samples before rows that were removed
+        self._carried_lost = 0  # number of missing samples before removed rows
 
     def remove_repeats(self, samples: SampleBlock) -> SampleBlock | None:
         """Remove the rows that repeat an earlier row. Return None if no row remains."""
@@ -161,7 +161,7 @@ class RowFilter:
         return self.select_rows(samples, np.flatnonzero(~repeats))
 
     def select_rows(self, samples: SampleBlock, rows: Ints) -> SampleBlock | None:
-        """Return some rows of a block, or None if there are none.
+        """Return the selected rows of a block, or None if no row is selected.
 
         Samples that are missing before a removed row count as missing before the next row.
 
@@ -170,7 +170,7 @@ class RowFilter:
         samples : SampleBlock
             Block of samples.
         rows : array of int64, shape (n,)
-            Numbers of the rows to keep, in their new order.
+            Indices of the rows to keep, in the new order.
         """
         if not rows.size:
             self._carried_lost += samples.lost

@@ -1,29 +1,30 @@
-"""Lower bound of sample times: the earliest time at which the newest sample of a device can have been taken.
+"""Earliest time at which the newest sample of a device can have been taken.
 
-A sample can be read late but never early. While the reading process gets no processor time, samples wait in the
-buffers of the system. They then arrive in one burst. The arrival time of a sample is therefore only an upper bound of
-the time at which it was taken. The earliest arrivals, compared with a clock that counts samples, bound the time from
-below (Moon, Skelly and Towsley, "Estimation and removal of clock skew from network delay measurements", 1999).
+A sample can be read late but never early. While the reading process gets no processor time, samples wait in the buffers
+of the system and then arrive in one burst. The arrival time is therefore only an upper bound of the sample time. A
+lower bound follows from a clock that advances by one sample period per sample: the sample time is the clock plus the
+minimum delay of the arrivals after this clock (Moon, Skelly and Towsley, "Estimation and removal of clock skew from
+network delay measurements", 1999).
 
-The bound is the minimum over the last WINDOW_S to twice WINDOW_S of steady reading, so that an error of the assumed
-sample period is forgotten. The bound holds if at least one sample of that time was read without delay. The module does
-no I/O and reads no clock.
+The minimum delay is taken over the current window of WINDOW_S and the window before it, so that an error of the assumed
+sample period has a limited effect. The bound is valid if at least one sample in the two windows was read without delay.
+The module does no I/O and reads no clock.
 """
 
 from math import inf
 from typing import Final
 
 WINDOW_S: Final = 60.0
-"""Length of each of the two windows of the minimum."""
+"""Length of each of the two windows over which the minimum delay is taken."""
 MAX_STEP_S: Final = 1.0
-"""Maximum time that one arrival adds to a window. A reader that slept for a minute has measured only one delay."""
+"""Maximum time that one arrival adds to a window. After a long pause, a single arrival measures only one delay."""
 SETTLED_S: Final = 10.0
-"""Minimum time of arrivals that show a sample period.
+"""Minimum duration of the arrivals from which the sample period is determined.
 
-In a shorter time, one late arrival changes the period too much.
+In a shorter time, a single late arrival has a large effect on the period.
 """
 MAX_PROMPT_DELAY_S: Final = 0.05
-"""A sample that arrives within this time of the bound has not waited. Only then is a new sample period adopted."""
+"""Maximum delay, relative to the minimum delay, of an arrival at which a new sample period is adopted."""
 
 
 class EarliestSampleTime:
@@ -41,13 +42,13 @@ class EarliestSampleTime:
 
     def __init__(self) -> None:
         self.period_s: float | None = None
-        """Sample period in s by the clock of the host, from the last samples that were read without delay."""
-        self._clock_s: float | None = None  # advances by one period per sample; newest sample = this + minimum delay
-        self._uncounted = 0.0  # samples that arrived before a period was known
-        self._start_delay_s = inf  # delay of the start, if the start is older than the first arrival
-        self._delay_s = self._previous_delay_s = inf  # minimum delay of an arrival after the clock, in the two windows
-        self._window_s = self._total_s = 0.0  # length of the current window so far, and of all windows
-        self._arrived_s = 0.0  # time of the newest arrival
+        """Sample period in s by the clock of the host, determined when a sample was read without delay."""
+        self._clock_s: float | None = None  # clock that advances by one period per sample
+        self._uncounted = 0.0  # number of samples that arrived before a period was known
+        self._start_delay_s = inf  # delay of the start, if the clock was started before the first arrival
+        self._delay_s = self._previous_delay_s = inf  # minimum delay of the arrivals after the clock, by window
+        self._window_s = self._total_s = 0.0  # duration of the current window so far, and of all windows
+        self._arrived_s = 0.0  # newest arrival time
 
     @property
     def newest_sample_not_before_s(self) -> float | None:
@@ -62,21 +63,21 @@ class EarliestSampleTime:
         return self._total_s >= SETTLED_S
 
     def start_clock(self, not_before_s: float) -> None:
-        """Start the clock at a sample that was read earlier and was not taken before ``not_before_s`` (in s)."""
+        """Start the clock at the time ``not_before_s`` in s, before which the previous sample was not taken."""
         self._clock_s = self._arrived_s = not_before_s
         self._start_delay_s = 0.0
 
     def advance_clock(self, samples: float, arrived_s: float, period_s: float | None) -> None:
-        """Advance the clock to a newer sample.
+        """Advance the clock to the newest sample.
 
         Parameters
         ----------
         samples : float
-            Number of sample periods since the last call, missing samples included.
+            Number of sample periods since the last call, including missing samples.
         arrived_s : float
-            Arrival time of the newest sample on the host in s.
+            Arrival time of the newest sample in s.
         period_s : float or None
-            Sample period in s that the arrivals show now; None if they do not show it.
+            Sample period in s according to the arrivals so far; None if the period is unknown.
         """
         self._uncounted += samples
         step_s = 0.0
@@ -87,7 +88,7 @@ class EarliestSampleTime:
         assert self._clock_s is not None
         self._clock_s += step_s
         delay_s = arrived_s - self._clock_s
-        # without a period the clock does not advance, and earlier delays are not comparable
+        # without a known period the clock does not advance, so earlier delays cannot be compared
         self._delay_s = delay_s if self.period_s is None else min(self._delay_s, delay_s)
         passed_s = max(min(arrived_s - self._arrived_s, MAX_STEP_S), 0.0)
         self._window_s += passed_s

@@ -1,4 +1,4 @@
-"""Rate limiter for events in sample time: one event of each kind per second, and a count of the others."""
+"""Rate limiter for events: at most one event of each kind per second of sample time."""
 
 from typing import Final
 
@@ -11,7 +11,7 @@ MIN_EVENT_INTERVAL_S: Final = 1.0
 class EventRateLimiter:
     """Queue of events that passes at most one event of each kind in MIN_EVENT_INTERVAL_S of sample time.
 
-    The events that are held back are summed up in the next one.
+    The next event of the kind states the number of events that were held back.
     """
 
     def __init__(self) -> None:
@@ -29,22 +29,22 @@ class EventRateLimiter:
         t_ns : int
             Time of the event in ns.
         text : str
-            Text of the event. ``{n}`` is replaced by the sum of the counts of all events that were held back.
+            Text of the event. ``{n}`` is replaced by the sum of ``n`` over this event and the events held back.
         n : int
-            Count of this event.
+            Number of rows that the event concerns.
         """
         key = (kind, text if "{n}" in text else "")
         held = self._held_back.pop(key, None)
         if "{n}" in text:
             n += held[2] if held else 0
-        else:  # the first event is reported, and the others are counted
+        else:  # keep the text of the first event, and count the other events
             n = held[2] + 1 if held else 0
             text = held[1] if held else text
         self._held_back[key] = (t_ns, text, n)
         self.release_held_events(t_ns)
 
     def release_held_events(self, t_ns: int) -> None:
-        """Pass on the events that have been held back long enough at the time ``t_ns``."""
+        """Move the events that have been held back long enough at the time ``t_ns`` to the queue."""
         for (kind, what), (at_ns, text, n) in [*self._held_back.items()] if self._held_back else ():
             if kind not in self._last_ns or abs(t_ns - self._last_ns[kind]) >= MIN_EVENT_INTERVAL_S * NS_PER_S:
                 del self._held_back[(kind, what)]
@@ -53,7 +53,7 @@ class EventRateLimiter:
                 self._events.append(Event(kind, at_ns, text.replace("{n}", str(n)) + more))
 
     def take_events(self, ended: bool = False) -> list[Event]:
-        """Return the events since the last call. If ``ended`` is True, return the events that are held back, too."""
+        """Return the events since the last call. If ``ended`` is True, include the events that are held back."""
         while ended and self._held_back:
             self._last_ns.clear()
             self.release_held_events(0)

@@ -1,10 +1,10 @@
-"""Comparison of the configured sample rate with the measured one.
+"""Comparison of the configured sample rate with the measured sample rate.
 
-A wrong rate shifts the Allan deviation curve along τ and scales the coefficients: N by the square root of the error, K
-by its inverse square root. Three outcomes are possible. If the two rates agree, the configured rate is used. If they
-differ by more than the measurement uncertainty but by no more than the tolerance of an oscillator, the measured rate is
-used. If they differ by more than that, one of them is wrong for a reason that the program cannot determine, and the
-configured rate is contradicted. The caller must then not publish results that depend on the rate. The reasons are in
+A wrong rate shifts the Allan deviation along τ and scales the coefficients. N scales with the square root of the error
+of the rate, K with the inverse square root. If the two rates agree within the measurement uncertainty, the configured
+rate is used. If the difference is larger but within the tolerance of an oscillator, the measured rate is used. If the
+difference exceeds this tolerance, the measured rate contradicts the configured rate, and the program cannot determine
+the cause. The caller must then not publish results that depend on the rate. The reasons are in
 docs/decisions/rate-is-a-label.md and docs/decisions/contradicted-rate.md. The module does no I/O and reads no clock.
 """
 
@@ -13,17 +13,17 @@ from typing import Final
 from drivers.timing.arrival_regression import snap_to_standard_rate
 
 AGREEMENT_LIMIT: Final = 0.005
-"""Relative difference up to which two rates agree. N and K are then off by a quarter of a percent at most."""
+"""Relative difference up to which two rates agree. The resulting error of N and K is at most a quarter of a percent."""
 CONTRADICTION_LIMIT: Final = 0.02
-"""Relative difference above which the configured rate is contradicted. Oscillators of sensors are better than this."""
+"""Relative difference above which the rates contradict each other. Oscillators of sensors are more accurate."""
 HYSTERESIS_FACTOR: Final = 0.75
-"""A contradiction ends below this share of the limit at which it began, so that the decision does not alternate."""
+"""Ratio of the limit at which a contradiction ends to the limit at which the contradiction begins."""
 UPDATE_THRESHOLD: Final = 0.001
 """Relative change of the measured rate above which the rate in use is replaced."""
 
 
 class RateCheck:
-    """Comparison of the configured rate of one device with the measured one.
+    """Comparison of the configured sample rate of one device with the measured rate.
 
     Parameters
     ----------

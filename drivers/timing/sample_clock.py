@@ -1,18 +1,17 @@
-"""Sample clock: gives each sample its time and detects missing samples.
+"""Sample clock, which assigns a time to each sample and detects missing samples.
 
-The wire format carries one of three kinds of timing (``drivers.sample.Timing``). Each kind has a module of its own:
+Sample times have one of three sources, depending on the wire format (``drivers.sample.Timing``):
 
-- a device counter (``counter_gaps``), which shows missing samples exactly,
-- arrival times only (``arrival_timeline``). Missing samples are the rejected frames that the decoder reports, the pause
-  while a link was closed, and delays that are not caught up,
-- times given by the sender (``sender_times``), which are kept.
+- A device counter (``counter_gaps``) gives the exact number of missing samples.
+- If there are only arrival times (``arrival_timeline``), missing samples are detected from rejected frames, from the
+  time during which the link was closed, and from persistent delays.
+- The sender gives the sample times (``sender_times``), which are used unchanged.
 
-In the first two cases, samples are placed on a line that is fitted to the arrival times. ``lost`` of each returned
-block counts all samples that are missing just before the block, rejected frames included.
+In the first two cases, the sample times are on a line that is fitted to the arrival times. ``lost`` of each returned
+block is the number of samples that are missing just before the block, including rejected frames.
 
-Repeated rows are left out and reported (``duplicate_rows``). There is at most one event of each kind per second of
-sample time (``event_rate_limiter``). The sample clock changes no values, does no I/O and reads no clock. Arrival times
-and counters are arguments.
+Repeated rows are dropped and reported (``duplicate_rows``). There is at most one event of each kind per second of
+sample time (``event_rate_limiter``). The sample clock does not change values, does no I/O and reads no clock.
 """
 
 from dataclasses import dataclass
@@ -31,13 +30,13 @@ from drivers.timing.rate_check import RateCheck
 from drivers.timing.sender_times import SenderTimes
 
 MAX_RESUME_DELAY_S: Final = 10.0
-"""Assumed maximum read delay of the last sample that was recorded before a restart."""
+"""Assumed maximum delay between taking and reading the last sample before a restart."""
 RATE_CHECK_S: Final = 30.0
 RATE_CHECK_SAMPLES: Final = (2 * MIN_SAMPLES, round(MIN_SPAN_S * MAX_RATE_HZ))
-"""Numbers of samples without a measured rate after which the check of the rate is given up.
+"""Numbers of samples after which the rate check is abandoned if no rate could be measured.
 
-The check is given up after the first number if RATE_CHECK_S has passed as well, and after the second number in any
-case.
+The check is abandoned after the first number of samples if RATE_CHECK_S has passed, and otherwise after the second
+number of samples.
 """
 
 
@@ -45,7 +44,7 @@ case.
 class LastSample:
     """Last sample before a restart of the program."""
 
-    t_ns: int  # in the epoch of the device's times
+    t_ns: int  # on the clock of the sample times of the device
     tick: int  # counter of the device; NO_TICK = none
     rate_hz: float | None
     ticks_per_sample: float | None  # ticks per sample
@@ -57,12 +56,12 @@ class SampleClock:
     Parameters
     ----------
     timing : Timing
-        Timing that the wire format carries.
+        Source of the sample times in the wire format.
     rate_hz : float or None
-        Configured sample rate in Hz. None if it is to be found from the data.
+        Configured sample rate in Hz. None if the rate is determined from the data.
     arrivals_are_timed : bool
-        False if arrival times do not depend on the rate of the device: bytes are read from a file, or a simulated
-        sensor runs at another speed.
+        False if arrival times do not depend on the sample rate, because bytes are read from a file, or because a
+        simulated sensor does not run in real time.
     """
 
     def __init__(self, timing: Timing, rate_hz: float | None, arrivals_are_timed: bool = True) -> None:
@@ -77,13 +76,13 @@ class SampleClock:
             self._counter = CounterGaps(timing, self._timeline, self._events)
         elif isinstance(timing, SenderTimedFormat):
             self._sender = SenderTimes(self._timeline, self._rows, self._events)
-        self._stamped = 0  # samples
-        self._stamped_s = 0.0  # from the first sample to the newest, by their original times
+        self._stamped = 0  # number of time-stamped samples
+        self._stamped_s = 0.0  # arrival or sender time from the first to the newest sample, in s
         self._ended = self._resumed = self._paused = False
-        self._idle_ns: int | None = None  # the link held no data at this time
+        self._idle_ns: int | None = None  # last time at which the link held no unread data
 
     def resume(self, before: LastSample) -> None:
-        """Continue from the last sample that was recorded before a restart. The samples since then are missing."""
+        """Continue from the last recorded sample before a restart. The samples after this sample are missing."""
         timeline = self._timeline
         self._resumed = self._paused = True
         timeline.assumed_hz = timeline.nominal_hz or before.rate_hz
@@ -96,25 +95,25 @@ class SampleClock:
 
     @property
     def dropped_repeated_rows(self) -> int:
-        """Number of rows left out because they repeat earlier rows."""
+        """Number of rows that were dropped because they repeat earlier rows."""
         return self._rows.dropped_repeated_rows
 
     @property
     def dropped_late_rows(self) -> int:
-        """Number of rows left out because they had been counted as missing."""
+        """Number of rows that were dropped because they had already been counted as missing."""
         return 0 if self._sender is None else self._sender.dropped_late_rows
 
     @property
     def ticks_per_sample(self) -> float | None:
-        """Ticks of the device counter per sample; None until the counter has advanced."""
+        """Number of ticks of the device counter per sample; None until the counter has advanced."""
         return None if self._counter is None else self._counter.typical_step.mean
 
     @property
     def rate_hz(self) -> float | None:
-        """Sample rate in Hz: the configured rate if there is one, otherwise the rate found from the data.
+        """Sample rate in Hz, configured or measured; None if the rate is unknown or outside the supported range.
 
-        None at first, and while the data give a rate outside the supported range. If the sample times contradict the
-        configured rate, the measured rate replaces it (see ``drivers.timing.rate_check``).
+        A measured rate that contradicts the configured rate replaces the configured rate
+        (``drivers.timing.rate_check``).
         """
         if self._check is not None:
             return self._check.rate_hz
@@ -125,17 +124,17 @@ class SampleClock:
 
     @property
     def measured_hz(self) -> float | None:
-        """Sample rate in Hz by the clock of the host, without rounding; None until it is known."""
+        """Measured sample rate in Hz by the clock of the host, without rounding; None if unknown."""
         return self._timeline.line.rate_hz() if self._timeline.line.can_tell_gap_from_jitter() else None
 
     @property
     def contradicted_hz(self) -> float | None:
-        """Measured rate in Hz that contradicts the configured rate. None if they agree or one of them is unknown."""
+        """Measured rate in Hz if the measured rate contradicts the configured rate, otherwise None."""
         return self._check.measured_hz if self._check is not None and self._check.contradicted else None
 
     @property
     def rate_check_pending(self) -> bool:
-        """True if samples have arrived but the configured rate has not been checked yet."""
+        """True if samples have arrived but the configured rate has not been checked."""
         if self._check is None or self._check.measured_hz is not None or self._ended:
             return False
         if not self._stamped:
@@ -146,28 +145,28 @@ class SampleClock:
         return self._arrivals_are_timed or self._sender is not None or self._has_device_clock
 
     def compare_rates_at_end(self) -> None:
-        """Compare the rates with the available samples, since no more samples will arrive."""
+        """Check the configured rate with the available samples, because no more samples will arrive."""
         if not self._ended and self._check is not None and self._check.measured_hz is None:
             self._check_rate(final=True)
         self._ended = True
 
     def take_events(self, ended: bool = False) -> list[Event]:
-        """Return the events since the last call. If ``ended`` is True, return the events that are held back, too."""
+        """Return the events since the last call. If ``ended`` is True, include the events that are held back."""
         return self._events.take_events(ended)
 
     def note_link_closed(self) -> None:
-        """Note that the link was closed. The arrival of the next sample shows how many samples are missing."""
+        """Prepare for samples after a closed link. The next arrival time gives the number of missing samples."""
         self._paused = True
 
     def note_no_unread_data(self, t_ns: int) -> None:
-        """Note that the link held no unread data at the host time ``t_ns``. Data that arrive later were sent later.
+        """Store a time at which the link held no unread data, on the monotonic clock of the host.
 
-        Only the time before the first sample is used. It limits how long the first samples may have waited.
+        Only the last such time before the first sample is used. The time limits the delay of the first samples.
         """
         self._idle_ns = t_ns
 
     def assign_times(self, samples: SampleBlock) -> list[SampleBlock]:
-        """Give samples their times.
+        """Assign times to samples.
 
         Parameters
         ----------
@@ -177,13 +176,13 @@ class SampleClock:
         Returns
         -------
         list of SampleBlock
-            The samples with their times. A new block begins where samples are missing.
+            Samples with assigned times. A new block begins where samples are missing.
         """
         timeline = self._timeline
         if timeline.origin_ns is None:
             timeline.origin_ns = int(samples.t_ns[0])
             if self._idle_ns is not None:
-                # one period before the first sample, which was not taken before the link was idle
+                # the first sample was not taken before the link was empty, so the previous sample is one period older
                 period_s = 1.0 / (timeline.nominal_hz or MAX_RATE_HZ)
                 timeline.earliest_time.start_clock(min(timeline.seconds_since_origin(self._idle_ns), 0.0) - period_s)
         self._events.release_held_events(int(samples.t_ns[-1]))
@@ -198,13 +197,13 @@ class SampleClock:
 
     @property
     def _has_device_clock(self) -> bool:
-        """True if the counter of the device shows the rate by the clock of the device."""
+        """True if the counter of the device measures time."""
         return self._counter is not None and self._counter.clock_line.count > 0
 
     def _check_rate(self, final: bool = False) -> None:
-        """Compare the configured rate with the rate that the data show, preferably by the clock of the device.
+        """Compare the configured rate with the measured rate, preferably by the clock of the device.
 
-        At the end of a short recording, arrival times show the rate too inaccurately.
+        At the end of a short recording, the rate by arrival times is too inaccurate and is not used.
         """
         line = None
         if self._counter is not None and self._has_device_clock:
@@ -220,7 +219,7 @@ class SampleClock:
         if self._sender is not None:
             return self._sender.split_at_missing_samples(samples)
         if self._paused and self.rate_hz is None:
-            self._timeline.restart_line()  # the number of missing samples is unknown: a line cannot span the pause
+            self._timeline.restart_line()  # the number of missing samples is unknown
         if self._counter is not None and (samples.ticks != NO_TICK).all():
             missing = self._counter.count_missing(samples, self._paused)
         else:
@@ -231,7 +230,7 @@ class SampleClock:
         return self._timeline.assign_line_times(samples, missing)
 
     def _missing_by_arrival(self, samples: SampleBlock) -> Ints:
-        """Return the missing samples [n] before each row of samples without a counter."""
+        """Return the number of missing samples [n] before each row according to the arrival times."""
         missing = np.zeros(len(samples), np.int64)
         arrived_ns = int(samples.t_ns[-1])
         if self._paused:

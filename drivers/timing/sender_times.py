@@ -1,11 +1,10 @@
 """Order and gaps of samples whose times the sender gives.
 
-Times that a host has stamped are early or late by whole periods although no sample is missing. A step of the times is
-therefore a gap only if the other steps are regular. If the times are too coarse for a decision, every row stays in the
-order of arrival.
+If the sender stamps samples on arrival, times may be wrong by whole periods although no sample is missing. A long step
+between two times therefore counts as a gap only if the other steps are regular.
 
-If the times of one block form a steady sequence in another order, the rows are sorted. Times that only jitter are not
-sorted, because the order of arrival is then correct. A row that arrives after it was counted as missing is left out.
+If the times of one block become evenly spaced by sorting, the rows are sorted. Otherwise the times are only affected by
+jitter, and the order of arrival is kept. A row that arrives after the sample was counted as missing is dropped.
 """
 
 from collections import deque
@@ -20,35 +19,35 @@ from drivers.timing.duplicate_rows import SEARCH_ROWS, RowFilter
 from drivers.timing.event_rate_limiter import EventRateLimiter
 
 FORWARD_JUMP_S: Final = 3600.0
-"""A step of sender times beyond this time is reported as an event."""
+"""Step between two sender times above which an event is reported."""
 STEP_HISTORY: Final = 255
 """Number of recent steps from which the typical deviation is determined."""
 STEP_TOLERANCE: Final = 0.25
-"""Tolerance as a fraction of a period. Times this close to a whole number of periods form a steady sequence."""
+"""Maximum deviation of a step from a whole number of periods, in periods, for evenly spaced times."""
 CERTAIN_GAP_PERIODS: Final = 4.0
-"""A longer step is a gap even if it is not a whole number of periods."""
+"""Step in periods above which a step is a gap, even if the step is not a whole number of periods."""
 MAX_LATENESS_RATIO: Final = 8.0
-"""A time is late, with no sample missing, up to this multiple of the upper quartile of the typical deviation."""
+"""Ratio of the longest step without a gap to the upper quartile of the deviations, both as excess over one period."""
 MAX_PERIOD_NS: Final = float(1 << 54)
-"""Longest period of missing samples whose times are kept, 200 days, so that the times stay within int64."""
+"""Longest period for which the times of missing samples are stored, 200 days, so that the times fit into int64."""
 
 
 class SenderTimes:
-    """Detector of gaps and of reordered rows in the times that the sender of one device gives.
+    """Detector of gaps and reordered rows in sender times.
 
     Parameters
     ----------
     timeline : ArrivalTimeline
-        Line of sender time against sample index.
+        Fitted line of sender time against sample index.
     rows : RowFilter
         Filter that removes rows and keeps their ``lost`` counts.
     events : EventRateLimiter
-        Receiver of the events about jumps and reordered rows.
+        Queue for the events about jumps and reordered rows.
     """
 
     def __init__(self, timeline: ArrivalTimeline, rows: RowFilter, events: EventRateLimiter) -> None:
         self.dropped_late_rows = 0
-        """Number of rows left out because they had been counted as missing."""
+        """Number of rows that were dropped because they had already been counted as missing."""
         self._timeline = timeline
         self._rows = rows
         self._events = events
@@ -57,7 +56,7 @@ class SenderTimes:
         self._steps_s: deque[float] = deque(maxlen=STEP_HISTORY)
 
     def sort_rows(self, samples: SampleBlock) -> SampleBlock | None:
-        """Sort the rows of a block by their times, and remove late rows. Return None if no row remains."""
+        """Sort the rows of a block by time, and remove late rows. Return None if no row remains."""
         t, last_ns = samples.t_ns, self._timeline.last_t_ns
         in_order = t[0] >= last_ns and (len(t) == 1 or (np.diff(t) >= 0).all())
         if not self._timeline.line.count or in_order:
@@ -77,7 +76,7 @@ class SenderTimes:
         return self._rows.select_rows(kept, order)
 
     def split_at_missing_samples(self, samples: SampleBlock) -> list[SampleBlock]:
-        """Return the samples with their own times. A new block begins where samples are missing."""
+        """Return the samples with unchanged times, in blocks that begin where samples are missing."""
         t, timeline = samples.t_ns, self._timeline
         steps = np.empty(len(samples), np.int64)
         steps[0] = t[0] - timeline.last_t_ns if timeline.line.count else 0
@@ -91,7 +90,7 @@ class SenderTimes:
         missing[0] = max(int(missing[0]), samples.lost)
         index = timeline.index + np.cumsum(missing + 1)
         first = 0
-        if jumps.size:  # a line must not contain a jump
+        if jumps.size:  # start a new line after the last jump
             first = int(jumps[-1])
             timeline.restart_line()
         for row in (first, len(samples) - 1):
@@ -102,7 +101,7 @@ class SenderTimes:
         return split_at_gaps(samples, t, missing)
 
     def _remove_late_rows(self, samples: SampleBlock, period_s: float) -> SampleBlock | None:
-        """Remove rows that were counted as missing; None if no row remains."""
+        """Remove the rows that have already been counted as missing. Return None if no row remains."""
         distance_ns = np.abs(samples.t_ns[:, None] - np.array(self._missing_t_ns))
         late = samples.t_ns < self._timeline.last_t_ns
         late &= distance_ns.min(axis=1) < STEP_TOLERANCE * period_s * NS_PER_S
@@ -117,14 +116,14 @@ class SenderTimes:
         return self._rows.select_rows(samples, np.flatnonzero(~late))
 
     def _keep_missing_times(self, t: Ints, missing: Ints, period_s: float) -> None:
-        """Keep the times of samples that count as missing, because they may arrive later."""
+        """Store the times of missing samples, because the samples may arrive later."""
         period_ns = min(period_s * NS_PER_S, MAX_PERIOD_NS)
         for row in np.flatnonzero((missing > 0) & (missing <= SEARCH_ROWS)).tolist():
             before_ns = np.rint(np.arange(1, missing[row] + 1) * period_ns)
             self._missing_t_ns.extend((t[row] - before_ns).astype(np.int64).tolist())
 
     def _period_s(self, steps: Ints) -> float | None:
-        """Return the period for the search of gaps; None as long as all samples may be one burst of a late sender."""
+        """Return the sample period for the detection of gaps; None while the period is unknown."""
         if self._timeline.line.can_tell_gap_from_jitter():
             return self._timeline.line.period_s()
         if self._timeline.assumed_hz:
@@ -133,7 +132,7 @@ class SenderTimes:
 
     def _report_jumps(self, t: Ints, steps: Ints) -> None:
         """Report times that went back or jumped ahead."""
-        back = steps < (-JUMP_S * NS_PER_S if self._went_back else 0.0)  # jitter back and forth is reported once
+        back = steps < (-JUMP_S * NS_PER_S if self._went_back else 0.0)  # small steps back are reported only once
         if back.any():
             at = int(np.argmax(back))
             self._events.report_event("clock_jumped", int(t[at]), f"time went back by {-steps[at] / NS_PER_S:.6g} s")
@@ -143,10 +142,10 @@ class SenderTimes:
             self._events.report_event("clock_jumped", int(t[at]), f"time jumped ahead by {steps[at] / NS_PER_S:.6g} s")
 
     def _count_missing(self, steps_s: Floats, period_s: float) -> Ints:
-        """Return the missing samples [n] before each row; all zero unless most steps are one period long.
+        """Return the number of missing samples [n] before each row; 0 unless most steps are one period long.
 
-        A short gap must be a whole number of periods and longer than the typical deviation. No neighbouring step may
-        compensate it.
+        A short gap must be a whole number of periods and exceed the typical deviation. If a neighbouring step is
+        shorter by the same time, the row was only late.
         """
         last_s = self._steps_s[-1] if self._steps_s else period_s
         self._steps_s.extend(steps_s[-STEP_HISTORY:].tolist())
@@ -167,7 +166,7 @@ class SenderTimes:
 
 
 def find_steady_order(t_ns: Ints, period_s: float) -> Ints | None:
-    """Return the order in which sender times form a steady sequence.
+    """Return the order in which sender times are evenly spaced.
 
     Parameters
     ----------
@@ -179,7 +178,7 @@ def find_steady_order(t_ns: Ints, period_s: float) -> Ints | None:
     Returns
     -------
     array of int64, shape (n,), or None
-        Row number of each position. None if the times are in order already or form no steady sequence.
+        Row index of each position. None if the times are already in order, or are not evenly spaced in any order.
 
     Examples
     --------
@@ -200,9 +199,9 @@ def find_steady_order(t_ns: Ints, period_s: float) -> Ints | None:
 
 
 def _typical_period_s(steps: Ints) -> float | None:
-    """Estimate the period in s from the steps while it is unknown; None without a step forward.
+    """Estimate the sample period in s from the steps; None if no step is positive.
 
-    The estimate is the median of steady steps, or the mean of other steps.
+    The estimate is the median if the steps are regular, otherwise the mean.
     """
     forward = steps[steps > 0] / NS_PER_S
     if not forward.size:

@@ -1,9 +1,9 @@
-"""Causes of connection errors. zenoh itself only reports that it could not connect.
+"""Causes of connection errors, since zenoh itself does not report a cause.
 
-``explain_refusal`` tests an endpoint with the configuration of the failed attempt. The test repeats the first steps of
-zenoh: a connection and, for TLS, the handshake with the same certificates. Nothing is sent after the handshake. The
-result is one line, or "" if no program listens at the endpoint or its protocol cannot be tested (QUIC, UDP). The test
-can wait for ``timeout_s`` twice, and must not delay samples.
+The functions connect to an endpoint with the configuration of the failed attempt. For TLS, the test includes the
+handshake with the same certificates. Nothing is sent after the handshake. The result is one line, or "" if no program
+listens at the endpoint or if the protocol cannot be tested (QUIC, UDP). The test of an endpoint may take twice
+``timeout_s``, so a thread that handles samples must not run the test.
 """
 
 import json
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 TIMEOUT_S: Final = 2.0
 LOGIN_REFUSED: Final = "answers, but refuses the login: check user and password"
-"""Only remaining reason if connection and handshake succeed."""
+"""Reason that remains if connection and handshake succeed."""
 UNKNOWN_AUTHORITY: Final = "does not accept our certificate: it is not signed by its authority"
 _ENDPOINT: Final = re.compile(r"(tcp|tls|ws|wss)/\[?([^\]?#]+?)\]?:(\d+)(?:[?#].*)?")
 _TLS_REASONS: Final = {
@@ -90,7 +90,7 @@ def _explain_handshake_failure(plain: socket.socket, host: str, config: "zenoh.C
         with context.wrap_socket(plain, server_hostname=host) as secure:
             secure.recv(1)  # in TLS 1.3 a refusal of our certificate is sent after the handshake
     except TimeoutError:
-        return LOGIN_REFUSED  # the other side waits for zenoh's first message
+        return LOGIN_REFUSED  # the other side waits for the first message of zenoh
     except ssl.SSLCertVerificationError as error:
         return f"its certificate is not valid: {error.verify_message}"
     except ssl.SSLError as error:

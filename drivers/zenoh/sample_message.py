@@ -1,13 +1,12 @@
-"""Message format of samples: conversion between ``SampleBlock`` and the msgpack map of ``<prefix>/<device>/samples``.
+"""Conversion between ``SampleBlock`` and the msgpack map that is published under ``<prefix>/<device>/samples``.
 
-The layout is defined only in this module. The daemon publishes with ``encode_samples``, the ``samples`` decoder reads
-with ``decode_samples``, and a replayed recording uses the same message. ``docs/samples-format.md`` documents the
-format.
+The daemon publishes messages of this format, the decoder ``samples`` reads them, and a replayed recording is converted
+to them. ``docs/samples-format.md`` documents the format.
 
 If the samples are evenly spaced to within half a microsecond, ``t`` is the Unix time of the newest sample in seconds,
-``t0`` the Unix time of the first sample, and ``rate`` the sample rate in Hz. Otherwise ``t`` contains the time of each
-sample as little-endian float64. The resolution of Unix seconds as float64 is 0.24 µs. Unknown keys and columns are
-ignored. Sizes are limited and must be consistent, otherwise a ``DecodeError`` is raised.
+``t0`` the Unix time of the first sample, and ``rate`` the sample rate in Hz. Otherwise ``t`` contains the Unix time of
+each sample in seconds as little-endian float64, with a resolution of 0.24 µs. Unknown keys and columns are ignored. If
+sizes are inconsistent or exceed a limit, a ``DecodeError`` is raised.
 """
 
 from collections.abc import Sequence
@@ -23,21 +22,21 @@ from drivers.sample import AXES, Floats, Ints, SampleBlock, make_block, ns_to_se
 
 SCHEMA: Final = "imu-monitor/samples/1"
 SCHEMAS: Final = (SCHEMA, "imu-monitor/compensated/1")
-"""Names of all schemas with this layout."""
+"""Names of all schemas with this format."""
 TEMPERATURE: Final = "temperature"
 COLUMNS: Final = (*AXES, TEMPERATURE)
 MAX_ROWS: Final = 1_000_000
 MAX_COLUMNS: Final = 64
 MAX_BYTES: Final = 1 << 26  # a million rows of seven columns
 MAX_GRID_DEVIATION_NS: Final = 500
-"""Largest deviation of a sample from an even grid. It is twice the resolution of Unix seconds as float64."""
+"""Largest deviation of a sample time from an even grid, twice the resolution of Unix seconds in float64."""
 T_LIMIT_S: Final = 4.6e9
-"""Largest absolute time, which is in the years 1824 to 2115. Differences of times fit into int64 nanoseconds."""
+"""Largest absolute Unix time, from the year 1824 to 2115. The difference of two times fits into int64 nanoseconds."""
 RATE_LIMITS_HZ: Final = (1e-6, 1e9)
 
 Count = Annotated[int, msgspec.Meta(ge=0, le=1 << 53)]
 Lost = Annotated[int, msgspec.Meta(ge=0, le=1_000_000_000)]
-"""Number of lost samples. The largest number corresponds to eleven days at 1 kHz."""
+"""Number of lost samples, up to eleven days at 1 kHz."""
 
 
 class _Payload(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -63,7 +62,7 @@ class SampleMessage:
     """Content of one message."""
 
     device: str
-    samples: int  # number received by the publisher since it started, including the samples of the message
+    samples: int  # number of samples that the publisher has received since its start, including this message
     block: SampleBlock  # t_ns are Unix times
 
 
@@ -79,9 +78,9 @@ def encode_samples(
     samples
         Number of samples of the device since the start, including the samples of the message.
     rows
-        Samples to encode. Axes without a value are left out. If all values are NaN, all six axes are kept.
+        Samples to encode. Axes without a value are omitted. If all values are NaN, all six axes are kept.
     offset_ns
-        Added to ``t_ns`` to give Unix time, in ns.
+        Offset from ``t_ns`` to Unix time in ns.
     schema
         Name of the schema.
     """
@@ -107,7 +106,7 @@ def encode_samples(
 
 
 def decode_samples(data: bytes) -> SampleMessage:
-    """Decode the samples of one message. Raise DecodeError with the reason if the message violates the format."""
+    """Decode the samples of one message. Raise DecodeError if the message is invalid."""
     try:
         payload = _DECODER.decode(data)
     except (msgspec.DecodeError, msgspec.ValidationError, UnicodeDecodeError, RecursionError) as error:
@@ -128,7 +127,7 @@ def decode_samples(data: bytes) -> SampleMessage:
 
 
 def _encode_times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
-    """Return the values of the keys ``t``, ``t0`` and ``rate`` of a message."""
+    """Return the values of the keys ``t``, ``t0`` and ``rate``."""
     n = unix_ns.size
     span_ns = int(unix_ns[-1] - unix_ns[0])
     rate = (n - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
@@ -140,7 +139,7 @@ def _encode_times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | N
 
 
 def _decode_values(payload: _Payload) -> Floats:
-    """Return the data as an array [rows, columns] after checking the sizes."""
+    """Check the sizes, and return the data as an array [rows, columns]."""
     names: Sequence[str] = payload.axes
     if not 0 < len(names) <= MAX_COLUMNS or len(set(names)) != len(names):
         raise DecodeError(f"axes: {len(names)} names, expected 1 to {MAX_COLUMNS} different names")
@@ -174,6 +173,6 @@ def _decode_times_ns(payload: _Payload, n: int) -> Ints:
 
 
 def _check_times(seconds: Floats) -> None:
-    """Raise DecodeError if a time is missing or out of range."""
+    """Raise DecodeError if a time is missing or outside the supported range."""
     if not np.all(np.abs(seconds) < T_LIMIT_S):
         raise DecodeError("t: a time is not a Unix time in seconds")

@@ -1,6 +1,6 @@
-"""Configurations of zenoh sessions. By default a session is a peer that does not scout or listen.
+"""Configuration of zenoh sessions. By default, a session is a peer that does not scout or listen.
 
-This module opens no session. The link, the publisher of the daemon and ``watch`` each open their own session.
+This module opens no session. The link, the publisher of the daemon and the command ``watch`` open separate sessions.
 """
 
 import contextlib
@@ -24,10 +24,11 @@ DEFAULT_CONFIGURATION: Final[Mapping[str, Any]] = {
     "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
     "transport/link/rx/max_message_size": 64_000_000,
 }
-"""Default configuration of a session. zenoh's own defaults scout and listen everywhere, and accept 1 GiB at once.
+"""Default configuration of a session.
 
-A lost connection is retried at least every second. A message longer than 64 MB is dropped while it arrives, and the
-connection stays open. An hour of samples at 1 kHz in one batch would fit.
+The defaults of zenoh would scout and listen on all interfaces, and accept messages of 1 GiB. A lost connection is
+retried at least once per second. A message longer than 64 MB is dropped, and the connection stays open. A message of
+64 MB could contain an hour of samples at 1 kHz.
 """
 
 SECRET_FILES: Final = (
@@ -55,11 +56,11 @@ def build_session_config(
     Parameters
     ----------
     own
-        Values by configuration key, which take precedence over the file. None means not set.
+        Values by configuration key, which take precedence over the file. A value of None is ignored.
     file
-        zenoh configuration file; None for zenoh's defaults.
+        zenoh configuration file. None for the defaults of zenoh.
     defaults
-        Values for keys that the file leaves at zenoh's default.
+        Values for keys that the file does not set.
 
     Raises
     ------
@@ -86,8 +87,8 @@ def build_session_config(
 def format_zenoh_error(error: Exception) -> str:
     """Return the text of a zenoh error in one line.
 
-    Positions in zenoh's source code and quoted file contents are removed, since a line of a configuration file may
-    contain a password.
+    Positions in the source code of zenoh are removed. Quotations from a configuration file are removed as well, since
+    they may contain a password.
     """
     text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error))
     text = re.sub(r"\s*-->\s*(\d+):(\d+)\s*\n.*\n\s*=\s*", r"line \1, column \2: ", text, flags=re.DOTALL)
@@ -110,7 +111,7 @@ def is_unconnected(session: "zenoh.Session") -> bool:
 
 
 def find_connect_endpoints(config: "zenoh.Config") -> tuple[str, ...]:
-    """Return the endpoints to which a configuration connects in the mode of the session."""
+    """Return the endpoints to which a session with this configuration connects."""
     found = json.loads(config.get_json("connect/endpoints"))
     if isinstance(found, dict):
         found = found.get(json.loads(config.get_json("mode")) or "peer", [])
@@ -118,18 +119,18 @@ def find_connect_endpoints(config: "zenoh.Config") -> tuple[str, ...]:
 
 
 def find_secret_files(config: "zenoh.Config") -> tuple[Path, ...]:
-    """Return the private keys and password lists that a configuration names. Other users must not read them."""
+    """Return the files with private keys and passwords, which other users must not be able to read."""
     return _named_files(config, SECRET_FILES)
 
 
 def _named_files(config: "zenoh.Config", keys: Sequence[str] | None = None) -> tuple[Path, ...]:
-    """Return the files that a configuration names under ``keys``, or under all keys."""
+    """Return the files in a configuration under ``keys``, or under all keys of files."""
     found = (json.loads(config.get_json(key)) for key in keys or (*SECRET_FILES, *PUBLIC_FILES))
     return tuple(Path(named) for named in found if named)
 
 
 def _check_file(path: Path) -> None:
-    """Raise ZError if the path is not a regular file. zenoh would wait forever for a FIFO."""
+    """Raise ZError if the path is not a regular file. zenoh would wait forever if the path were a FIFO."""
     import zenoh
 
     try:

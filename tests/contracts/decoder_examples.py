@@ -12,7 +12,7 @@ from typing import Any
 
 from drivers import decoders, discovery
 from drivers.decoders.base import Decoder
-from drivers.settings_model import read_settings
+from tests.support.settings import read_settings
 
 DEGREE = math.pi / 180.0
 G = 9.80665
@@ -58,7 +58,7 @@ class Example:
     def carrier(self) -> str:
         """What the decoder is fed: bytes, frames or messages."""
         module = importlib.import_module(f"{decoders.__name__}.{self.name}")
-        carriers = [c.carrier for c in vars(module).values() if "carrier" in getattr(c, "__dict__", {})]
+        carriers = [getattr(found, "carrier", None) for found in vars(module).values()]
         return str(next(c for c in carriers if isinstance(c, str)))
 
     def build(self, folder: Path) -> Decoder:

@@ -19,9 +19,9 @@ from drivers import discovery, links
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Link, LinkSettings
 from drivers.sample import Chunk
-from drivers.settings_model import read_settings
 from tests.support.loopback_link import LoopbackLink
 from tests.support.ports import free_endpoint
+from tests.support.settings import read_settings
 from tests.support.waiting import FOREVER_S, PATIENCE_S
 from tests.support.zenoh_sessions import router as zenoh_router
 

@@ -16,10 +16,10 @@ from drivers.decoders import samples as samples_decoder
 from drivers.driver import MAX_UNDECODED_BYTES, AxisMap, Driver, parse_axis_map
 from drivers.errors import ConfigError
 from drivers.sample import NO_TICK, Chunk, make_block
-from drivers.settings_model import read_settings
 from drivers.timing.sample_clock import SampleClock
 from drivers.zenoh.sample_message import encode_samples
 from tests.support.loopback_link import LoopbackLink
+from tests.support.settings import read_settings
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
 RATE = 100.0
@@ -332,7 +332,7 @@ def test_the_status_of_a_device_whose_can_frames_are_all_late_names_the_window()
     rig = can_rig(range(500))
     assert rig.driver.state == "waiting"
     assert rig.driver.text.startswith("loopback: ")
-    assert rig.driver.text.endswith(f" bytes and no sample in them; {APART}")
+    assert rig.driver.text.endswith(f" bytes without a sample; {APART}")
 
 
 def test_times_follow_what_the_link_brings():
@@ -404,7 +404,7 @@ def test_many_holes_are_told_once_a_second(monkeypatch):
     rig = Rig()
     driver = rig.driver
     for lost in (3, 2, 2):
-        driver._count(make_block(np.zeros(1, np.int64), np.zeros((1, 6)), lost=lost), 0)
+        driver._count_samples(make_block(np.zeros(1, np.int64), np.zeros((1, 6)), lost=lost), 0)
         driver._report_lost()
     now_s[0] += 1.0
     driver._report_lost()

@@ -9,7 +9,8 @@ from pydantic import Field
 from drivers import number_ranges
 from drivers.errors import ConfigError
 from drivers.number_ranges import RATE_HZ, SCALE, SEED, SILENCE_S, NumberRange
-from drivers.settings_model import ListOf, SettingsModel, read_settings
+from drivers.settings_model import ListOf, SettingsModel
+from tests.support.settings import read_settings
 
 ALL = {name: one for name, one in vars(number_ranges).items() if isinstance(one, NumberRange)}
 

@@ -11,17 +11,8 @@ from pydantic import Field
 
 from drivers.errors import ConfigError
 from drivers.number_ranges import FRACTION, RATE_HZ
-from drivers.settings_model import (
-    Conflict,
-    FileOrName,
-    FilePath,
-    ListOf,
-    SettingsModel,
-    WordOr,
-    check_table,
-    one_of,
-    read_settings,
-)
+from drivers.settings_model import Conflict, FileOrName, FilePath, ListOf, SettingsModel, WordOr, check_table, one_of
+from tests.support.settings import read_settings
 
 
 class Part(SettingsModel):

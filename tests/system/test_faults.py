@@ -405,7 +405,7 @@ def test_garbage_on_the_line(tmp_path: Path) -> None:
         opened(run)
         for _ in range(10):
             cable.write(noise.randbytes(400).replace(b"\n", b"\0"))
-        says(run, "board", "and no sample in them")
+        says(run, "board", "bytes without a sample")
         assert run.caught.healths["board"].state == "waiting"
         goes_on(run)
         cable.write(b"\n" + lines(0, 50))

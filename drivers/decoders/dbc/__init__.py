@@ -1,19 +1,20 @@
 """Decoder for CAN sensors that a DBC file describes. The settings map axes to signals.
 
-``build`` reads the DBC with cantools and checks the map. After that, no file is opened and cantools is not used. The
-frames of one message are stacked to an array [n, size], and each signal is extracted from all frames at once. The tests
-compare the extracted values with those of cantools.
+``build`` reads the DBC file with cantools and checks the settings. The decoder then works without cantools. Each signal
+is extracted from the frames of many samples at once. The tests compare the extracted values with the values that
+cantools decodes.
 
 One sample may be spread over several messages, whose frames are joined in order of arrival
-(``drivers.decoders.dbc.join``). A sample with a frame that is missing, too short or not ``valid`` is bad and counts as
-missing. With ``partial = true``, missing frames only leave their axes unmeasured. A sample with a frame that arrived
-after ``window`` also counts as missing. It is counted in ``late`` instead of ``bad``. A message that contains only the
-temperature may be sent less often than the other messages. Its newest value is used.
+(``drivers.decoders.dbc.join``). A sample is bad, and counts as missing, if one of its frames is missing, too short or
+not ``valid``. With ``partial = true``, the axes of a missing frame are only marked as not measured. A sample also
+counts as missing if one of its frames arrived later than the time ``window`` allows. Such samples are counted in
+``dropped_late_samples`` instead of ``bad``. A message that contains only the temperature may be sent less often than
+the other messages. Each sample then gets the newest temperature.
 
-J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by their parameter group. Priority and
-sender are ignored. The first sender received is used, unless ``source`` names another sender. A raw value in the top
-2/256 of its range means "error" or "not available" (SAE J1939-71: 0xFE00 to 0xFFFF of 16 bits) and is not measured.
-``not_available = true`` applies this rule to other messages, too.
+J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by their parameter group, without priority
+and sender. The decoder accepts the first sender that it receives, unless ``source`` names the sender. A raw value in
+the top 2/256 of its range means "error" or "not available" (SAE J1939-71: 0xFE00 to 0xFFFF of 16 bits), and the axis is
+marked as not measured. With ``not_available = true``, this rule also applies to messages other than J1939.
 """
 
 from collections.abc import Sequence
@@ -31,7 +32,7 @@ from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, 
 __all__ = ["DbcDecoder", "Settings", "SignalSettings", "build"]
 
 MAX_CACHED_IDS: Final = 4096
-"""Maximum number of 29-bit identifiers in the cache, so that noise on a bus does not fill the memory."""
+"""Maximum number of 29-bit identifiers in the cache, so that noise on the bus does not fill the memory."""
 
 
 class DbcDecoder:
@@ -44,7 +45,7 @@ class DbcDecoder:
     settings
         Settings of the decoder.
     timing
-        Timing of the samples.
+        Source of the sample times.
     """
 
     carrier: ClassVar[str] = "frames"
@@ -58,7 +59,7 @@ class DbcDecoder:
         self.bad = 0
         self.dropped_late_samples = 0
         self.late_frames_hint = ""
-        self._left_out = 0  # number of samples left out, bad or late
+        self._dropped = 0  # number of bad and late samples
         self.recent_problem = ""
         self._two_senders_hint = ""  # hint that two senders are on the bus
         self._samples_since_reject = 0  # number of good samples since the last rejected sample
@@ -71,11 +72,11 @@ class DbcDecoder:
 
     @property
     def addresses(self) -> tuple[int, ...]:
-        """Addresses to receive from the bus. ``ANY_SOURCE`` marks J1939 parameter groups."""
+        """Addresses to receive from the bus. The flag ``ANY_SOURCE`` marks J1939 parameter groups."""
         return tuple(m.address | (ANY_SOURCE if m.j1939 else 0) for _, m in self._numbered_messages())
 
     def reset(self) -> None:
-        """Discard an open sample, the newest temperature and the selected sender."""
+        """Discard an incomplete sample, the newest temperature and the selected sender."""
         self._assembler.reset()
         self._builder.forget_rejected_frames()
         self._source = self._settings.source
@@ -83,10 +84,7 @@ class DbcDecoder:
         self._cache.clear()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the samples that these frames complete.
-
-        ``t_ns`` is the arrival time of the last frame of each sample.
-        """
+        """Return the samples that these frames complete. ``t_ns`` is the arrival time of the last frame of a sample."""
         done: list[SampleFrames] = []
         for chunk in chunks:
             which = self._message_index(chunk.address)
@@ -101,7 +99,7 @@ class DbcDecoder:
                 self.recent_problem = f"{message}: frames of {len(chunk.data)} bytes, but its signals need {size}"
             self._assembler.add_frame(which, chunk.data[:size] if len(chunk.data) >= size else b"", chunk.t_ns, done)
         blocks = self._decode_samples(done)
-        rejected = self._builder.bad != self._left_out
+        rejected = self._builder.bad != self._dropped
         self._samples_since_reject = 0 if rejected else self._samples_since_reject + len(done)
         if self._samples_since_reject >= HINT_FRAMES:
             self.recent_problem = self.late_frames_hint = ""
@@ -112,8 +110,8 @@ class DbcDecoder:
                 f"window = {self._settings.window:g} s: increase `window` in decoder_options"
             )
         self.recent_problem = self._two_senders_hint or self.recent_problem
-        self._left_out, self.dropped_late_samples = self._builder.bad, self._assembler.dropped_late_samples
-        self.bad = self._left_out - self.dropped_late_samples
+        self._dropped, self.dropped_late_samples = self._builder.bad, self._assembler.dropped_late_samples
+        self.bad = self._dropped - self.dropped_late_samples
         return blocks
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
@@ -121,7 +119,7 @@ class DbcDecoder:
         n = len(samples)
         table = np.column_stack((samples.values, samples.temperature_c))
         sent: list[tuple[Message, Bytes]] = []
-        # the temperature is sent first, since it applies to the samples after it
+        # the temperature is sent first, since the decoder applies it to the following samples
         for _, message in sorted(self._numbered_messages()):
             frames = np.full((n, message.length), 0xFF if message.j1939 else 0, np.uint8)
             for column in message.columns:
@@ -139,15 +137,12 @@ class DbcDecoder:
         ]
 
     def _numbered_messages(self) -> list[tuple[int, Message]]:
-        """Return the messages with their index in a sample.
-
-        The index -1 is the message that contains only the temperature.
-        """
+        """Return the messages and their indices. The message that contains only the temperature has the index -1."""
         slow = [(-1, self._slow)] if self._slow is not None else []
         return [*slow, *enumerate(self._messages)]
 
     def _message_index(self, address: int) -> int | None:
-        """Return the index of the message with this address; None if it is not used."""
+        """Return the index of the message with this address; None if the message is not used."""
         if address in self._known:
             return self._known[address]
         if not self._groups or not address & EXTENDED_ID:
@@ -159,7 +154,7 @@ class DbcDecoder:
         return self._cache[address]
 
     def _find_j1939_message(self, address: int) -> int | None:
-        """Return the index of the J1939 message with this address; None for an unused message or another sender."""
+        """Return the index of a J1939 message; None if the message is not used or has another sender."""
         which = self._groups.get(_parameter_group(address))
         if which is None:
             return None
@@ -176,13 +171,13 @@ class DbcDecoder:
         return None
 
     def _note_temperature(self, data: bytes) -> None:
-        """Keep the newest frame of the message that contains only the temperature."""
+        """Store the newest frame of the message that contains only the temperature."""
         assert self._slow is not None
         if len(data) >= self._slow.size:
             self._assembler.temperature = data[: self._slow.size]
 
     def _decode_samples(self, done: Sequence[SampleFrames]) -> list[SampleBlock]:
-        """Return joined samples as blocks. Each signal is extracted from all samples at once."""
+        """Return the samples as blocks. Each signal is extracted from all samples at once."""
         n = len(done)
         table = np.full((n, len(COLUMNS)), np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
@@ -197,7 +192,7 @@ class DbcDecoder:
             if message.counter is not None:
                 raw: Ints = message.counter.extract_raw(frames).astype(np.int64)
                 ticks[there] = raw[there]
-        # ``BlockBuilder`` rejects a sample without any value and counts it as missing
+        # ``BlockBuilder`` rejects a sample without any value, and counts the sample as missing
         table[~valid] = np.nan
         if not valid.all():
             self.recent_problem = f"{self._settings.valid} is not 1: the sensor reports that its values are invalid"
@@ -212,7 +207,7 @@ class DbcDecoder:
 
 
 def _stack_frames(done: Sequence[SampleFrames], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
-    """Return the frames [n, size] of one message, and a mask [n] of the frames that exist."""
+    """Return the frames [n, size] of one message, and a mask [n] of the frames that have arrived."""
     frames = [s.temperature if which < 0 else s.frames[which] for s in done]
     empty = bytes(size)
     data = np.frombuffer(b"".join(f or empty for f in frames), np.uint8)
@@ -226,12 +221,12 @@ def _parameter_group(frame_id: int) -> int:
 
 
 def build(settings: Settings) -> Decoder:
-    """Return the decoder of these settings, after reading the DBC file.
+    """Read the DBC file and return the decoder.
 
     Raises
     ------
     ConfigError
-        Some settings are wrong, one line for each.
+        If settings are wrong. The error has one line for each mistake.
     """
     database = Database(settings)
     return DbcDecoder(database.messages, settings, database.timing)

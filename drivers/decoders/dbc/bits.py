@@ -1,8 +1,7 @@
-"""Extraction of one CAN signal from many frames at once, and insertion into frames.
+"""Extraction of one CAN signal from many frames at once, and insertion of a signal into frames.
 
-Frames are bytes [n, size], physical values are [n]. Bits are numbered in the order in which the byte order of the
-signal counts them. Intel signals count from the least significant bit of each byte, Motorola signals from the most
-significant bit.
+Frames are arrays [n, size] of bytes, and values are arrays [n]. Bits are numbered from the least significant bit of
+each byte for Intel signals, and from the most significant bit of each byte for Motorola signals.
 """
 
 from dataclasses import dataclass
@@ -32,7 +31,7 @@ class SignalBits:
     is_float: bool
     scale: float
     offset: float
-    indicators: bool  # True if values in the top 2/256 of the range are not measured
+    indicators: bool  # True if raw values in the top 2/256 of the range mean "error" or "not available"
 
     @property
     def end_byte(self) -> int:
@@ -41,7 +40,7 @@ class SignalBits:
 
     @property
     def _bit_order(self) -> Literal["big", "little"]:
-        """Order of the bits of a byte, as NumPy calls it."""
+        """Bit order for ``numpy.unpackbits`` and ``numpy.packbits``."""
         return "big" if self.big_endian else "little"
 
     def extract_raw(self, frames: Bytes) -> RawNumbers:
@@ -56,19 +55,19 @@ class SignalBits:
         raw = self.extract_raw(frames)
         values = self._to_float(raw) * self.scale + self.offset
         if self.indicators:
-            # right shift to the top byte; shorter fields have no indicators
+            # compare the top byte; fields shorter than one byte have no indicators
             values = np.where(raw >> np.uint64(self.length - 8) >= FIRST_INDICATOR, np.nan, values)
         return values
 
     def insert_values(self, frames: Bytes, values: Floats) -> None:
-        """Write values into frames, rounded to the nearest step and clipped to the range.
+        """Write values into frames, rounded to the resolution and clipped to the range of the signal.
 
         Parameters
         ----------
         frames
             [n, size] uint8, changed in place.
         values
-            [n] float64 in the unit of the DBC. NaN becomes the indicator for not available if the signal has one.
+            [n] float64 in the unit of the DBC. NaN is written as "not available" if the signal has this indicator.
         """
         with np.errstate(over="ignore"):
             raw = self._from_float((values - self.offset) / self.scale)
@@ -92,10 +91,10 @@ class SignalBits:
         frames[:] = np.packbits(bits, axis=1, bitorder=self._bit_order)
 
     def _to_float(self, raw: RawNumbers) -> Floats:
-        """Return raw numbers as float64 according to their type."""
+        """Convert raw numbers to float64."""
         if self.is_float:
             bits = raw.astype(f"<u{self.length // 8}")
-            with np.errstate(invalid="ignore"):  # a signalling NaN is treated as NaN
+            with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
                 return bits.view(f"<f{self.length // 8}").astype(np.float64)
         if self.signed:
             unused = np.uint64(64 - self.length)
@@ -104,7 +103,7 @@ class SignalBits:
         return raw.astype(np.float64)
 
     def _from_float(self, numbers: Floats) -> RawNumbers:
-        """Return numbers as raw numbers, rounded and clipped to the range. Bits above ``length`` are undefined."""
+        """Convert numbers to raw numbers, rounded and clipped. Only the lowest ``length`` bits are defined."""
         if self.is_float:
             bits: RawNumbers = numbers.astype(f"<f{self.length // 8}").view(f"<u{self.length // 8}").astype(np.uint64)
             return bits

@@ -1,7 +1,7 @@
 """Lookup of the configured messages and signals in a DBC file.
 
 The file is read once with cantools. Every name must exist, every unit must be known, and every signal must fit in its
-message. Otherwise a ``ConfigError`` names the mistake and the expected value in one line.
+message. A ``ConfigError`` describes all violations.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ class Database:
     Raises
     ------
     ConfigError
-        Some settings are wrong, one line for each.
+        If settings are wrong. The error has one line for each mistake.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -60,14 +60,14 @@ class Database:
 
     @contextlib.contextmanager
     def _collecting(self) -> Iterator[None]:
-        """Collect a ConfigError and continue, so that all mistakes are reported."""
+        """Store the lines of a ConfigError instead of raising the error, so that all mistakes are reported."""
         try:
             yield
         except ConfigError as error:
             self._errors += error.lines
 
     def _find_configured_signals(self) -> None:
-        """Find all signals of the settings."""
+        """Find the signals of all axes, the counter and the signal ``valid``."""
         s = self._settings
         for axis, entry in s.signals.items():
             with self._collecting():
@@ -111,7 +111,7 @@ class Database:
         self._register_message(message, bits).columns.append(column)
 
     def _conversion_to_si(self, axis: str, entry: SignalSettings, signal: Any) -> tuple[float, float]:
-        """Return factor and offset from the unit of a signal to SI."""
+        """Return the factor and the offset that convert the values of a signal to SI units."""
         unit = entry.unit or signal.unit or ""
         try:
             if axis == TEMPERATURE:
@@ -128,7 +128,7 @@ class Database:
         return factor * entry.factor, offset * entry.factor
 
     def _find_signal(self, key: str, name: str) -> tuple[Any, Any]:
-        """Return message and signal of the DBC for a name "Message.Signal"."""
+        """Return the message and the signal that a name such as "Message.Signal" refers to."""
         message_name, dot, signal_name = name.partition(".")
         if not dot:
             hint = ', or with join = "counter" a bare name' if key == "counter" else ""
@@ -147,7 +147,7 @@ class Database:
         return message, signal
 
     def _register_message(self, message: Any, bits: SignalBits) -> Message:
-        """Return the entry of a used message, after extending its size to contain the signal."""
+        """Add a message to the used messages, and extend its ``size`` so that a frame contains the signal."""
         extended, j1939 = bool(message.is_extended_frame), self._is_j1939(message)
         new = Message(message.name, message.frame_id, extended, j1939, size=0, length=message.length, columns=[])
         entry = self._used.setdefault(message.name, new)
@@ -160,10 +160,10 @@ class Database:
         return bool(message.protocol == "j1939" if s.j1939 is None else s.j1939)
 
     def _signal_bits(self, message: Any, signal: Any) -> SignalBits:
-        """Return the bit field of a signal. Raise ConfigError if it is not supported."""
+        """Return the position and the scale of a signal. Raise ConfigError if the signal is not supported."""
         s = self._settings
         big_endian = signal.byte_order == "big_endian"
-        # a DBC numbers the most significant bit of Motorola signals, 7 … 0 within each byte
+        # a DBC file states the most significant bit of a Motorola signal and numbers the bits of a byte from 7 to 0
         first = 8 * (signal.start // 8) + 7 - signal.start % 8 if big_endian else signal.start
         if first < 0 or first + signal.length > 8 * message.length or not 0 < signal.length <= 64:
             raise ConfigError(f"{self._path.name}: {signal.name} does not fit in {message.name}")
@@ -190,7 +190,7 @@ class Database:
 
 
 def _locate(file: str) -> Path:
-    """Return the path of a database file. A name without a folder may be that of a shipped database."""
+    """Return the path of a database file. A name without a folder may refer to a database shipped with the program."""
     path = file_access.expand_user(file)
     name = file.removeprefix(SHIPPED_PREFIX)
     if name == file and (file_access.is_file(path) or len(path.parts) != 1):
@@ -203,7 +203,7 @@ def _locate(file: str) -> Path:
 
 
 def _load(path: Path) -> Any:
-    """Read the database without strict checks, since many files contain overlapping signals that are not used."""
+    """Read a database without strict checks, since unused signals overlap in many files."""
     check_extra("can", "a CAN database")
     import cantools
 
@@ -219,7 +219,7 @@ def _load(path: Path) -> Any:
 
 
 def _text(path: Path) -> str:
-    """Return the text of a DBC file. Editors write UTF-8 or a Windows code page, which differ in the degree sign."""
+    """Return the text of a DBC file, which is encoded in UTF-8 or in the Windows code page 1252."""
     data = file_access.read_small_file(path)
     try:
         return data.decode("utf-8-sig")

@@ -1,17 +1,18 @@
-"""Joining of the frames of several messages to samples, and detection of incomplete samples.
+"""Assembly of samples from the frames of several CAN messages, and detection of incomplete samples.
 
-A frame starts the next sample if the open sample already contains a frame of the same message. A message that contains
-only the counter also starts the next sample. With ``join = "counter"``, a frame with another count starts it as well. A
-sample is complete when every message has arrived. A sample that ends earlier is bad, unless ``partial`` is True. Frames
-before the first complete sample are not counted, since the link may have been opened in the middle of a sample.
+A sample is complete when one frame of every message has arrived. The next sample starts with the first frame of a
+message that the current sample already contains, or with a message that contains only the counter. With
+``join = "counter"``, a frame with another counter value also starts the next sample. A sample that ends before all
+frames have arrived is bad, unless ``partial`` is True. Frames before the first complete sample are ignored, since the
+link may have been opened in the middle of a sample.
 
-A frame that arrives more than ``window`` after the first frame of the open sample has two possible causes. The frame is
-a late frame of the open sample, or it starts the next sample because earlier frames were lost. If the frames contain
-counts, a frame with the same count is late. Otherwise the order of the messages decides. A sample starts with the
-message before which the pause is longest, so a frame of this message starts the next sample. A frame of another message
-is late, unless a complete sample period has passed. Pauses are medians over the last frames. A frame waits while the
-order of the messages is unknown. A sample with all its frames, some of them late, counts as late and not as bad. The
-values of a late sample are left out, and the sample counts as missing.
+A frame may arrive more than ``window`` after the first frame of the current sample. Such a frame is either late, or it
+starts the next sample because earlier frames were lost. If the frames contain counter values, a frame with the counter
+value of the current sample is late. Otherwise the order of the messages decides. The first message of a sample is the
+message with the longest median pause before its frames. A frame of the first message starts the next sample. A frame of
+any other message is late, unless a complete sample period has passed. While the order of the messages is unknown, the
+frame waits. If all frames of a sample have arrived, but some of them late, the sample is dropped. A dropped late sample
+counts as missing, but not as bad.
 """
 
 from collections import deque
@@ -29,12 +30,9 @@ from drivers.sample import AXES, EXTENDED_ID, NO_TICK
 PAUSE_HISTORY: Final = 15
 """Number of pauses per message over which the median is computed."""
 MIN_PAUSES: Final = 3
-"""Number of pauses per message from which the order of the messages is known."""
+"""Number of pauses per message that determine the order of the messages."""
 MAX_UNDECIDED_PER_MESSAGE: Final = 8
-"""Number of frames per message that wait until the order is known.
-
-After that, the order of the received frames is used.
-"""
+"""Maximum number of waiting frames per message. Above this number, the order is estimated from the pauses so far."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +53,8 @@ class Message:
     frame_id: int
     extended: bool
     j1939: bool
-    size: int  # bytes that contain the used signals
-    length: int  # bytes of the complete message
+    size: int  # number of bytes from the start of the message to the end of the last used signal
+    length: int  # number of bytes of the complete message
     columns: list[Column]
     valid: SignalBits | None = None
     counter: SignalBits | None = None
@@ -80,14 +78,14 @@ class Message:
 
 @dataclass(slots=True)
 class SampleFrames:
-    """Frames of one sample. None stands for a frame that has not arrived, and b"" for a frame that is too short."""
+    """Frames of one sample by message. A missing frame is None, and a frame that is too short is empty."""
 
     frames: list[bytes | None]
-    t_ns: int  # arrival of the newest frame
-    start_ns: int
-    count: int  # value of the counter; NO_TICK = none yet
-    missing_before: int = 0  # bad and late samples since the last good sample
-    late: set[int] = field(default_factory=set)  # messages that arrived after the window
+    t_ns: int  # arrival time of the newest frame
+    start_ns: int  # arrival time of the first frame
+    count: int  # value of the counter; NO_TICK = no counter value has arrived
+    missing_before: int = 0  # number of bad and late samples since the last good sample
+    late: set[int] = field(default_factory=set)  # indices of the messages that arrived after the window
     temperature: bytes | None = None  # newest frame of the message that contains only the temperature
 
     @property
@@ -115,30 +113,30 @@ class SampleAssembler:
         self._window_ns = round(settings.window * 1e9) or (1 << 62)
         self._partial = settings.partial
         self.dropped_late_samples = 0
-        """Number of samples left out because some of their frames arrived after the window."""
-        self._delay_ns = 0  # from the first frame of a sample to its late frame; 0 = no frame has been late
+        """Number of samples dropped because some of their frames arrived after the window."""
+        self._delay_ns = 0  # time from the first frame of a sample to a late frame; 0 = no frame has been late
         self.reset()
 
     def reset(self) -> None:
-        """Discard the open sample, the order of the messages and the synchronization."""
-        self._open: SampleFrames | None = None
+        """Discard the current sample, the known order of the messages and the synchronization."""
+        self._current: SampleFrames | None = None
         self._synchronized = False
         self._missing = 0
-        self._count_before = NO_TICK  # count of the previous sample
-        self._newest_ns: int | None = None  # arrival of the newest frame
+        self._count_before = NO_TICK  # counter value of the previous sample
+        self._newest_ns: int | None = None  # arrival time of the newest frame
         self._pauses: list[deque[int]] = [deque(maxlen=PAUSE_HISTORY) for _ in range(self._n)]  # ns before each message
         self._undecided: deque[tuple[int, bytes, int]] = deque()
         self.temperature: bytes | None = None
 
     def take_missing_samples(self) -> int:
-        """Return the number of bad and late samples since the last good sample, and reset the number."""
+        """Return the number of bad and late samples since the last good sample, and set the number to 0."""
         missing, self._missing = self._missing, 0
         return missing
 
     def take_late_frame_delay_ns(self) -> int:
-        """Return the delay of the newest late frame after the first frame of its sample.
+        """Return the time from the first frame of a sample to the newest late frame of the sample, in ns.
 
-        The delay is 0 if no frame has been late since the last call.
+        The result is 0 if no frame has been late since the last call.
         """
         delay_ns, self._delay_ns = self._delay_ns, 0
         return delay_ns
@@ -167,9 +165,9 @@ class SampleAssembler:
             self._undecided.popleft()
 
     def _assign_frame(self, which: int, data: bytes, t_ns: int, done: list[SampleFrames]) -> bool:
-        """Add a frame to its sample. Return False if the sample is not known yet."""
+        """Add a frame to the current or the next sample. Return False if the order of the messages is unknown."""
         count = self._read_count(which, data)
-        sample = self._open
+        sample = self._current
         if sample is not None:
             delay_ns = t_ns - sample.start_ns
             next_one = self._begins_next(sample, which, count, delay_ns)
@@ -177,43 +175,43 @@ class SampleAssembler:
                 return False
             if next_one:
                 if NO_TICK != count == self._count_before:
-                    return True  # this frame belongs to the previous sample, which is already finished and counted
+                    return True  # the frame belongs to the previous sample, which has already been counted
                 self._finish(sample, done)
                 sample = None
             elif delay_ns > self._window_ns:
                 self._delay_ns = delay_ns
-                self._note_late(sample, which, data, done)
+                self._add_late_frame(sample, which, data, done)
                 return True
         if sample is None:
-            sample = self._open = SampleFrames([None] * self._n, t_ns, t_ns, NO_TICK)
+            sample = self._current = SampleFrames([None] * self._n, t_ns, t_ns, NO_TICK)
         sample.frames[which] = data
         sample.t_ns = t_ns
         if count != NO_TICK:
             sample.count = count
         if sample.complete:
             self._finish(sample, done)
-            self._open = None
+            self._current = None
         return True
 
-    def _note_late(self, sample: SampleFrames, which: int, data: bytes, done: list[SampleFrames]) -> None:
-        """Note a late frame of the open sample."""
+    def _add_late_frame(self, sample: SampleFrames, which: int, data: bytes, done: list[SampleFrames]) -> None:
+        """Mark a message of the current sample as late."""
         if data:
             sample.late.add(which)
         else:
-            sample.frames[which] = data  # too short, so the sample is bad
+            sample.frames[which] = data  # the frame is too short, so the sample is bad
         if sample.frames.count(None) == len(sample.late):
             self._finish(sample, done)
-            self._open = None
+            self._current = None
 
     def _read_count(self, which: int, data: bytes) -> int:
-        """Return the count in a frame; NO_TICK if there is none."""
+        """Return the counter value in a frame; NO_TICK if the frame contains no counter."""
         bits = self._counters[which]
         if bits is None or not data or not self._by_count:
             return NO_TICK
         return int(bits.extract_raw(np.frombuffer(data, np.uint8)[None, :])[0])
 
     def _begins_next(self, sample: SampleFrames, which: int, count: int, delay_ns: int) -> bool | None:
-        """Return True if a frame starts the next sample; None if the order of the messages must be known first."""
+        """Return True if a frame starts the next sample; None if this depends on the unknown order of the messages."""
         if sample.frames[which] is not None or which in sample.late or which == self._counter_message:
             return True
         if NO_TICK not in (count, sample.count):
@@ -229,7 +227,7 @@ class SampleAssembler:
         return which == first or delay_ns >= sum(pauses)
 
     def _finish(self, sample: SampleFrames, done: list[SampleFrames]) -> None:
-        """Finish a sample as good, late or bad."""
+        """Append a good sample to ``done``, or count a late or bad sample."""
         self._count_before = sample.count
         whole = sample.complete and b"" not in sample.frames
         if whole or (self._partial and any(sample.frames)):

@@ -5,7 +5,6 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BeforeValidator, Field
 
-from drivers.decoders.base import DecoderSettings
 from drivers.errors import ConfigError
 from drivers.number_ranges import DELAY_S, SCALE, SOURCE_ADDRESS, TICK_S, format_value
 from drivers.sample import AXES
@@ -16,7 +15,7 @@ COLUMNS: Final = (*AXES, TEMPERATURE)
 
 
 class SignalSettings(SettingsModel):
-    """Description of one signal, if a name alone is not sufficient."""
+    """Signal of one axis, with its unit and an additional factor."""
 
     signal: str = Field(examples=["RateOfTurn.RateX"], description='"Message.Signal"')
     unit: str = Field("", examples=["rad/s"], description="unit of the signal; absent: as the DBC says")
@@ -34,7 +33,7 @@ def _signal(value: Any) -> Any:
     return value
 
 
-class Settings(DecoderSettings):
+class Settings(SettingsModel):
     """Keys of ``[device.driver.decoder_options]`` for a CAN database."""
 
     file: FileOrName = Field(
@@ -76,7 +75,7 @@ class Settings(DecoderSettings):
     )
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict if no axis is measured, or if samples are joined by a counter that is missing."""
+        """Yield a conflict if no axis is measured, or if the counter that joins samples is missing."""
         if not self.signals:
             yield Conflict("signals", 'empty; it maps axes to signals: gz = "Message.Signal"')
         elif set(self.signals) == {TEMPERATURE}:

@@ -27,9 +27,9 @@ from drivers.sample import (
     concatenate_blocks,
     make_block,
 )
-from drivers.settings_model import read_settings
 from drivers.units import DEGREE, G0
 from tests.support.recordings import recordings
+from tests.support.settings import read_settings
 
 CANMOD = {f"g{c}": f"ImuData.AngularRate{c.upper()}" for c in "xyz"} | {
     f"a{c}": f"ImuData.Acceleration{c.upper()}" for c in "xyz"

@@ -9,7 +9,7 @@ from drivers.decoders.base import MAX_BYTES_WITHOUT_FRAME
 from drivers.decoders.stim300 import IDENTIFIERS, SIZES, Settings, build, datagram_crc, has_valid_crc
 from drivers.errors import ConfigError
 from drivers.sample import Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks, make_block
-from drivers.settings_model import read_settings
+from tests.support.settings import read_settings
 
 PUBLISHED = bytes.fromhex(
     "AF 00 01 24 FF FA D6 00 03 5B 00 FF E7 A6 FF DD 36 08 1C 52 00 FF 7E 70 FE BA 0C 3F FA 1D 00"

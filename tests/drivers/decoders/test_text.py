@@ -9,7 +9,7 @@ from drivers.decoders.base import xor_checksum
 from drivers.decoders.text import MAX_LINE_BYTES, Settings, build
 from drivers.errors import ConfigError
 from drivers.sample import ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
-from drivers.settings_model import read_settings
+from tests.support.settings import read_settings
 
 SIX = ("gx", "gy", "gz", "ax", "ay", "az")
 LINE = b"1,2,3,4,5,6\n"

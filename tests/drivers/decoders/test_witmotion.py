@@ -8,7 +8,7 @@ import pytest
 from drivers.decoders.witmotion import Settings, build, encode_packet
 from drivers.errors import ConfigError
 from drivers.sample import ArrivalTimedFormat, Chunk, SampleBlock, concatenate_blocks, make_block
-from drivers.settings_model import read_settings
+from tests.support.settings import read_settings
 
 DEGREE, G = math.pi / 180.0, 9.80665
 ACCEL = bytes.fromhex("55 51 0A 00 EC FF 00 08 D0 09 7C")

@@ -24,7 +24,7 @@ from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links import can_link
 from drivers.links.can_link import CanLink
 from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk, concatenate_blocks
-from drivers.settings_model import read_settings
+from tests.support.settings import read_settings
 
 UNIQUE = itertools.count()
 

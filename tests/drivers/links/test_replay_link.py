@@ -14,7 +14,7 @@ from drivers.links import base, replay_link
 from drivers.links.base import Link
 from drivers.recordings import load_samples
 from drivers.sample import EXTENDED_ID, Chunk, concatenate_blocks
-from drivers.settings_model import read_settings
+from tests.support.settings import read_settings
 
 FRAMES = [(0x9, False, bytes(range(8))), (0x0CF02AE2, True, b"\x00\x7d\x00\x7d\x00\x7d\x00\x05")] * 20
 

@@ -16,7 +16,7 @@ import serial
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links import serial_link
 from drivers.links.base import Link
-from drivers.settings_model import read_settings
+from tests.support.settings import read_settings
 from tests.support.waiting import FOREVER_S, wait_for
 
 

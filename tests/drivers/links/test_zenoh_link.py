@@ -16,8 +16,8 @@ from drivers.errors import ConfigError, LinkUnavailable
 from drivers.links import zenoh_link
 from drivers.links.base import Link
 from drivers.sample import Chunk
-from drivers.settings_model import read_settings
 from tests.support.ports import free_endpoint
+from tests.support.settings import read_settings
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.zenoh_sessions import router as open_router
 from tests.support.zenoh_sessions import session

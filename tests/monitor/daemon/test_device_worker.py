@@ -11,7 +11,6 @@ from drivers.decoders import dbc, samples, text, vectornav_binary
 from drivers.errors import ConfigError
 from drivers.links import replay_link
 from drivers.sample import concatenate_blocks, make_block
-from drivers.settings_model import read_settings
 from monitor.daemon.device import device_worker
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
@@ -24,6 +23,7 @@ from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings import loading as settings
 from monitor.settings.loading import Device, Driver
 from tests.support.loopback_link import LoopbackLink
+from tests.support.settings import read_settings
 from tests.support.waiting import PATIENCE_S, wait_for
 
 RATE = 100.0

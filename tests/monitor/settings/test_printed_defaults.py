@@ -11,7 +11,7 @@ from drivers import discovery
 from drivers.decoders.dbc.settings import SignalSettings
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
-from drivers.settings_model import SettingsModel, fields_by_key, find_model, read_settings
+from drivers.settings_model import SettingsModel, fields_by_key, find_model
 from monitor.commands.check_config import check_configuration
 from monitor.settings import printed_defaults
 from monitor.settings.driver_settings import FaultsTable, link_names, link_settings
@@ -26,6 +26,7 @@ from monitor.settings.schema import (
     ViewerTable,
     ZenohTable,
 )
+from tests.support.settings import read_settings
 
 LINKS = link_names()
 DECODERS = discovery.list_modules(drivers.decoders)

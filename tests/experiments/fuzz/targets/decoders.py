@@ -23,7 +23,6 @@ from drivers.decoders.dbc import DbcDecoder
 from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import Database
 from drivers.sample import AXES, EXTENDED_ID, NO_TICK, Chunk, CounterTimedFormat, SampleBlock, make_block
-from drivers.settings_model import read_settings
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, EXAMPLES, NAMES, Example
 from tests.experiments.fuzz.checks import fed, seen
@@ -31,6 +30,7 @@ from tests.experiments.fuzz.formats import FORMATS, some_of
 from tests.experiments.fuzz.stamped import Stamped
 from tests.experiments.fuzz.tape import Tape, pieces_of
 from tests.experiments.fuzz.target import Check, target
+from tests.support.settings import read_settings
 
 LONGEST: Final = 3000
 """Bytes of a stream; repeats would make it longer."""

@@ -16,7 +16,7 @@ from typing import Any, Final
 from drivers.decoders import dbc
 from drivers.errors import ConfigError
 from drivers.sample import Chunk
-from drivers.settings_model import SettingsModel, read_settings
+from drivers.settings_model import SettingsModel
 from monitor.common import shipped_file_paths
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_catalogue import read_model
@@ -27,6 +27,7 @@ from tests.experiments.fuzz.tape import WILD, Tape
 from tests.experiments.fuzz.target import target
 from tests.experiments.fuzz.targets.decoders import SECOND_DATABASE, SECOND_SIGNALS
 from tests.experiments.fuzz.targets.files import folder
+from tests.support.settings import read_settings
 
 CONFIG: Final = shipped_file_paths.CONFIG_FOLDER
 LINES_AT_MOST: Final = 2000
