@@ -26,7 +26,7 @@ def doctor(
 
     from monitor.commands import doctor as checks
 
-    output.check_output_folder("--json", json)
+    output.check_output_file("--json", json)
     findings = checks.examine(config)
     if json is not None:
         output.write_bytes("--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n")

@@ -52,6 +52,7 @@ def history(
     """Print past coefficients, temperatures, lost samples and events, over periods from hours to years."""
     from rich.console import Console
 
+    from drivers.recordings.formats import format_for_path
     from drivers.sample import AXES
     from monitor.estimation.fit.coefficients import SYMBOLS
     from monitor.history.query import PARTS, HistoryQuery
@@ -61,7 +62,11 @@ def history(
 
     if axis is not None and axis not in AXES:
         raise ConfigError(f'--axis: "{axis}"; possible are {", ".join(AXES)}')
-    _check_output_files(json, out, plot)
+    output.check_output_file("--plot", plot, ".png")
+    output.check_output_file("--json", json)
+    output.check_output_file("--out", out)
+    if out is not None:
+        format_for_path(out)
     live = connect is not None or zenoh is not None
     if source is not None and live:
         raise ConfigError(f"{source}: give either a file or --connect, not both")
@@ -79,24 +84,6 @@ def history(
         few_s = max(width_of(past.span, None, MAX_TABLE_ROWS), past.step_s)
         few = past if few_s == past.step_s else get(HistoryQuery(asked.span, few_s, ("coefficients", "status"), axes))
         history_text.print_axis_history(few, axis, SYMBOLS, console)
-
-
-def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) -> None:
-    """Check the output files before the history is read.
-
-    Raises
-    ------
-    ConfigError
-        If a file cannot be written, or if a suffix is not supported.
-    """
-    from drivers.recordings.formats import format_for_path
-
-    if plot is not None and plot.suffix != ".png":
-        raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
-    for option, place in (("--json", json), ("--out", out), ("--plot", plot)):
-        output.check_output_folder(option, place)
-    if out is not None:
-        format_for_path(out)
 
 
 def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: Path | None, plot: Path | None) -> None:

@@ -9,7 +9,7 @@ subfolder of ``DIR/``. The common results and the differences are written to ``D
 """
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +24,7 @@ from drivers.recordings import FORMATS, iter_blocks, load_samples
 from drivers.recordings import Recording as Samples
 from drivers.recordings.writing import atomic_write_path
 from drivers.sample import AXES
+from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.estimation.regular_grid import resample_with_temperature
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.preparation.recording import Recording
@@ -33,8 +34,6 @@ from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.several_recordings import comparison_report
 from monitor.reconcile.several_recordings.comparison import Comparison, NamedResult, compare
 
-ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 REPORT: Final = "report.json"
 """File name of the report as JSON."""
 
@@ -64,7 +63,7 @@ class ComparisonRequest:
     last_s: float | None = None  # length of the end of each recording that is used; None for all
 
 
-def run_reconciliation(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Reconciliation:
+def run_reconciliation(request: Request, tell: ProgressCallback = ignore_progress) -> Reconciliation:
     """Compare one recording with a model and write the report.
 
     Parameters
@@ -97,7 +96,7 @@ def run_reconciliation(request: Request, tell: ProgressCallback = lambda _what, 
     return result
 
 
-def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lambda _what, _share: None) -> Comparison:
+def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = ignore_progress) -> Comparison:
     """Compare several recordings with a model and with each other, and write the reports.
 
     Parameters

@@ -16,7 +16,7 @@ from drivers import file_access
 from drivers.errors import ConfigError, NotReady
 from drivers.quantities import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks, load_samples
-from drivers.sample import AXES, Floats
+from drivers.sample import AXES
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import ThermalModel
@@ -78,8 +78,7 @@ def fit_recording(
     RecordingError, ConfigError
         If the recording cannot be read, or if it has no temperature.
     """
-    values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
-    means = _means(values, temperature_c, rate, interval_s or choose_interval_s(temperature_c.size / rate, rate))
+    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s)
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
@@ -111,9 +110,8 @@ def predict_recording(
     RecordingError, ConfigError
         If the recording cannot be read, or if it has no temperature.
     """
-    values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     interval = next(iter(models.values())).interval_s
-    means = _means(values, temperature_c, rate, interval)
+    means, notes = _read_interval_means(recording, interval, rate_hz, last_s)
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
@@ -210,21 +208,18 @@ def _model(path: Path, axis: str, row: AxisModelRecord, interval_s: float) -> Th
     )
 
 
-def _read(
-    recording: Path, rate_hz: float | None, last_s: float | None
-) -> tuple[Floats, Floats, float, tuple[str, ...]]:
-    """Return values [n, 6], temperature [n] in °C, rate in Hz and notes of a recording."""
+def _read_interval_means(
+    recording: Path, interval_s: float | None, rate_hz: float | None, last_s: float | None
+) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
+    """Return the interval means of each recorded axis, and the notes about the recording."""
     found = load_samples(recording, rate_hz, last_s)
     values, temperature_c, rate, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")
-    return values, temperature_c, rate, (*found.notes, *notes)
-
-
-def _means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> dict[str, IntervalMeans]:
-    """Return the interval means of each axis that was recorded."""
-    return {
-        axis: compute_interval_means(values[:, at], temperature_c, rate_hz, interval_s)
+    interval_s = interval_s or choose_interval_s(temperature_c.size / rate, rate)
+    means = {
+        axis: compute_interval_means(values[:, at], temperature_c, rate, interval_s)
         for at, axis in enumerate(AXES)
         if np.isfinite(values[:, at]).any()
     }
+    return means, (*found.notes, *notes)
