@@ -9,9 +9,7 @@ from monitor.cli.shared import output
 from monitor.cli.shared.errors import FAILED
 
 SCHEMA: Final = "imu-monitor/doctor/1"
-"""Schema of the JSON."""
 SIGNS: Final = {"well": "[green]✓[/]", "doubt": "[yellow]![/]", "wrong": "[red]✗[/]"}
-"""Sign of each mark in the table."""
 
 
 def doctor(

@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from monitor.history.time_ranges import TimeRange
 
 MAX_TABLE_ROWS: Final = 24
-"""Number of rows in the table of one axis over time."""
 Get = Callable[["HistoryQuery"], "HistoryTable"]
 """Function that returns the results of a query."""
 

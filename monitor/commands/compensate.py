@@ -28,13 +28,10 @@ from monitor.drift.compensation.sage_husa import MIN_CONFIRMED_INTERVALS, REJECT
 from monitor.estimation.regular_grid import resample_with_temperature
 
 METHODS: Final = ("adaptive", "fixed", *REFERENCE_METHODS)
-"""Names of the methods."""
 GYROS: Final = AXES[:3]
-"""Gyroscope axes."""
 LEARNING_SHARE: Final = 1.0 / 3.0
 """Share of the samples at rest that is used for learning and excluded from the evaluation."""
 BLOCK_ROWS: Final = 1 << 16
-"""Number of rows that are written at a time."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -51,7 +51,6 @@ Sensors that use all digits of a float need 32.5 to 33.3 bytes, and sensors with
 RAW_BYTES: Final = 60.0
 """Approximate size of the received frame of a sample. It depends on the protocol."""
 CONNECT_TIMEOUT_S: Final = 2.0
-"""Longest wait for a connection."""
 TIME_ERROR: Final = 5
 """Return value of adjtimex(2) if the clock is not synchronised."""
 CAN_TYPE: Final = "280"

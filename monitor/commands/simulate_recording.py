@@ -27,11 +27,8 @@ from monitor.noise.model import NoiseModel
 from monitor.noise.simulation import ModelStream, SimulatedSamples
 
 TRUTH_SCHEMA: Final = "imu-monitor/truth/1"
-"""Schema of the file with the truth."""
 RESULT_SCHEMA: Final = "imu-monitor/simulate/1"
-"""Schema of the result as JSON."""
 CHUNK_ROWS: Final = 1 << 16
-"""Number of rows that are drawn and written at a time."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,10 +30,9 @@ from monitor.drift.thermal.thermal_study import (
 from monitor.estimation.regular_grid import resample_with_temperature
 
 SCHEMA: Final = "imu-monitor/thermal-model/1"
-"""Schema of the model file."""
 
 
-class AxisModelRecord(msgspec.Struct):
+class _AxisModelRecord(msgspec.Struct):
     """Thermal model of one axis in a model file."""
 
     powers: int
@@ -49,12 +48,12 @@ class AxisModelRecord(msgspec.Struct):
     """Model in a form for other programs. ``from_file`` does not read it."""
 
 
-class ModelFile(msgspec.Struct):
+class _ModelFile(msgspec.Struct):
     """Content of a model file."""
 
     schema: str
     interval: float
-    axes: dict[str, AxisModelRecord]
+    axes: dict[str, _AxisModelRecord]
 
 
 def fit_recording(
@@ -126,7 +125,7 @@ def predict_recording(
 def encode_model_file(study: ThermalFitReport) -> bytes:
     """Return the content of the model file with all axes that were fitted."""
     rows = {axis: _row(one.model) for axis, one in study.fits.items()}
-    return msgspec.json.format(msgspec.json.encode(ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
+    return msgspec.json.format(msgspec.json.encode(_ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
 
 
 def read_model_file(path: Path) -> dict[str, ThermalModel]:
@@ -138,7 +137,7 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
         If the file cannot be read, or if its content is invalid.
     """
     try:
-        found = msgspec.json.decode(file_access.read_small_file(path, pipe=True), type=ModelFile)
+        found = msgspec.json.decode(file_access.read_small_file(path, pipe=True), type=_ModelFile)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -154,9 +153,9 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
     return {axis: _model(path, axis, row, found.interval) for axis, row in found.axes.items()}
 
 
-def _row(model: ThermalModel) -> AxisModelRecord:
+def _row(model: ThermalModel) -> _AxisModelRecord:
     """Return a model in the form of the model file."""
-    return AxisModelRecord(
+    return _AxisModelRecord(
         powers=model.shape.powers,
         time_constants=list(model.shape.constants_s),
         reference=model.reference_c,
@@ -170,7 +169,7 @@ def _row(model: ThermalModel) -> AxisModelRecord:
     )
 
 
-def _model(path: Path, axis: str, row: AxisModelRecord, interval_s: float) -> ThermalModel:
+def _model(path: Path, axis: str, row: _AxisModelRecord, interval_s: float) -> ThermalModel:
     """Check the model of one axis in a model file, and return it."""
     k = len(row.time_constants)
     terms = 1 + row.powers + k

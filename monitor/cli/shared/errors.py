@@ -18,9 +18,7 @@ WRONG: Final = 2
 NO_ANSWER: Final = 3
 """Exit status if the data do not support an answer."""
 INTERRUPTED: Final = 128 + signal.SIGINT
-"""Exit status after Ctrl-C."""
 DEBUG: Final = "--debug"
-"""Option that prints tracebacks."""
 MAX_CAUSE_CHARACTERS: Final = 300
 """Maximum length of the text of an unexpected error. Libraries may write pages."""
 

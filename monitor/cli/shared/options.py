@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from monitor.publishing.exporters import NoiseCoefficients
 
 MAX_AVERAGING_TIMES: Final = 1000
-"""Largest number of averaging times in a list."""
 
 
 def range_callback(quantity: Quantity) -> Callable[[typer.CallbackParam, Number | None], Number | None]:

@@ -24,9 +24,7 @@ if TYPE_CHECKING:
     from monitor.settings.loading import Config
 
 STDOUT: Final = "standard output"
-"""Name of standard output in messages."""
 STDERR: Final = "standard error"
-"""Name of standard error in messages."""
 
 
 def run_service(config: "Config", seconds: float | None, viewer: str | None) -> None:

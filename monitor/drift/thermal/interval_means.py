@@ -10,7 +10,6 @@ from drivers.sample import Floats
 PARTS_PER_INTERVAL: Final = 8
 """Number of parts of an interval. The scatter of the parts determines the standard error of the mean."""
 MIN_KNOWN_SHARE: Final = 0.5
-"""Smallest share of known samples in an interval."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,10 +25,6 @@ class IntervalMeans:
     def known(self) -> np.ndarray:
         """True [n] where bias and temperature are both known."""
         return np.isfinite(self.bias) & np.isfinite(self.temperature_c)
-
-    def first_intervals(self, n: int) -> "IntervalMeans":
-        """Return the first n intervals."""
-        return IntervalMeans(self.interval_s, self.bias[:n], self.error[:n], self.temperature_c[:n])
 
 
 def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> IntervalMeans:

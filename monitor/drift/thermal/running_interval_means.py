@@ -15,9 +15,7 @@ from drivers.sample import AXES, Floats
 from monitor.drift.thermal.interval_means import MIN_KNOWN_SHARE, PARTS_PER_INTERVAL
 
 BUFFER_ROWS: Final = 1024
-"""Largest number of rows in the buffer."""
 TEMPERATURE_COLUMN: Final = len(AXES)
-"""Column of the temperature, after the columns of the axes."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -107,6 +107,12 @@ class _Regression:
     noise: tuple[float, float]  # ratio and correlation of the most likely noise model
 
 
+def temperature_noise_c(temperature_c: Floats) -> float:
+    """Return the standard deviation of the noise of temperatures [n] in °C, from their second differences."""
+    second = np.diff(temperature_c, 2)
+    return float(np.median(np.abs(second))) / 6.0**0.5 / 0.6745 if second.size else 0.0
+
+
 def heating_direction(temperature_c: Floats) -> Floats:
     """Return +1 where temperature was last rising and -1 where it was last falling. All values are 0 without any
     change.
@@ -123,8 +129,8 @@ def heating_direction(temperature_c: Floats) -> Floats:
     >>> heating_direction(np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0])).tolist()
     [1.0, 1.0, 1.0, -1.0, -1.0, -1.0]
     """
-    noise = float(np.median(np.abs(np.diff(temperature_c, 2)))) / 6.0**0.5 / 0.6745 if temperature_c.size > 2 else 0.0
-    threshold = max(MIN_REVERSAL_SHARE * float(np.ptp(temperature_c)), MIN_REVERSAL_SIGMAS * noise)
+    noise_c = temperature_noise_c(temperature_c)
+    threshold = max(MIN_REVERSAL_SHARE * float(np.ptp(temperature_c)), MIN_REVERSAL_SIGMAS * noise_c)
     direction = np.zeros(temperature_c.size)
     highest = lowest = 0
     now = 0.0
