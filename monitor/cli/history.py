@@ -10,6 +10,7 @@ import typer
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
 from monitor.cli.shared import options, output
+from monitor.cli.shared.errors import name_option
 
 if TYPE_CHECKING:
     from monitor.history.query import HistoryQuery
@@ -69,7 +70,8 @@ def history(
     live = connect is not None or zenoh is not None
     if source is not None and live:
         raise ConfigError(f"{source}: give either a file or --connect, not both")
-    step_s = None if step is None else max(int(_for_option("--step", parse_duration_s, step)), 1)
+    with name_option("--step"):
+        step_s = None if step is None else max(int(parse_duration_s(step)), 1)
     axes = AXES if axis is None else (axis,)
     asked = HistoryQuery(_span(since, until), step_s, PARTS, axes)
     get = _from_daemon(connect, zenoh, prefix, device) if live else _from_file(source, device)
@@ -177,16 +179,10 @@ def _span(since: str | None, until: str | None) -> "TimeRange | None":
     if since is None and until is None:
         return None
     now_s = time.time()
-    start_s = float("-inf") if since is None else _for_option("--from", parse_time, since, now_s)
-    end_s = float("inf") if until is None else _for_option("--to", parse_time, until, now_s)
+    with name_option("--from"):
+        start_s = float("-inf") if since is None else parse_time(since, now_s)
+    with name_option("--to"):
+        end_s = float("inf") if until is None else parse_time(until, now_s)
     if end_s <= start_s:
         raise ConfigError(f"--to: {until} is not after --from {since}")
     return TimeRange(start_s, end_s, end_included=False)
-
-
-def _for_option(option: str, function: Callable[..., float], *arguments: object) -> float:
-    """Call a function, and prefix a ConfigError with the name of the option."""
-    try:
-        return function(*arguments)
-    except ConfigError as error:
-        raise ConfigError(f"{option}: {error}") from None
