@@ -63,7 +63,7 @@ def _print_version(wanted: bool) -> None:
 
 
 @app.callback()
-def options_of_all_commands(
+def _options_of_all_commands(
     version: Annotated[
         bool, typer.Option("--version", help="Print the version and exit.", callback=_print_version, is_eager=True)
     ] = False,
@@ -104,7 +104,7 @@ def main() -> None:
     Every error is printed as one line on standard error. ``--debug``, before or after the name of the command, prints
     the traceback of an error before this line.
     """
-    arguments, debug = split_debug(sys.argv[1:])
+    arguments, debug = _split_debug(sys.argv[1:])
     threading.excepthook = partial(report_failed_thread, debug)
     _ignore_impossible_width(os.environ)
     try:
@@ -152,14 +152,8 @@ def _ignore_impossible_width(environment: MutableMapping[str, str]) -> None:
             environment.pop(name, None)
 
 
-def split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:
-    """Return the arguments without ``--debug``, and True if ``--debug`` was given. ``--`` ends the options.
-
-    Examples
-    --------
-    >>> split_debug(["analyze", "a.csv", "--debug"]), split_debug(["analyze", "--", "--debug"])
-    ((['analyze', 'a.csv'], True), (['analyze', '--', '--debug'], False))
-    """
+def _split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:
+    """Return the arguments without ``--debug``, and True if ``--debug`` was given before ``--``."""
     end = arguments.index("--") if "--" in arguments else len(arguments)
     return [*(one for one in arguments[:end] if one != DEBUG), *arguments[end:]], DEBUG in arguments[:end]
 

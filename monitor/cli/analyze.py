@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from drivers.errors import ConfigError, NotReady
+from drivers.errors import NotReady
 from monitor.cli.shared import options, output
 
 
@@ -33,8 +33,7 @@ def analyze(
     from monitor.commands import analyze as offline
     from monitor.publishing.messages.analysis import AnalysisMessage, FailedAnalysisMessage
 
-    if plot is not None and plot.suffix not in (".png", ".html"):
-        raise ConfigError(f"--plot: {plot}: a name ending in .png or .html is needed")
+    output.check_output_file("--plot", plot, ".png", ".html")
     window_s = options.parse_duration("--window", window)
     last_s = options.parse_duration("--last", last)
     wanted = offline.Request(

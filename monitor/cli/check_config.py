@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import ConfigError
-from monitor.cli.shared.errors import WRONG
+from monitor.cli.shared.errors import WRONG, name_option
 
 
 def check(
@@ -51,8 +51,6 @@ def _defaults(link: str | None, decoder: str | None) -> str:
         ("--decoder", decoder, printed_defaults.format_decoder),
     ):
         if name is not None:
-            try:
+            with name_option(option):
                 texts.append(form(name))
-            except ConfigError as error:
-                raise ConfigError(f"{option}: {error}") from None
     return "\n".join(texts) or printed_defaults.format_defaults()

@@ -36,10 +36,9 @@ def compensate(
     from monitor.commands import compensate as compensating
     from monitor.publishing.terminal import compensate_text as text
 
-    if plot is not None and plot.suffix != ".png":
-        raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
-    for option, place in (("--out", out), ("--json", json), ("--plot", plot)):
-        output.check_output_folder(option, place)
+    output.check_output_file("--plot", plot, ".png")
+    output.check_output_file("--out", out)
+    output.check_output_file("--json", json)
     for option, place in (("--json", json), ("--plot", plot), ("RECORDING", recording)):
         if place is not None and real_path(place) == real_path(out):
             raise ConfigError(f"{option}: {place} is also the output file of --out; choose another name")

@@ -9,9 +9,7 @@ from monitor.cli.shared import output
 from monitor.cli.shared.errors import FAILED
 
 SCHEMA: Final = "imu-monitor/doctor/1"
-"""Schema of the JSON."""
 SIGNS: Final = {"well": "[green]✓[/]", "doubt": "[yellow]![/]", "wrong": "[red]✗[/]"}
-"""Sign of each mark in the table."""
 
 
 def doctor(
@@ -26,7 +24,7 @@ def doctor(
 
     from monitor.commands import doctor as checks
 
-    output.check_output_folder("--json", json)
+    output.check_output_file("--json", json)
     findings = checks.examine(config)
     if json is not None:
         output.write_bytes("--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n")

@@ -10,6 +10,7 @@ import typer
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
 from monitor.cli.shared import options, output
+from monitor.cli.shared.errors import name_option
 
 if TYPE_CHECKING:
     from monitor.history.query import HistoryQuery
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from monitor.history.time_ranges import TimeRange
 
 MAX_TABLE_ROWS: Final = 24
-"""Number of rows in the table of one axis over time."""
 Get = Callable[["HistoryQuery"], "HistoryTable"]
 """Function that returns the results of a query."""
 
@@ -52,6 +52,7 @@ def history(
     """Print past coefficients, temperatures, lost samples and events, over periods from hours to years."""
     from rich.console import Console
 
+    from drivers.recordings.formats import format_for_path
     from drivers.sample import AXES
     from monitor.estimation.fit.coefficients import SYMBOLS
     from monitor.history.query import PARTS, HistoryQuery
@@ -61,11 +62,16 @@ def history(
 
     if axis is not None and axis not in AXES:
         raise ConfigError(f'--axis: "{axis}"; possible are {", ".join(AXES)}')
-    _check_output_files(json, out, plot)
+    output.check_output_file("--plot", plot, ".png")
+    output.check_output_file("--json", json)
+    output.check_output_file("--out", out)
+    if out is not None:
+        format_for_path(out)
     live = connect is not None or zenoh is not None
     if source is not None and live:
         raise ConfigError(f"{source}: give either a file or --connect, not both")
-    step_s = None if step is None else max(int(_for_option("--step", parse_duration_s, step)), 1)
+    with name_option("--step"):
+        step_s = None if step is None else max(int(parse_duration_s(step)), 1)
     axes = AXES if axis is None else (axis,)
     asked = HistoryQuery(_span(since, until), step_s, PARTS, axes)
     get = _from_daemon(connect, zenoh, prefix, device) if live else _from_file(source, device)
@@ -79,24 +85,6 @@ def history(
         few_s = max(width_of(past.span, None, MAX_TABLE_ROWS), past.step_s)
         few = past if few_s == past.step_s else get(HistoryQuery(asked.span, few_s, ("coefficients", "status"), axes))
         history_text.print_axis_history(few, axis, SYMBOLS, console)
-
-
-def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) -> None:
-    """Check the output files before the history is read.
-
-    Raises
-    ------
-    ConfigError
-        If a file cannot be written, or if a suffix is not supported.
-    """
-    from drivers.recordings.formats import find_format
-
-    if plot is not None and plot.suffix != ".png":
-        raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
-    for option, place in (("--json", json), ("--out", out), ("--plot", plot)):
-        output.check_output_folder(option, place)
-    if out is not None:
-        find_format(out)
 
 
 def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: Path | None, plot: Path | None) -> None:
@@ -191,16 +179,10 @@ def _span(since: str | None, until: str | None) -> "TimeRange | None":
     if since is None and until is None:
         return None
     now_s = time.time()
-    start_s = float("-inf") if since is None else _for_option("--from", parse_time, since, now_s)
-    end_s = float("inf") if until is None else _for_option("--to", parse_time, until, now_s)
+    with name_option("--from"):
+        start_s = float("-inf") if since is None else parse_time(since, now_s)
+    with name_option("--to"):
+        end_s = float("inf") if until is None else parse_time(until, now_s)
     if end_s <= start_s:
         raise ConfigError(f"--to: {until} is not after --from {since}")
     return TimeRange(start_s, end_s, end_included=False)
-
-
-def _for_option(option: str, function: Callable[..., float], *arguments: object) -> float:
-    """Call a function, and prefix a ConfigError with the name of the option."""
-    try:
-        return function(*arguments)
-    except ConfigError as error:
-        raise ConfigError(f"{option}: {error}") from None

@@ -42,7 +42,7 @@ def reconcile(
     from monitor.reconcile.several_recordings import comparison_report
 
     last_s = options.parse_duration("--last", last)
-    output.check_output_folder("--json", json)
+    output.check_output_file("--json", json)
     tested = None if model is None else load_model(model, Path.cwd())
     several = len(recordings) > 1
     service_in_terminal.exit_on_sigterm()

@@ -34,7 +34,7 @@ def simulate(
     from monitor.noise.model_catalogue import load_model
 
     length_s = options.parse_duration("--seconds", seconds)
-    output.check_output_folder("--json", json)
+    output.check_output_file("--json", json)
     for option, path in (("--json", json), ("--temperature-from", temperature_from)):
         if path is not None and real_path(path) == real_path(out):
             raise ConfigError(f"{option}: {path} is also the output file of --out; choose another name")

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from drivers.errors import ConfigError, NotReady
+from drivers.errors import NotReady
 from monitor.cli.shared import options, output
 
 RecordingPath = Annotated[Path, typer.Argument(metavar="RECORDING", help="File, or folder of segments.")]
@@ -33,8 +33,9 @@ def thermal_fit(
     from monitor.commands import thermal
     from monitor.publishing.terminal import thermal_text as text
 
-    _check_thermal(json, plot)
-    output.check_output_folder("--out", out)
+    output.check_output_file("--plot", plot, ".png")
+    output.check_output_file("--json", json)
+    output.check_output_file("--out", out)
     interval_s, last_s = options.parse_duration("--interval", interval), options.parse_duration("--last", last)
     study = thermal.fit_recording(recording, interval_s, rate, last_s)
     if json is not None:
@@ -65,7 +66,8 @@ def thermal_predict(
     from monitor.commands import thermal
     from monitor.publishing.terminal import thermal_text as text
 
-    _check_thermal(json, plot)
+    output.check_output_file("--plot", plot, ".png")
+    output.check_output_file("--json", json)
     outlook = thermal.predict_recording(
         recording, thermal.read_model_file(model), rate, options.parse_duration("--last", last)
     )
@@ -79,17 +81,3 @@ def thermal_predict(
         save_thermal_prediction_plot(outlook, plot)
     if json != Path("-"):
         text.print_thermal_prediction(outlook, Console())
-
-
-def _check_thermal(json: Path | None, plot: Path | None) -> None:
-    """Check the output files of the ``thermal`` commands before the work begins.
-
-    Raises
-    ------
-    ConfigError
-        If a file cannot be written, or if the suffix of the picture is not .png.
-    """
-    if plot is not None and plot.suffix != ".png":
-        raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
-    output.check_output_folder("--json", json)
-    output.check_output_folder("--plot", plot)

@@ -9,7 +9,7 @@ time are computed in the calling thread, so that Ctrl-C ends the computation at 
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +19,7 @@ import numpy as np
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
 from drivers.sample import AXES, Ints, SampleBlock
+from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.drift.thermal.temperature_removal import TemperatureRemoval, remove_temperature, temperature_varied
 from monitor.estimation.allan.batch import TauGrid
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
@@ -29,9 +30,6 @@ from monitor.estimation.regular_grid import resample_with_temperature
 from monitor.publishing.plots.allan_figure import other_deviations
 from monitor.publishing.plots.dynamic_figure import ChangeMark
 from monitor.publishing.terminal.thermal_text import temperature_notes
-
-ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 
 
 class TooFewSamples(NotReady):
@@ -77,7 +75,7 @@ class Results:
     )
 
 
-def run_analysis(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Results:
+def run_analysis(request: Request, tell: ProgressCallback = ignore_progress) -> Results:
     """Read a recording and analyse it.
 
     Parameters

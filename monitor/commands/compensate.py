@@ -6,7 +6,6 @@ recordings. All methods are evaluated on the same samples at rest. The first thi
 because some methods use it for learning.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -19,6 +18,7 @@ from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
 from drivers.recordings.writing import open_recording_writer
 from drivers.sample import AXES, Floats
+from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.compensation_score import score_at_rest
@@ -28,16 +28,10 @@ from monitor.drift.compensation.sage_husa import MIN_CONFIRMED_INTERVALS, REJECT
 from monitor.estimation.regular_grid import resample_with_temperature
 
 METHODS: Final = ("adaptive", "fixed", *REFERENCE_METHODS)
-"""Names of the methods."""
 GYROS: Final = AXES[:3]
-"""Gyroscope axes."""
 LEARNING_SHARE: Final = 1.0 / 3.0
 """Share of the samples at rest that is used for learning and excluded from the evaluation."""
 BLOCK_ROWS: Final = 1 << 16
-"""Number of rows that are written at a time."""
-
-ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +46,7 @@ class Request:
     last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
-def run_compensation(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> CompensationResult:
+def run_compensation(request: Request, tell: ProgressCallback = ignore_progress) -> CompensationResult:
     """Compensate a recording and write the result.
 
     Parameters

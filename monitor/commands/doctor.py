@@ -10,6 +10,7 @@ noise uses all digits of a 32-bit float. Sensors with a coarser resolution need 
 comparatively small and is not counted.
 """
 
+import contextlib
 import ctypes
 import errno
 import operator
@@ -23,6 +24,7 @@ import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
@@ -35,6 +37,7 @@ from drivers.links.replay_link import ReplayLink
 from drivers.number_ranges import DAY_S
 from monitor.commands.check_config import check_configuration
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, lock_holder
+from monitor.common.units import format_count
 from monitor.settings.file_permissions import contains_secret
 from monitor.settings.loading import Config, Storage
 
@@ -48,17 +51,13 @@ Sensors that use all digits of a float need 32.5 to 33.3 bytes, and sensors with
 RAW_BYTES: Final = 60.0
 """Approximate size of the received frame of a sample. It depends on the protocol."""
 CONNECT_TIMEOUT_S: Final = 2.0
-"""Longest wait for a connection."""
 TIME_ERROR: Final = 5
 """Return value of adjtimex(2) if the clock is not synchronised."""
 CAN_TYPE: Final = "280"
 """ARPHRD_CAN, in /sys/class/net/NAME/type."""
 MAX_PORT: Final = 65535
-"""Largest port number."""
 UNIT: Final = "imu-monitor.service"
-"""Name of the systemd unit."""
 PACKAGE: Final = "imu-monitor"
-"""Name of the distribution package."""
 PACKAGES: Final = ("monitor", "drivers")
 """Import packages of the program. The names are common, so other packages may have the same names."""
 TCP_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
@@ -66,7 +65,6 @@ TCP_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?"
 REQUIREMENT: Final = re.compile(r"([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;(.*))?")
 """Regular expression for the requirement of a package: name, versions and marker."""
 LOOPBACK: Final = ("127.", "::1", "localhost")
-"""Beginnings of loopback addresses."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,136 +77,118 @@ class Finding:
     do: str = ""  # advice; empty if nothing is to be done
 
 
+_well, _doubt, _wrong = partial(Finding, "well"), partial(Finding, "doubt"), partial(Finding, "wrong")
+
+
 def examine(path: Path | None = None) -> list[Finding]:
     """Check the machine, and the configuration if a path is given."""
-    found = [
+    machine = [
         *check_library_versions(),
-        *check_shadowed_packages(sys.path),
-        *_check_kernels(),
-        *check_clock(),
+        *_check_shadowed_packages(sys.path),
+        _check_kernels(),
+        check_clock(),
         *_check_systemd_unit(),
     ]
     if path is None:
-        return found
-    config, wrong = read_configuration(path)
-    found = [*wrong, *found]
+        return machine
+    config, mistakes = check_configuration(path, pipe=True)
+    found = [_wrong("configuration", line) for line in mistakes]
+    if config is not None:
+        found.append(_well("configuration", f"{path}: {format_count(len(config.devices), 'device')}"))
+    found += machine
     if path.is_file():
-        found += _check_permissions(path)
-    if config is None:
-        return found
-    for one in config.table["device"]:
-        found += _check_device(str(one["name"]), one["driver"])
-    found += [
-        *_check_zenoh(config),
-        *_check_viewer(config),
-        *_check_storage(config),
-        *_check_metrics(config),
-        *_check_reconcile(config),
-    ]
-    for hook in config.hooks:
-        if hook.command:
-            found += _check_permissions(Path(hook.command[0]), f"hook {Path(hook.command[0]).name}", secret=False)
+        found.append(_check_permissions(path))
+    if config is not None:
+        found += _check_configured(config)
     return found
 
 
-# --- the configuration
+def _check_configured(config: Config) -> Iterator[Finding]:
+    """Check the devices, the outputs and the hooks of a valid configuration."""
+    for one in config.table["device"]:
+        yield from _check_device(str(one["name"]), one["driver"])
+    yield from _check_zenoh(config)
+    yield from _check_viewer(config)
+    yield from _check_storage(config)
+    yield from _check_metrics(config)
+    yield from _check_reconcile(config)
+    for hook in config.hooks:
+        if hook.command:
+            command = Path(hook.command[0])
+            yield _check_permissions(command, f"hook {command.name}", secret=False)
 
 
-def read_configuration(path: Path) -> tuple[Config | None, list[Finding]]:
-    """Read and check the configuration; return it, or None if it has a mistake, and the findings."""
-    config, wrong = check_configuration(path, pipe=True)
-    if config is None:
-        return None, [Finding("wrong", "configuration", line) for line in wrong]
-    count = len(config.devices)
-    return config, [Finding("well", "configuration", f"{path}: {count} device{'' if count == 1 else 's'}")]
-
-
-def _check_permissions(path: Path, about: str = "permissions", secret: bool = True) -> list[Finding]:
+def _check_permissions(path: Path, about: str = "permissions", secret: bool = True) -> Finding:
     """Check who may write a file that controls the service, and who may read a file that may contain a password."""
     try:
         seen = path.stat()
     except OSError as error:
-        return [Finding("wrong", about, f"{path}: {error.strerror or error}")]
+        return _wrong(about, f"{path}: {error.strerror or error}")
     mode = stat.S_IMODE(seen.st_mode)
     if mode & stat.S_IWOTH:
         text = f"{path}: everyone can write it, and run commands as the user of the service"
-        return [Finding("wrong", about, text, f"chmod o-w {path}")]
+        return _wrong(about, text, f"chmod o-w {path}")
     if seen.st_uid not in (0, os.geteuid()):
         text = f"{path}: belongs to another user ({_user(seen.st_uid)}), who can change what the service does"
-        return [Finding("doubt", about, text, f"chown root {path}")]
+        return _doubt(about, text, f"chown root {path}")
     if mode & stat.S_IWGRP:
-        text = f"{path}: the group {_group(seen.st_gid)} can write it"
-        return [Finding("doubt", about, text, f"chmod g-w {path}")]
+        return _doubt(about, f"{path}: the group {_group(seen.st_gid)} can write it", f"chmod g-w {path}")
     if secret and mode & stat.S_IROTH and contains_secret(path):
-        text = f"{path}: everyone can read the password in it"
-        return [Finding("wrong", about, text, f"chmod o-r {path}")]
-    return [Finding("well", about, f"{path}: {mode:04o}, owner {_user(seen.st_uid)}")]
+        return _wrong(about, f"{path}: everyone can read the password in it", f"chmod o-r {path}")
+    return _well(about, f"{path}: {mode:04o}, owner {_user(seen.st_uid)}")
 
 
 # --- devices
 
 
-def _check_device(name: str, driver: Mapping[str, Any]) -> list[Finding]:
+def _check_device(name: str, driver: Mapping[str, Any]) -> Iterator[Finding]:
     """Check the link of a device without opening it."""
     about = f"device {name}"
     match driver.get("link"):
         case "serial":
-            return _check_serial_port(about, str(driver.get("port")))
+            yield _check_serial_port(about, str(driver.get("port")))
         case "can":
-            return check_can_interface(
-                about, str(driver.get("interface", "socketcan")), str(driver.get("channel", "can0"))
-            )
+            interface, channel = str(driver.get("interface", "socketcan")), str(driver.get("channel", "can0"))
+            yield check_can_interface(about, interface, channel)
         case "zenoh":
-            endpoints = driver.get("connect", [])
-            return [one for endpoint in endpoints for one in _reachable(about, str(endpoint))]
+            for endpoint in driver.get("connect", []):
+                yield _check_reachable(about, str(endpoint))
         case other:
-            return [Finding("well", about, f"link {other}: nothing to check on this machine")]
+            yield _well(about, f"link {other}: nothing to check on this machine")
 
 
-def _check_serial_port(about: str, port: str) -> list[Finding]:
+def _check_serial_port(about: str, port: str) -> Finding:
     """Check that a serial port exists, is accessible and is not used by another program."""
     if "://" in port:
-        return [Finding("well", about, f"{port}: network port or pattern, not checked")]
+        return _well(about, f"{port}: network port or pattern, not checked")
     path = Path(port)
     if not path.exists():
         there = sorted(str(one) for kind in ("ttyUSB*", "ttyACM*", "ttyAMA*") for one in Path("/dev").glob(kind))
         text = f"{port}: no such port; existing ports: {', '.join(there) or 'none'}"
-        return [
-            Finding("wrong", about, text, "plug it in, or choose another port; dmesg shows what was plugged in last")
-        ]
+        return _wrong(about, text, "plug it in, or choose another port; dmesg shows what was plugged in last")
     seen = path.stat()
     if not stat.S_ISCHR(seen.st_mode):
-        return [Finding("wrong", about, f"{port}: not a serial port")]
+        return _wrong(about, f"{port}: not a serial port")
     if not os.access(path, os.R_OK | os.W_OK):
-        group = _group(seen.st_gid)
-        text = f"{port}: {_user(os.geteuid())} cannot read and write it; members of group {group} can"
-        return [Finding("wrong", about, text, f"sudo usermod -aG {group} {_user(os.geteuid())}, and log in again")]
-    holders = list(_processes_using(path))
-    if holders:
-        text = f"{port}: in use by {', '.join(holders)}"
-        return [
-            Finding("doubt", about, text, "if this is not the service itself, end it: only one program can read a port")
-        ]
-    return [Finding("well", about, f"{port}: exists, is readable, and no visible program uses it")]
+        user, group = _user(os.geteuid()), _group(seen.st_gid)
+        text = f"{port}: {user} cannot read and write it; members of group {group} can"
+        return _wrong(about, text, f"sudo usermod -aG {group} {user}, and log in again")
+    if holders := ", ".join(_processes_using(path)):
+        do = "if this is not the service itself, end it: only one program can read a port"
+        return _doubt(about, f"{port}: in use by {holders}", do)
+    return _well(about, f"{port}: exists, is readable, and no visible program uses it")
 
 
 def _processes_using(port: Path) -> Iterator[str]:
     """Yield the programs that have a port open, as far as this user can see them."""
-    wanted = port.resolve()
+    wanted = str(port.resolve())
     for process in Path("/proc").glob("[0-9]*"):
-        if process.name == str(os.getpid()):
-            continue
-        try:
-            open_files = {os.readlink(one) for one in (process / "fd").iterdir()}
-            if str(wanted) in open_files:
+        with contextlib.suppress(OSError):  # the process belongs to another user, or has ended
+            if process.name != str(os.getpid()) and wanted in map(os.readlink, (process / "fd").iterdir()):
                 yield f"{(process / 'comm').read_text().strip()} (pid {process.name})"
-        except OSError:  # the process belongs to another user, or has ended
-            continue
 
 
-def check_can_interface(
-    about: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")
-) -> list[Finding]:
+def check_can_interface(about: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")) -> Finding:
     """Check that the package for a CAN interface is installed, and that a socketcan interface exists and is up.
 
     Parameters
@@ -224,11 +204,11 @@ def check_can_interface(
     """
     if missing := describe_missing_package(interface):
         text, _, command = missing.partition(": ")
-        return [Finding("wrong", about, text, command)]
+        return _wrong(about, text, command)
     if interface != "socketcan":
-        return [Finding("well", about, f"{interface} {channel}: not checked")]
+        return _well(about, f"{interface} {channel}: not checked")
     if not hasattr(socket, "AF_CAN"):
-        return [Finding("wrong", about, "this system has no socketcan", "use another interface of python-can")]
+        return _wrong(about, "this system has no socketcan", "use another interface of python-can")
     network = sysfs / channel
     up = f"sudo ip link set {channel} up type can bitrate 500000, with the bit rate of the bus"
     try:
@@ -236,35 +216,48 @@ def check_can_interface(
     except OSError:
         types = [one for one in sysfs.glob("*/type") if os.access(one, os.R_OK) and one.read_text().strip() == CAN_TYPE]
         there = ", ".join(sorted(one.parent.name for one in types)) or "none"
-        return [Finding("wrong", about, f"{channel}: no such interface; existing CAN interfaces: {there}", up)]
+        return _wrong(about, f"{channel}: no such interface; existing CAN interfaces: {there}", up)
     if kind != CAN_TYPE:
-        return [Finding("wrong", about, f"{channel}: not a CAN interface", up)]
+        return _wrong(about, f"{channel}: not a CAN interface", up)
     if not flags & 1:  # IFF_UP
-        return [Finding("wrong", about, f"{channel}: is down", up)]
-    return [Finding("well", about, f"{channel}: is up")]
+        return _wrong(about, f"{channel}: is down", up)
+    return _well(about, f"{channel}: is up")
 
 
 # --- outputs
 
 
-def _check_zenoh(config: Config) -> list[Finding]:
+def _check_zenoh(config: Config) -> Iterator[Finding]:
     """Check the ports to listen on, the routers to connect to, and the zenoh configuration file."""
     own = config.zenoh
     if own.mode == "none":
-        return []
-    found = [one for endpoint in own.listen or () if own.mode != "client" for one in check_port_free("zenoh", endpoint)]
-    found += [one for endpoint in own.connect for one in _reachable("zenoh", endpoint)]
-    for endpoint in own.listen or ():
-        host = _host(endpoint)
-        if host and not host.startswith(LOOPBACK) and own.config is None:
-            text = f"{endpoint}: everyone who reaches this machine can read all data and send commands"
-            found.append(Finding("doubt", "zenoh", text, "listen on 127.0.0.1, or use TLS and access control"))
+        return
+    if own.mode != "client":
+        for endpoint in own.listen or ():
+            yield check_port_free("zenoh", endpoint)
+    for endpoint in own.connect:
+        yield _check_reachable("zenoh", endpoint)
     if own.config is not None:
-        found += _check_permissions(own.config, "zenoh file")
-    return found
+        yield _check_permissions(own.config, "zenoh file")
+        return
+    for endpoint in own.listen or ():
+        address = TCP_ENDPOINT.fullmatch(endpoint)
+        if address is not None and not address[1].startswith(LOOPBACK):
+            text = f"{endpoint}: everyone who reaches this machine can read all data and send commands"
+            yield _doubt("zenoh", text, "listen on 127.0.0.1, or use TLS and access control")
 
 
-def check_port_free(about: str, endpoint: str) -> list[Finding]:
+def _parse_endpoint(about: str, endpoint: str, failure: str) -> tuple[str, int] | Finding:
+    """Return host and port of an endpoint, or a finding if it has no TCP port or an impossible port."""
+    match = TCP_ENDPOINT.fullmatch(endpoint)
+    if match is None:
+        return _well(about, f"{endpoint}: not checked, since only TCP endpoints can be checked")
+    if int(match[2]) > MAX_PORT:
+        return _wrong(about, f"{endpoint}: {failure}: the largest port is {MAX_PORT}")
+    return match[1], int(match[2])
+
+
+def check_port_free(about: str, endpoint: str) -> Finding:
     """Check that a port is free, by listening on the port for a moment.
 
     Parameters
@@ -274,96 +267,78 @@ def check_port_free(about: str, endpoint: str) -> list[Finding]:
     endpoint : str
         Zenoh endpoint.
     """
-    match = TCP_ENDPOINT.fullmatch(endpoint)
-    if match is None:
-        return [Finding("well", about, f"{endpoint}: not checked, since only TCP ports can be checked")]
-    if int(match[2]) > MAX_PORT:
-        return [Finding("wrong", about, f"{endpoint}: cannot listen: the largest port is {MAX_PORT}")]
+    address = _parse_endpoint(about, endpoint, "cannot listen")
+    if isinstance(address, Finding):
+        return address
     try:
-        family = socket.AF_INET6 if ":" in match[1] else socket.AF_INET
-        with socket.create_server((match[1], int(match[2])), family=family):
-            return [Finding("well", about, f"{endpoint}: free")]
+        with socket.create_server(address, family=socket.AF_INET6 if ":" in address[0] else socket.AF_INET):
+            return _well(about, f"{endpoint}: free")
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) == errno.EADDRINUSE:
-            text = f"{endpoint}: another program listens there"
-            return [
-                Finding(
-                    "doubt", about, text, "no problem if it is this service; otherwise end it, or choose another port"
-                )
-            ]
-        why = getattr(error, "strerror", None) or error
-        return [Finding("wrong", about, f"{endpoint}: cannot listen: {why}")]
+            do = "no problem if it is this service; otherwise end it, or choose another port"
+            return _doubt(about, f"{endpoint}: another program listens there", do)
+        return _wrong(about, f"{endpoint}: cannot listen: {getattr(error, 'strerror', None) or error}")
 
 
-def _reachable(about: str, endpoint: str) -> list[Finding]:
+def _check_reachable(about: str, endpoint: str) -> Finding:
     """Check that a connection to an endpoint can be opened."""
-    match = TCP_ENDPOINT.fullmatch(endpoint)
-    if match is None:
-        return [Finding("well", about, f"{endpoint}: not checked, since only TCP endpoints can be checked")]
-    if int(match[2]) > MAX_PORT:
-        return [Finding("wrong", about, f"{endpoint}: no answer: the largest port is {MAX_PORT}")]
+    address = _parse_endpoint(about, endpoint, "no answer")
+    if isinstance(address, Finding):
+        return address
     try:
-        with socket.create_connection((match[1], int(match[2])), timeout=CONNECT_TIMEOUT_S):
-            return [Finding("well", about, f"{endpoint}: answers")]
+        with socket.create_connection(address, timeout=CONNECT_TIMEOUT_S):
+            return _well(about, f"{endpoint}: answers")
     except (OSError, UnicodeError) as error:
         text = f"{endpoint}: no answer: {getattr(error, 'strerror', None) or error}"
-        return [
-            Finding(
-                "doubt", about, text, "start the program there, or check cables and firewalls; the service tries again"
-            )
-        ]
+        do = "start the program there, or check cables and firewalls; the service tries again"
+        return _doubt(about, text, do)
 
 
-def _check_viewer(config: Config) -> list[Finding]:
+def _check_viewer(config: Config) -> Iterator[Finding]:
     """Check that the viewer is installed, if the configuration uses it."""
-    if config.viewer.mode == "none":
-        return []
+    mode = config.viewer.mode
+    if mode == "none":
+        return
     if find_spec("rerun") is None:
-        text = f'viewer.mode is "{config.viewer.mode}", but rerun-sdk is not installed: there will be no live view'
-        return [Finding("doubt", "viewer", text, 'pip install "imu-monitor[viewer]", or mode = "none"')]
-    return [Finding("well", "viewer", f"rerun-sdk is installed, mode {config.viewer.mode}")]
+        text = f'viewer.mode is "{mode}", but rerun-sdk is not installed: there will be no live view'
+        yield _doubt("viewer", text, 'pip install "imu-monitor[viewer]", or mode = "none"')
+    else:
+        yield _well("viewer", f"rerun-sdk is installed, mode {mode}")
 
 
-def _check_metrics(config: Config) -> list[Finding]:
+def _check_metrics(config: Config) -> Iterator[Finding]:
     """Check the library and the port for Prometheus, and who can reach the port."""
     own = config.metrics
     if own is None:
-        return []
+        return
     if find_spec("prometheus_client") is None:
         text = "metrics.listen is set, but prometheus-client is not installed"
-        return [Finding("wrong", "metrics", text, 'pip install "imu-monitor[metrics]"')]
+        yield _wrong("metrics", text, 'pip install "imu-monitor[metrics]"')
+        return
     host = f"[{own.host}]" if ":" in own.host else own.host
-    found = check_port_free("metrics", f"tcp/{host}:{own.port}")
+    yield check_port_free("metrics", f"tcp/{host}:{own.port}")
     if not own.host.startswith(LOOPBACK):
         text = f"{own.host}: everyone who reaches this machine can read the metrics"
-        found.append(Finding("doubt", "metrics", text, "listen on 127.0.0.1, and let a local collector forward them"))
-    return found
+        yield _doubt("metrics", text, "listen on 127.0.0.1, and let a local collector forward them")
 
 
-def _check_reconcile(config: Config) -> list[Finding]:
+def _check_reconcile(config: Config) -> Iterator[Finding]:
     """Check that ``command/reconcile`` can be answered, if a folder is configured for its reports."""
-    missing = find_missing_packages("reconcile")
-    if not missing or not any(one.reconcile_folder for one in config.devices):
-        return []
-    text = (
-        f"reconcile_folder is set, but {' and '.join(missing)} is not installed: the service refuses command/reconcile"
-    )
-    return [Finding("doubt", "reconcile", text, 'pip install "imu-monitor[reconcile]"')]
+    missing = " and ".join(find_missing_packages("reconcile"))
+    if missing and any(one.reconcile_folder for one in config.devices):
+        text = f"reconcile_folder is set, but {missing} is not installed: the service refuses command/reconcile"
+        yield _doubt("reconcile", text, 'pip install "imu-monitor[reconcile]"')
 
 
-def _check_storage(config: Config) -> list[Finding]:
+def _check_storage(config: Config) -> Iterator[Finding]:
     """Check the library for recordings, the storage folder and the free disk space."""
     own = config.storage
     if own is None:
-        return [
-            Finding(
-                "doubt", "storage", "nothing is kept: after a restart the window is empty", "set folder in [storage]"
-            )
-        ]
-    found = []
+        yield _doubt("storage", "nothing is stored: after a restart the window is empty", "set folder in [storage]")
+        return
     if (own.record or own.raw) and find_spec("pyarrow") is None:
         text = "samples are to be recorded, but pyarrow is not installed"
-        found.append(Finding("wrong", "storage", text, 'pip install "imu-monitor[arrow]"'))
+        yield _wrong("storage", text, 'pip install "imu-monitor[arrow]"')
     folder = next(one for one in (own.folder, *own.folder.parents) if os.path.exists(one))
     try:
         file_access.check_folder_or_absent(folder)
@@ -372,17 +347,18 @@ def _check_storage(config: Config) -> list[Finding]:
         usage = shutil.disk_usage(folder)
     except OSError as error:
         text = f"{own.folder}: cannot be written: {error.strerror or error}"
-        return [*found, Finding("wrong", "storage", text, f"create it, owned by {_user(os.geteuid())}")]
-    found += _check_in_use(own)
-    return [*found, *check_disk_space(own, recorded_bytes_per_day(config), usage.total, usage.free)]
+        yield _wrong("storage", text, f"create it, owned by {_user(os.geteuid())}")
+        return
+    yield from _check_in_use(own)
+    yield check_disk_space(own, recorded_bytes_per_day(config), usage.total, usage.free)
 
 
-def _check_in_use(own: Storage) -> list[Finding]:
+def _check_in_use(own: Storage) -> Iterator[Finding]:
     """Check whether another process records into the storage folder or writes its history there."""
     wanted = {RECORDING_LOCK: own.record or own.raw, HISTORY_LOCK: own.history}
-    holders = sorted({held for name, on in wanted.items() if on and (held := lock_holder(own.folder, name))})
     do = "no problem if it is this service; otherwise end it, or choose another folder: only one program records"
-    return [Finding("doubt", "storage", f"{own.folder}: in use by {one}", do) for one in holders]
+    for holder in sorted({lock_holder(own.folder, name) for name, on in wanted.items() if on} - {""}):
+        yield _doubt("storage", f"{own.folder}: in use by {holder}", do)
 
 
 def recorded_bytes_per_day(config: Config) -> float | None:
@@ -407,7 +383,7 @@ def recorded_bytes_per_day(config: Config) -> float | None:
     return None if len(known) < len(rates) else sum(known) * DAY_S * each
 
 
-def check_disk_space(own: Storage, a_day: float | None, total: int, available: int) -> list[Finding]:
+def check_disk_space(own: Storage, a_day: float | None, total: int, available: int) -> Finding:
     """Check that the disk has enough space for the data to be kept.
 
     Parameters
@@ -424,16 +400,16 @@ def check_disk_space(own: Storage, a_day: float | None, total: int, available: i
     allowed = available - (1.0 - own.disk_share) * total
     if a_day is None:
         text = f"{own.folder}: {_gb(available)} free; disk use per day unknown, since a device has no configured rate"
-        return [Finding("doubt", "storage", text, "add rate to every device")]
+        return _doubt("storage", text, "add rate to every device")
     wanted, days = a_day * own.keep_s / DAY_S, max(allowed, 0.0) / a_day if a_day else float("inf")
     text = f"{own.folder}: {_gb(available)} free, about {_gb(a_day)} per day, {_gb(wanted)} for the whole time of keep"
     if allowed <= 0.0 or days < 1.0:
         do = "free disk space, or record on another disk"
-        return [Finding("wrong", "storage", f"{text}: not enough for one day below disk_share", do)]
+        return _wrong("storage", f"{text}: not enough for one day below disk_share", do)
     if wanted > allowed:
         do = "a larger disk, or a shorter keep"
-        return [Finding("doubt", "storage", f"{text}: the oldest data will be deleted after about {days:.0f} days", do)]
-    return [Finding("well", "storage", text)]
+        return _doubt("storage", f"{text}: the oldest data will be deleted after about {days:.0f} days", do)
+    return _well("storage", text)
 
 
 # --- the machine
@@ -441,30 +417,22 @@ def check_disk_space(own: Storage, a_day: float | None, total: int, available: i
 
 def check_library_versions() -> list[Finding]:
     """Check the version of each library against the requirements of this program."""
-    wanted = list(required_libraries())
-    if not wanted:
-        return [
-            Finding(
-                "doubt",
-                "libraries",
-                "the required versions are unknown, because the package imu-monitor is not installed",
-            )
-        ]
-    wrong, count = [], 0
-    for name, versions, optional in wanted:
+    about, wrong, count = "libraries", [], 0
+    for name, versions, optional in required_libraries():
+        install = f'pip install "{name}{versions}"'
         try:
             there = metadata.version(name)
         except metadata.PackageNotFoundError:
             if not optional:
-                wrong.append(Finding("wrong", "libraries", f"{name} is missing", f'pip install "{name}{versions}"'))
+                wrong.append(_wrong(about, f"{name} is missing", install))
             continue
         count += 1
         if not version_satisfies(there, versions):
-            text = f"{name} {there} is installed, {versions} is required"
-            wrong.append(Finding("wrong", "libraries", text, f'pip install "{name}{versions}"'))
-    return wrong or [
-        Finding("well", "libraries", f"Python {sys.version.split()[0]}, {count} libraries with the required versions")
-    ]
+            wrong.append(_wrong(about, f"{name} {there} is installed, {versions} is required", install))
+    if not wrong and not count:
+        text = "the required versions are unknown, because the package imu-monitor is not installed"
+        return [_doubt(about, text)]
+    return wrong or [_well(about, f"Python {sys.version.split()[0]}, {count} libraries with the required versions")]
 
 
 def required_libraries() -> Iterator[tuple[str, str, bool]]:
@@ -502,14 +470,8 @@ def version_satisfies(version: str, wanted: str) -> bool:
     return all(compare[sign](_numbers(version), _numbers(bound)) for sign, bound in bounds)
 
 
-def check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
-    """Report foreign modules that Python would import in place of the packages of the program.
-
-    Parameters
-    ----------
-    module_path : sequence of str
-        Folders in the order in which Python searches them, as ``sys.path``.
-    """
+def _check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
+    """Report foreign modules that Python would import in place of the packages of the program."""
     own = Path(__file__).resolve().parents[2]
     found = []
     for entry in module_path:
@@ -525,11 +487,11 @@ def check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
                     f"{foreign}: is found before the program's own package {name}; imu-monitor uses its own, a script "
                     f"that imports {name} does not"
                 )
-                found.append(Finding("doubt", "packages", text, f"remove {folder} from PYTHONPATH for such scripts"))
-    return found or [Finding("well", "packages", f"{' and '.join(PACKAGES)} are the program's own, in {own}")]
+                found.append(_doubt("packages", text, f"remove {folder} from PYTHONPATH for such scripts"))
+    return found or [_well("packages", f"{' and '.join(PACKAGES)} are the program's own, in {own}")]
 
 
-def _check_kernels() -> list[Finding]:
+def _check_kernels() -> Finding:
     """Check that the kernels are compiled and cached on disk."""
     from monitor.common.compiled import cache_folder
     from monitor.daemon.kernels.kernel_compilation import is_warm
@@ -538,22 +500,22 @@ def _check_kernels() -> list[Finding]:
     folder = cache_folder()
     if folder is None:
         text = "no folder for compiled kernels is writable: every start compiles them again, for one or two minutes"
-        return [Finding("doubt", "kernels", text, "set NUMBA_CACHE_DIR to a folder of the service's user")]
+        return _doubt("kernels", text, "set NUMBA_CACHE_DIR to a folder of the service's user")
     if not is_warm(SERVICE):
         text = f"not compiled for this version on this machine, in {folder}: the next start takes longer"
-        return [Finding("doubt", "kernels", text, "run imu-monitor warm-up as the user of the service")]
-    return [Finding("well", "kernels", f"compiled, in {folder}")]
+        return _doubt("kernels", text, "run imu-monitor warm-up as the user of the service")
+    return _well("kernels", f"compiled, in {folder}")
 
 
-def check_clock() -> list[Finding]:
+def check_clock() -> Finding:
     """Check that the host clock is synchronised, because the times of results are taken from this clock."""
     state = _adjtimex()
     if state is None:
-        return [Finding("doubt", "clock", "the system does not report whether it is synchronised")]
+        return _doubt("clock", "the system does not report whether it is synchronised")
     if state == TIME_ERROR:
         text = "not synchronised: the times of results and recordings will drift, or jump when it is set"
-        return [Finding("doubt", "clock", text, "timedatectl set-ntp true, or install chrony")]
-    return [Finding("well", "clock", "synchronised")]
+        return _doubt("clock", text, "timedatectl set-ntp true, or install chrony")
+    return _well("clock", "synchronised")
 
 
 def _check_systemd_unit() -> list[Finding]:
@@ -564,7 +526,7 @@ def _check_systemd_unit() -> list[Finding]:
     try:
         said = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False).stdout
     except (OSError, subprocess.TimeoutExpired) as error:
-        return [Finding("doubt", "systemd", f"the state is unknown: {error}")]
+        return [_doubt("systemd", f"the state is unknown: {error}")]
     return check_unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
 
 
@@ -581,14 +543,12 @@ def check_unit_state(seen: Mapping[str, str]) -> list[Finding]:
     active, restarts = seen.get("ActiveState", ""), seen.get("NRestarts", "0")
     text = f"{UNIT}: {active} ({seen.get('SubState', '')}), {restarts} restarts, {seen.get('UnitFileState', '')}"
     if active == "failed":
-        return [Finding("wrong", "systemd", text, f"journalctl -u {UNIT} -e shows the reason")]
-    if active == "active" and restarts == "0" and seen.get("UnitFileState") == "enabled":
-        return [Finding("well", "systemd", text)]
-    if active == "active" and restarts == "0":
-        return [
-            Finding("doubt", "systemd", text, f"systemctl enable {UNIT}; otherwise it does not start with the machine")
-        ]
-    return [Finding("doubt", "systemd", text, f"journalctl -u {UNIT} -e; systemctl enable --now {UNIT}")]
+        return [_wrong("systemd", text, f"journalctl -u {UNIT} -e shows the reason")]
+    if active != "active" or restarts != "0":
+        return [_doubt("systemd", text, f"journalctl -u {UNIT} -e; systemctl enable --now {UNIT}")]
+    if seen.get("UnitFileState") != "enabled":
+        return [_doubt("systemd", text, f"systemctl enable {UNIT}; otherwise it does not start with the machine")]
+    return [_well("systemd", text)]
 
 
 # --- shared functions
@@ -609,12 +569,6 @@ def _numbers(version: str) -> tuple[int, ...]:
     """Return the first four numbers of a version. Missing numbers are 0."""
     numbers = [int(part) for part in re.split(r"[^\d.]", version)[0].split(".") if part]
     return (*numbers, 0, 0, 0, 0)[:4]
-
-
-def _host(endpoint: str) -> str:
-    """Return the host of an endpoint; "" if it is not a TCP endpoint."""
-    match = TCP_ENDPOINT.fullmatch(endpoint)
-    return match[1] if match else ""
 
 
 def _gb(amount: float) -> str:

@@ -9,7 +9,7 @@ subfolder of ``DIR/``. The common results and the differences are written to ``D
 """
 
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,6 +24,7 @@ from drivers.recordings import FORMATS, iter_blocks, load_samples
 from drivers.recordings import Recording as Samples
 from drivers.recordings.writing import atomic_write_path
 from drivers.sample import AXES
+from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.estimation.regular_grid import resample_with_temperature
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.preparation.recording import Recording
@@ -33,10 +34,7 @@ from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.several_recordings import comparison_report
 from monitor.reconcile.several_recordings.comparison import Comparison, NamedResult, compare_results
 
-ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 REPORT: Final = "report.json"
-"""File name of the report as JSON."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +62,7 @@ class ComparisonRequest:
     last_s: float | None = None  # length of the end of each recording that is used; None for all
 
 
-def run_reconciliation(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Reconciliation:
+def run_reconciliation(request: Request, tell: ProgressCallback = ignore_progress) -> Reconciliation:
     """Compare one recording with a model and write the report.
 
     Parameters
@@ -89,15 +87,15 @@ def run_reconciliation(request: Request, tell: ProgressCallback = lambda _what, 
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             result = reconcile(recording, request.model, request.seed, pool.map, lambda what: tell(what, None))
     except NotReady as error:
-        _write(request.out / REPORT, encode_failure(str(error), len(found)))
+        _write(request.out / REPORT, _encode_failure(str(error), len(found)))
         raise
     result = replace(result, notes=(*request.notes, *found.notes, *notes, *result.notes))
     tell("writing", None)
-    write_report(result, request.out, request.recording.name)
+    _write_report(result, request.out, request.recording.name)
     return result
 
 
-def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lambda _what, _share: None) -> Comparison:
+def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = ignore_progress) -> Comparison:
     """Compare several recordings with a model and with each other, and write the reports.
 
     Parameters
@@ -137,24 +135,16 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
     if len(runs) < 2:
         why = "; ".join(f"{name}: {said}" for name, said in silent.items())
         why = f"at least two recordings are needed for a comparison, but only {len(runs)} can be evaluated: {why}"
-        _write(request.out / REPORT, encode_failure(why, 0, comparison_report.SCHEMA))
+        _write(request.out / REPORT, _encode_failure(why, 0, comparison_report.SCHEMA))
         raise NotReady(why)
     tell("writing", None)
     comparison = compare_results(runs, fitted_to, silent)
-    write_comparison(comparison, request.out)
+    _write_comparison(comparison, request.out)
     return comparison
 
 
-def write_comparison(result: Comparison, folder: Path) -> None:
-    """Write the report on all recordings together.
-
-    Parameters
-    ----------
-    result : Comparison
-        Comparison of the recordings.
-    folder : Path
-        Folder of the report.
-    """
+def _write_comparison(result: Comparison, folder: Path) -> None:
+    """Write the report on all recordings together."""
     from monitor.publishing.reports.comparison_page import render_page
 
     _write(folder / REPORT, comparison_report.encode_comparison(result))
@@ -203,18 +193,8 @@ def _tell_for(tell: ProgressCallback, which: str) -> ProgressCallback:
     return lambda what, share: tell(f"{which}: {what}", share)
 
 
-def write_report(result: Reconciliation, folder: Path, title: str) -> None:
-    """Write the four files of a report.
-
-    Parameters
-    ----------
-    result : Reconciliation
-        Comparison of the recording with the model.
-    folder : Path
-        Folder of the report.
-    title : str
-        Title of the page.
-    """
+def _write_report(result: Reconciliation, folder: Path, title: str) -> None:
+    """Write the four files of a report."""
     from monitor.publishing.reports.reconcile_page import render_page
 
     _write(folder / REPORT, encode_report(result))
@@ -228,18 +208,8 @@ def write_report(result: Reconciliation, folder: Path, title: str) -> None:
         write_rrd(result, place)
 
 
-def encode_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
-    """Return the content of ``report.json`` for data that do not support an answer.
-
-    Parameters
-    ----------
-    why : str
-        Reason.
-    samples : int
-        Number of samples in the recording.
-    schema : str, optional
-        Schema of the report.
-    """
+def _encode_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
+    """Return the content of ``report.json`` for data that do not support an answer."""
     return msgspec.json.encode({"schema": schema, "verdict": None, "why": why, "samples": samples})
 
 

@@ -9,7 +9,6 @@ random values such as the times of events.
 """
 
 import tomllib
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -23,18 +22,13 @@ from drivers.number_ranges import SAMPLE_COUNT
 from drivers.recordings import Recording, load_samples, open_recording_writer
 from drivers.recordings.writing import atomic_write_path
 from drivers.sample import AXES, Floats
+from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.noise.model import NoiseModel
 from monitor.noise.simulation import ModelStream, SimulatedSamples
 
 TRUTH_SCHEMA: Final = "imu-monitor/truth/1"
-"""Schema of the file with the truth."""
 RESULT_SCHEMA: Final = "imu-monitor/simulate/1"
-"""Schema of the result as JSON."""
 CHUNK_ROWS: Final = 1 << 16
-"""Number of rows that are drawn and written at a time."""
-
-ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +88,7 @@ class Result:
         )
 
 
-def run_simulation(request: Request, tell: ProgressCallback = lambda _what, _share: None) -> Result:
+def run_simulation(request: Request, tell: ProgressCallback = ignore_progress) -> Result:
     """Simulate a recording and write it.
 
     Parameters

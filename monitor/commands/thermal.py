@@ -16,7 +16,7 @@ from drivers import file_access
 from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks, load_samples
-from drivers.sample import AXES, Floats
+from drivers.sample import AXES
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import ThermalModel
@@ -30,10 +30,9 @@ from monitor.drift.thermal.thermal_study import (
 from monitor.estimation.regular_grid import resample_with_temperature
 
 SCHEMA: Final = "imu-monitor/thermal-model/1"
-"""Schema of the model file."""
 
 
-class AxisModelRecord(msgspec.Struct):
+class _AxisModelRecord(msgspec.Struct):
     """Thermal model of one axis in a model file."""
 
     powers: int
@@ -49,12 +48,12 @@ class AxisModelRecord(msgspec.Struct):
     """Model in a form for other programs. ``from_file`` does not read it."""
 
 
-class ModelFile(msgspec.Struct):
+class _ModelFile(msgspec.Struct):
     """Content of a model file."""
 
     schema: str
     interval: float
-    axes: dict[str, AxisModelRecord]
+    axes: dict[str, _AxisModelRecord]
 
 
 def fit_recording(
@@ -78,8 +77,7 @@ def fit_recording(
     RecordingError, ConfigError
         If the recording cannot be read, or if it has no temperature.
     """
-    values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
-    means = _means(values, temperature_c, rate, interval_s or choose_interval_s(temperature_c.size / rate, rate))
+    means, notes = _read_interval_means(recording, interval_s, rate_hz, last_s)
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
@@ -111,9 +109,8 @@ def predict_recording(
     RecordingError, ConfigError
         If the recording cannot be read, or if it has no temperature.
     """
-    values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     interval = next(iter(models.values())).interval_s
-    means = _means(values, temperature_c, rate, interval)
+    means, notes = _read_interval_means(recording, interval, rate_hz, last_s)
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
@@ -128,7 +125,7 @@ def predict_recording(
 def encode_model_file(study: ThermalFitReport) -> bytes:
     """Return the content of the model file with all axes that were fitted."""
     rows = {axis: _row(one.model) for axis, one in study.fits.items()}
-    return msgspec.json.format(msgspec.json.encode(ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
+    return msgspec.json.format(msgspec.json.encode(_ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
 
 
 def read_model_file(path: Path) -> dict[str, ThermalModel]:
@@ -140,7 +137,7 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
         If the file cannot be read, or if its content is invalid.
     """
     try:
-        found = msgspec.json.decode(file_access.read_small_file(path, pipe=True), type=ModelFile)
+        found = msgspec.json.decode(file_access.read_small_file(path, pipe=True), type=_ModelFile)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -156,9 +153,9 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
     return {axis: _model(path, axis, row, found.interval) for axis, row in found.axes.items()}
 
 
-def _row(model: ThermalModel) -> AxisModelRecord:
+def _row(model: ThermalModel) -> _AxisModelRecord:
     """Return a model in the form of the model file."""
-    return AxisModelRecord(
+    return _AxisModelRecord(
         powers=model.shape.powers,
         time_constants=list(model.shape.constants_s),
         reference=model.reference_c,
@@ -172,7 +169,7 @@ def _row(model: ThermalModel) -> AxisModelRecord:
     )
 
 
-def _model(path: Path, axis: str, row: AxisModelRecord, interval_s: float) -> ThermalModel:
+def _model(path: Path, axis: str, row: _AxisModelRecord, interval_s: float) -> ThermalModel:
     """Check the model of one axis in a model file, and return it."""
     k = len(row.time_constants)
     terms = 1 + row.powers + k
@@ -216,21 +213,18 @@ def _model(path: Path, axis: str, row: AxisModelRecord, interval_s: float) -> Th
     )
 
 
-def _read(
-    recording: Path, rate_hz: float | None, last_s: float | None
-) -> tuple[Floats, Floats, float, tuple[str, ...]]:
-    """Return values [n, 6], temperature [n] in °C, rate in Hz and notes of a recording."""
+def _read_interval_means(
+    recording: Path, interval_s: float | None, rate_hz: float | None, last_s: float | None
+) -> tuple[dict[str, IntervalMeans], tuple[str, ...]]:
+    """Return the interval means of each recorded axis, and the notes about the recording."""
     found = load_samples(recording, rate_hz, last_s)
     values, temperature_c, rate, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
         raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")
-    return values, temperature_c, rate, (*found.notes, *notes)
-
-
-def _means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> dict[str, IntervalMeans]:
-    """Return the interval means of each axis that was recorded."""
-    return {
-        axis: compute_interval_means(values[:, at], temperature_c, rate_hz, interval_s)
+    interval_s = interval_s or choose_interval_s(temperature_c.size / rate, rate)
+    means = {
+        axis: compute_interval_means(values[:, at], temperature_c, rate, interval_s)
         for at, axis in enumerate(AXES)
         if np.isfinite(values[:, at]).any()
     }
+    return means, (*found.notes, *notes)

@@ -51,14 +51,13 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 PACKAGE_ROOT: Final = Path(__file__).parents[2]
-"""Folder of the program's packages."""
 IDENTIFIER: Final = re.compile(r"\w+")
 """Regular expression for a name in a list of imported names."""
 IMPORT_STATEMENT: Final = re.compile(r"^ *from (monitor[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
 """Regular expression for an import from a module of the package, with names in parentheses or on one line."""
 
 
-class IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
+class _IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
     """LLVM module that is only linked into other modules. It is neither optimised as a whole nor translated to machine
     code."""
 
@@ -68,11 +67,11 @@ class IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
         self._finalized = True
 
 
-class IntermediateCompiler(Compiler):  # type: ignore[misc]
-    """Compiler that compiles a function to an ``IntermediateLibrary``."""
+class _IntermediateCompiler(Compiler):  # type: ignore[misc]
+    """Compiler that compiles a function to an ``_IntermediateLibrary``."""
 
     def __init__(self, typing_context: Any, target_context: Any, library: Any, *more: Any) -> None:
-        library = IntermediateLibrary(target_context.codegen(), "intermediate")
+        library = _IntermediateLibrary(target_context.codegen(), "intermediate")
         super().__init__(typing_context, target_context, library, *more)
         self.state.targetctx.get_executable = _without_machine_code  # this context serves only this compilation
 
@@ -83,11 +82,11 @@ def _without_machine_code(library: Any, description: Any, environment: Any) -> A
     return _dynfunc.make_function(description.lookup_module(), description.qualname, "", 0, environment, (library,))
 
 
-class IntermediateDispatcher(CPUDispatcher):  # type: ignore[misc]
+class _IntermediateDispatcher(CPUDispatcher):  # type: ignore[misc]
     """Dispatcher that compiles a function for calls from other kernels."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, bool | str]) -> None:
-        super().__init__(function, targetoptions=options, pipeline_class=IntermediateCompiler)
+        super().__init__(function, targetoptions=options, pipeline_class=_IntermediateCompiler)
 
     def __call__(self, *_: object) -> Any:
         """Raise TypeError, because there is no machine code to call."""
@@ -113,7 +112,7 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             "nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "forceinline": inline,
         }  # fmt: skip
         super().__init__(function, targetoptions=options)
-        self.intermediate = IntermediateDispatcher(function, options | {"no_cpython_wrapper": True})
+        self.intermediate = _IntermediateDispatcher(function, options | {"no_cpython_wrapper": True})
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Compile for a call from another kernel. Numba calls this method when it infers the types of that kernel.

@@ -17,7 +17,6 @@ from monitor.common.compiled import compiled
 Floats = NDArray[np.float64]
 
 CORNISH_FISHER_TERMS: Final = 10
-"""Number of terms in the Cornish-Fisher expansion of a χ² quantile."""
 MIN_ASYMPTOTIC_EDF: Final = 1000.0
 """Smallest number of degrees of freedom for which the expansion is exact to rounding."""
 MIN_EXPANDED_EDF: Final = 30.0
@@ -26,11 +25,9 @@ MIN_EXPANDED_EDF: Final = 30.0
 With fewer degrees of freedom, the iteration starts from the power law at zero or from Wilson and Hilferty's formula.
 """
 MAX_ITERATIONS: Final = 60
-"""Largest number of Halley or Newton iterations."""
 STEP_TOLERANCE: Final = 1e-7
 """Relative step at which a Halley or Newton iteration ends. The result is then exact to rounding."""
 FRACTION_TOLERANCE: Final = 1e-15
-"""Relative tolerance of the continued fraction."""
 MIN_ASYMPTOTIC_DF: Final = 1000
 """Smallest number of degrees of freedom for which four terms of the expansion of Student's quantile are exact to
 rounding.

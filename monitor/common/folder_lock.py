@@ -22,9 +22,7 @@ from typing import Final
 from drivers.file_access import FILE_KINDS, check_folder_or_absent
 
 RECORDING_LOCK: Final = "recording.lock"
-"""Name of the lock file for recordings."""
 HISTORY_LOCK: Final = "history.lock"
-"""Name of the lock file for the history."""
 LOCKS_UNSUPPORTED_ERRNOS: Final = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
 """Error numbers of ``flock`` on a file system without locks."""
 RETRY_S: Final = 0.05

@@ -17,14 +17,10 @@ Floats = NDArray[np.float64]
 FORWARD_DIFFERENCE_STEP: Final = 2.0**-26
 """Relative step of a forward difference: the square root of the rounding error."""
 WOLFE_DECREASE: Final = 1e-4
-"""Constant of the first Wolfe condition, the sufficient decrease."""
 WOLFE_CURVATURE: Final = 0.9
-"""Constant of the second Wolfe condition, the curvature."""
 MAX_BISECTIONS: Final = 40
-"""Largest number of steps of a line search."""
 MAX_ITERATIONS_PER_VARIABLE: Final = 200
 INVERSE_GOLDEN_RATIO: Final = (sqrt(5.0) - 1.0) / 2.0
-"""Inverse of the golden ratio."""
 
 
 def minimize_bfgs(

@@ -67,4 +67,3 @@ TOPICS: Final = (
     RESET,
     RECONCILE,
 )
-"""All topics."""

@@ -23,10 +23,8 @@ KIND_NAMES: Final = {"gyro": "Gyroscopes", "accel": "Accelerometers"}
 DEGREE: Final = 180.0 / math.pi  # degrees per radian
 ROOT_HOUR: Final = 60.0  # √s per √h
 MILLI_G: Final = 1e-3 * G0
-"""One thousandth of standard gravity [m/s²]."""
 MICRO_G: Final = 1e6 / G0  # µg per m/s²
 NO_VALUE: Final = "—"
-"""Text for a missing value in tables."""
 DURATION_UNITS: Final = ((DAY_S, "d"), (HOUR_S, "h"), (60, "min"), (1, "s"))
 """Units of durations [s], the largest first."""
 
@@ -80,7 +78,6 @@ DEVIATION_UNITS: Final[dict[Kind, Unit]] = {
 }
 """Customary unit of Allan deviations."""
 SAMPLE_UNITS: Final[dict[Kind, Unit]] = {"gyro": Unit(DEGREE, "°/s"), "accel": Unit(1.0, "m/s²")}
-"""Customary unit of samples."""
 
 COEFFICIENT_NAMES: Final[dict[Kind, dict[str, str]]] = {
     "gyro": {

@@ -37,7 +37,7 @@ GYROS, ACCELEROMETERS = AXES[:3], AXES[3:]
 
 @dataclass(slots=True)
 class SampleBlockContext:
-    """Block of samples that is being simulated."""
+    """Context of the block of samples that is being simulated."""
 
     first: int  # index of the first sample, counted from the start of the stream
     temperature_c: Floats  # [n] °C; NaN if the model has no temperature

@@ -24,9 +24,7 @@ T = TypeVar("T", bound=ParameterTable)
 WILDCARDS: Final = {"g*": AXES[:3], "a*": AXES[3:]}
 """Keys that stand for all axes of a kind."""
 AXIS_KEYS: Final = (*AXES, *WILDCARDS)
-"""Keys of a model file that name axes."""
 TOP_LEVEL_KEYS: Final = ("sample_rate", "temperature")
-"""Other keys of a model file."""
 
 AxisEffects = tuple[tuple[str, ...], tuple[Effect, ...]]
 """Names of axes, and the effects of each of these axes."""

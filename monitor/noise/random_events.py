@@ -12,7 +12,6 @@ import numpy as np
 from drivers.sample import Floats, Ints
 
 BATCH_SIZE: Final = 64
-"""Events that are drawn at once."""
 MAX_LISTED_EVENTS: Final = 1000
 """Largest number of events whose times are listed. Later events are only counted."""
 

@@ -27,7 +27,6 @@ Curve = Callable[[Floats], Floats]
 """Function of frequency (Hz) or averaging time (s)."""
 
 POINTS_PER_DECADE: Final = 400
-"""Points of the frequency grid per decade."""
 MIN_FREQUENCY_CYCLES: Final = 1e-5
 """Lower end of the frequency grid, times the longest τ. For a random walk, 3·10⁻⁵ of σ² lies below it."""
 MAX_SMOOTH_CYCLES: Final = 0.1

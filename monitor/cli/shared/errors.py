@@ -1,8 +1,9 @@
 """Messages and exit statuses for the errors that end a command."""
 
+import contextlib
 import os
 import signal
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from difflib import get_close_matches
 from typing import Any, Final
 
@@ -18,11 +19,18 @@ WRONG: Final = 2
 NO_ANSWER: Final = 3
 """Exit status if the data do not support an answer."""
 INTERRUPTED: Final = 128 + signal.SIGINT
-"""Exit status after Ctrl-C."""
 DEBUG: Final = "--debug"
-"""Option that prints tracebacks."""
 MAX_CAUSE_CHARACTERS: Final = 300
 """Maximum length of the text of an unexpected error. Libraries may write pages."""
+
+
+@contextlib.contextmanager
+def name_option(option: str) -> Iterator[None]:
+    """Put the name of an option in front of the message of a ConfigError."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{option}: {error}") from None
 
 
 def message_and_status(error: Exception) -> tuple[str, int]:

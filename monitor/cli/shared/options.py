@@ -19,6 +19,7 @@ from drivers.number_ranges import (
     Number,
     NumberRange,
 )
+from monitor.cli.shared.errors import name_option
 
 if TYPE_CHECKING:
     from monitor.drift.compensation.arma import Order
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from monitor.publishing.exporters import NoiseCoefficients
 
 MAX_AVERAGING_TIMES: Final = 1000
-"""Largest number of averaging times in a list."""
 
 
 def range_callback(quantity: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
@@ -39,10 +39,10 @@ def range_callback(quantity: NumberRange) -> Callable[[typer.CallbackParam, Numb
     """
 
     def check(option: typer.CallbackParam, value: Number | None) -> Number | None:
-        try:
-            return None if value is None else quantity.check(value)
-        except ConfigError as error:
-            raise ConfigError(f"{option.opts[0]}: {error}") from None
+        if value is not None:
+            with name_option(option.opts[0]):
+                quantity.check(value)
+        return value
 
     return check
 
@@ -125,10 +125,10 @@ def parse_averaging_times(text: str) -> "TauGrid":
         ) from None
     if len(listed) > MAX_AVERAGING_TIMES:
         raise ConfigError(f"--tau: {len(listed)} averaging times; at most {MAX_AVERAGING_TIMES} are possible")
-    try:
-        return tuple(AVERAGING_TIME_S.check(value) for value in listed)
-    except ConfigError as error:
-        raise ConfigError(f"--tau: {error}") from None
+    with name_option("--tau"):
+        for tau_s in listed:
+            AVERAGING_TIME_S.check(tau_s)
+    return listed
 
 
 @overload
@@ -154,10 +154,11 @@ def parse_duration(option: str, text: str | None) -> float | None:
     """
     from monitor.settings.loading import seconds
 
-    try:
-        return None if text is None else seconds(text)
-    except ConfigError as error:
-        raise ConfigError(f"{option}: {error}") from None
+    duration_s = None
+    if text is not None:
+        with name_option(option):
+            duration_s = seconds(text)
+    return duration_s
 
 
 def parse_arma_order(text: str | None) -> "Order | None":

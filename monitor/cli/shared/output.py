@@ -2,21 +2,19 @@
 
 import contextlib
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from drivers.errors import ConfigError
+from monitor.commands.progress import ProgressCallback, ignore_progress
 
 if TYPE_CHECKING:
     from monitor.estimation.analysis import Analysis
 
-ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 
-
-def check_output_folder(option: str, path: Path | None) -> None:
-    """Check that the folder of an output file exists, before the work begins.
+def check_output_file(option: str, path: Path | None, *suffixes: str) -> None:
+    """Check the name and the folder of an output file, before the work begins.
 
     Parameters
     ----------
@@ -24,13 +22,19 @@ def check_output_folder(option: str, path: Path | None) -> None:
         Name of the option, for the message.
     path : Path or None
         File to write.
+    *suffixes : str
+        Allowed suffixes. By default, all suffixes are allowed.
 
     Raises
     ------
     ConfigError
-        If the folder does not exist.
+        If the suffix is not allowed, or if the folder does not exist.
     """
-    if path is not None and path != Path("-") and not path.parent.is_dir():
+    if path is None:
+        return
+    if suffixes and path.suffix not in suffixes:
+        raise ConfigError(f"{option}: {path}: a name ending in {' or '.join(suffixes)} is needed")
+    if path != Path("-") and not path.parent.is_dir():
         raise ConfigError(f"{option}: {path}: cannot be written: there is no folder {path.parent}")
 
 
@@ -69,7 +73,7 @@ def show_progress() -> Iterator[ProgressCallback]:
 
     console = Console(stderr=True)
     if not (console.is_terminal and sys.stdout.isatty()):
-        yield lambda _what, _share: None
+        yield ignore_progress
         return
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("", total=None)

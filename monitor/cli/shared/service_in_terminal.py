@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
 
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
+from monitor.cli.shared.errors import name_option
 
 if TYPE_CHECKING:
     from collections.abc import MutableMapping
@@ -24,9 +25,7 @@ if TYPE_CHECKING:
     from monitor.settings.loading import Config
 
 STDOUT: Final = "standard output"
-"""Name of standard output in messages."""
 STDERR: Final = "standard error"
-"""Name of standard error in messages."""
 
 
 def run_service(config: "Config", seconds: float | None, viewer: str | None) -> None:
@@ -144,10 +143,8 @@ def run_fleet_viewer(
     from monitor.publishing.zenoh.subscriber import ZenohSubscriber
     from monitor.settings import loading
 
-    try:
+    with name_option("--viewer"):
         loading.check_viewer_mode(mode)
-    except ConfigError as error:
-        raise ConfigError(f"--viewer: {error}") from None
     keys = tuple(dict.fromkeys(full_device_key(device, keyexpr) for device in detail))
     arriving = ZenohSubscriber(keyexpr, connect, file, keys)
     rerun = RerunView(ViewerSettings(mode=mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
@@ -196,10 +193,8 @@ def _with_viewer(config: "Config", viewer: str | None) -> "Config":
 
     if viewer is None:
         return config
-    try:
+    with name_option("--viewer"):
         loading.check_viewer_mode(viewer)
-    except ConfigError as error:
-        raise ConfigError(f"--viewer: {error}") from None
     return dataclasses.replace(config, viewer=config.viewer.model_copy(update={"mode": viewer}))
 
 

@@ -36,7 +36,6 @@ ORDERS: Final[tuple[Order, ...]] = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1))
 MIN_VALUES: Final = 30
 """Smallest number of known values for an identification."""
 MAX_PARTIAL_AUTOCORRELATION: Final = 0.99999
-"""Largest absolute value of a partial autocorrelation."""
 MAX_COEFFICIENTS: Final = 3
 """Number of coefficients of the highest order. Only this order can have several maxima of the likelihood."""
 MIN_MAXIMA_DISTANCE: Final = 0.1

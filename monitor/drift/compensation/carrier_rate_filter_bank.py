@@ -26,7 +26,6 @@ from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled, inlined
 
 MAX_MEMORY_S: Final = 10.0
-"""Memory of the slowest filter in seconds."""
 RESIDUAL_MEMORY: Final = 64.0
 """Time constant of the exponential average of a residual, in samples."""
 GATE: Final = 5.0

@@ -15,7 +15,6 @@ from drivers.sample import Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 
 MINUTE_S: Final = 60.0
-"""One minute in seconds."""
 SPANS_S: Final = (60.0, 600.0, 3600.0)
 """Averaging periods in seconds for the mean rate, which is the mean error of the heading rate."""
 

@@ -279,25 +279,18 @@ class Compensator:
 
     def _record_interval(self, outcomes: Floats) -> None:
         """Record the result of one interval in the history."""
-        columns = outcomes[1:].reshape(GYROS, 6)
+        columns = outcomes[1:].reshape(GYROS, 6).T.copy()
         at = self._interval_count % HISTORY_INTERVALS
-        became = columns[:, OUTCOME]
+        became = columns[OUTCOME].astype(np.int64)
         self._means[became == sage_husa.STEPPED] = np.nan  # The older means belong to the bias before the step.
         used = (became == sage_husa.USED) | (became == sage_husa.STEPPED)
-        self._means[:, at] = np.where(used, columns[:, MEAN], np.nan)
-        self._scatter[:, at] = np.where(used, columns[:, SCATTER], np.nan)
+        self._means[:, at] = np.where(used, columns[MEAN], np.nan)
+        self._scatter[:, at] = np.where(used, columns[SCATTER], np.nan)
         self._interval_count += 1
         self._at_rest += used
-        self._finished_intervals.append(
-            DriftInterval(
-                int(outcomes[0] + 1) * self.interval_samples,
-                columns[:, MEAN].copy(),
-                columns[:, EXPECTED].copy(),
-                columns[:, INNOVATION_STD].copy(),
-                columns[:, OUTCOME].astype(np.int64),
-                columns[:, EXPECTED_ERROR].copy(),
-            )
-        )
+        end = int(outcomes[0] + 1) * self.interval_samples
+        mean, expected, innovation_std, _, expected_error, _ = columns
+        self._finished_intervals.append(DriftInterval(end, mean, expected, innovation_std, became, expected_error))
 
 
 def _initial_state(rate_hz: float, adapts: bool) -> CompensatorState:

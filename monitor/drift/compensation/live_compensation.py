@@ -19,7 +19,6 @@ from monitor.drift.compensation.sage_husa import STEPPED, USED
 from monitor.estimation.detection.signal_monitor import MAX_RATE_CHANGE
 
 EVENT_KIND: Final = "drift_unexplained"
-"""Kind of the events of this module."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,7 @@
 """Published methods that remove drift and noise from a finished recording, for comparison.
 
 All three methods learn from samples at rest and then treat the recording as one signal. None of them detects motion.
-``filter_emd_modes`` and ``shrink_wavelets`` need future samples. ``autoregressive_filter`` assumes that the whole
+The methods ``emd`` and ``wavelet`` need future samples. The method ``ar`` assumes that the whole
 signal has the spectrum of the noise at rest.
 """
 
@@ -18,20 +18,15 @@ from monitor.common.distributions import NORMAL_QUARTILE
 MAX_ORDER: Final = 8
 """Highest order of an autoregression."""
 MIN_REST_SAMPLES: Final = 100
-"""Smallest number of samples at rest."""
 PIECE, OVERLAP = 16_384, 4_096
 """Samples of one empirical mode decomposition, and of the cross-fade to the next one. A long signal is decomposed in
 pieces, because the required memory grows with the length."""
 MAX_NOISE_LAG: Final = 2
 """Lag in samples by which the autocorrelation of a noise mode has fallen below 1/e."""
 WAVELET: Final = "db4"
-"""Name of the wavelet in PyWavelets."""
 MAX_DOUBLINGS: Final = 60
-"""Largest number of iterations of the doubling algorithm."""
 MAX_LEVELS: Final = 8
-"""Highest number of levels of a wavelet decomposition."""
 MISSING_PACKAGES: Final = 'EMD-signal and PyWavelets are not installed: pip install "imu-monitor[denoise]"'
-"""Message for a missing optional package."""
 
 ReferenceMethod = Callable[[Floats, Floats], Floats]
 """Function that returns a rate [n] without noise. The arguments are the rate [n] and samples at rest [m], minus the
@@ -70,54 +65,18 @@ def apply_reference_method(x: Floats, learned: Floats, variant: ReferenceMethod)
     return np.where(there, out, np.nan)
 
 
-def autoregressive_filter(x: Floats, learned: Floats) -> Floats:
-    """Filter with an autoregressive model: Yule–Walker equations, order by BIC, Kalman filter.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n,)
-        Rate in rad/s without its mean at rest.
-    learned : ndarray, shape (m,)
-        Rate at rest in rad/s without its mean. The variance is the measurement noise of the filter.
-    """
+def _autoregressive_filter(x: Floats, learned: Floats) -> Floats:
+    """Filter with an autoregressive model: Yule–Walker equations, order by BIC, Kalman filter."""
     return _kalman_filtered(x, *_autoregression(learned), float(learned.var()))
 
 
-def filter_emd_modes(x: Floats, learned: Floats) -> Floats:
-    """Filter the noise modes of an empirical mode decomposition (Huang et al. 1998).
-
-    The modes whose autocorrelation falls within MAX_NOISE_LAG samples are filtered as in ``autoregressive_filter``.
-
-    Parameters
-    ----------
-    x : ndarray, shape (n,)
-        Rate in rad/s without its mean at rest.
-    learned : ndarray, shape (m,)
-        Not used.
-
-    Raises
-    ------
-    ConfigError
-        If EMD-signal is not installed.
-    """
+def _filter_emd_modes(x: Floats, _learned: Floats) -> Floats:
+    """Filter the modes of an empirical mode decomposition (Huang et al. 1998) that are noise, see ``_is_noise``."""
     return _process_pieces(x, _filter_noise_modes)
 
 
-def shrink_wavelets(x: Floats, learned: Floats) -> Floats:
-    """Shrink wavelet coefficients softly by the universal threshold (Donoho & Johnstone 1994).
-
-    Parameters
-    ----------
-    x : ndarray, shape (n,)
-        Rate in rad/s without its mean at rest.
-    learned : ndarray, shape (m,)
-        Rate at rest in rad/s without its mean. The noise of each level is estimated from this rate.
-
-    Raises
-    ------
-    ConfigError
-        If PyWavelets is not installed.
-    """
+def _shrink_wavelets(x: Floats, learned: Floats) -> Floats:
+    """Shrink wavelet coefficients softly by the universal threshold (Donoho & Johnstone 1994)."""
     try:
         import pywt
     except ImportError as error:
@@ -240,8 +199,7 @@ def _process_pieces(x: Floats, work: Callable[[Floats], Floats]) -> Floats:
 
 
 REFERENCE_METHODS: Final[dict[str, ReferenceMethod]] = {
-    "ar": autoregressive_filter,
-    "emd": filter_emd_modes,
-    "wavelet": shrink_wavelets,
+    "ar": _autoregressive_filter,
+    "emd": _filter_emd_modes,
+    "wavelet": _shrink_wavelets,
 }
-"""Methods by name."""

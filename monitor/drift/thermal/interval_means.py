@@ -5,12 +5,11 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.sample import Floats, Ints
 
 PARTS_PER_INTERVAL: Final = 8
 """Number of parts of an interval. The scatter of the parts determines the standard error of the mean."""
 MIN_KNOWN_SHARE: Final = 0.5
-"""Smallest share of known samples in an interval."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,10 +25,6 @@ class IntervalMeans:
     def known(self) -> np.ndarray:
         """True [n] where bias and temperature are both known."""
         return np.isfinite(self.bias) & np.isfinite(self.temperature_c)
-
-    def first_intervals(self, n: int) -> "IntervalMeans":
-        """Return the first n intervals."""
-        return IntervalMeans(self.interval_s, self.bias[:n], self.error[:n], self.temperature_c[:n])
 
 
 def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> IntervalMeans:
@@ -77,15 +72,24 @@ def _row_means(rows: Floats) -> tuple[Floats, Floats]:
     if size:
         shape = (count.size, PARTS_PER_INTERVAL, size)
         inside = known_samples[:, : PARTS_PER_INTERVAL * size].reshape(shape).sum(axis=2)
-        part = (
-            np.where(known_samples, rows - mean[:, None], 0.0)[:, : PARTS_PER_INTERVAL * size]
-            .reshape(shape)
-            .sum(axis=2)
-        )
-        with np.errstate(invalid="ignore", divide="ignore"):
-            differences = np.diff(part / inside, axis=1)
-            both = np.isfinite(differences)
-            square = np.where(both, differences, 0.0) ** 2
-            error = np.sqrt(0.5 * square.sum(axis=1) / both.sum(axis=1) / PARTS_PER_INTERVAL)
+        differences = np.where(known_samples, rows - mean[:, None], 0.0)[:, : PARTS_PER_INTERVAL * size]
+        error = standard_error(differences.reshape(shape).sum(axis=2).T, inside.T)
     mean[too_few], error[too_few] = np.nan, np.nan
     return mean, error
+
+
+def standard_error(sums: Floats, counts: Ints) -> Floats:
+    """Return the standard errors [n] of interval means, as described in ``compute_interval_means``.
+
+    Parameters
+    ----------
+    sums : ndarray, shape (PARTS_PER_INTERVAL, n)
+        Sum of the known samples of each part.
+    counts : ndarray, shape (PARTS_PER_INTERVAL, n)
+        Number of known samples of each part.
+    """
+    with np.errstate(invalid="ignore", divide="ignore"):
+        differences = np.diff(sums / counts, axis=0)
+        known = np.isfinite(differences)
+        square = np.where(known, differences, 0.0) ** 2
+        return np.asarray(np.sqrt(0.5 * square.sum(axis=0) / known.sum(axis=0) / PARTS_PER_INTERVAL))

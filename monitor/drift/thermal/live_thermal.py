@@ -23,7 +23,6 @@ from monitor.drift.thermal.running_interval_means import IntervalMean, RunningIn
 from monitor.estimation.detection.signal_monitor import MAX_RATE_CHANGE
 
 KIND: Final = "temperature_unexplained"
-"""Kind of the events of this module."""
 
 
 @dataclass(frozen=True, slots=True)

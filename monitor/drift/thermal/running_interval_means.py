@@ -12,12 +12,10 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import AXES, Floats
-from monitor.drift.thermal.interval_means import MIN_KNOWN_SHARE, PARTS_PER_INTERVAL
+from monitor.drift.thermal.interval_means import MIN_KNOWN_SHARE, PARTS_PER_INTERVAL, standard_error
 
 BUFFER_ROWS: Final = 1024
-"""Largest number of rows in the buffer."""
 TEMPERATURE_COLUMN: Final = len(AXES)
-"""Column of the temperature, after the columns of the axes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,13 +145,7 @@ class RunningIntervalMeans:
         too_few = count < max(MIN_KNOWN_SHARE * self._length, 1.0)
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = self._origin + self._sum.sum(axis=0) / count
-            differences = np.diff(
-                self._sum[:PARTS_PER_INTERVAL, :TEMPERATURE_COLUMN]
-                / self._count[:PARTS_PER_INTERVAL, :TEMPERATURE_COLUMN],
-                axis=0,
-            )
-            both = np.isfinite(differences)
-            square = np.where(both, differences, 0.0) ** 2
-            error = np.sqrt(0.5 * square.sum(axis=0) / both.sum(axis=0) / PARTS_PER_INTERVAL)
+        parts = np.s_[:PARTS_PER_INTERVAL, :TEMPERATURE_COLUMN]
+        error = standard_error(self._sum[parts], self._count[parts])
         mean[too_few], error[too_few[:TEMPERATURE_COLUMN]] = np.nan, np.nan
         return IntervalMean(mean[:TEMPERATURE_COLUMN], error, float(mean[TEMPERATURE_COLUMN]), self._end)

@@ -108,6 +108,12 @@ class _Regression:
     noise: tuple[float, float]  # ratio and correlation of the most likely noise model
 
 
+def temperature_noise_c(temperature_c: Floats) -> float:
+    """Return the standard deviation of the noise of temperatures [n] in °C, from their second differences."""
+    second = np.diff(temperature_c, 2)
+    return float(np.median(np.abs(second))) / 6.0**0.5 / 0.6745 if second.size else 0.0
+
+
 def heating_direction(temperature_c: Floats) -> Floats:
     """Return +1 where temperature was last rising and -1 where it was last falling. All values are 0 without any
     change.
@@ -124,8 +130,8 @@ def heating_direction(temperature_c: Floats) -> Floats:
     >>> heating_direction(np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0])).tolist()
     [1.0, 1.0, 1.0, -1.0, -1.0, -1.0]
     """
-    noise = float(np.median(np.abs(np.diff(temperature_c, 2)))) / 6.0**0.5 / 0.6745 if temperature_c.size > 2 else 0.0
-    threshold = max(MIN_REVERSAL_SHARE * float(np.ptp(temperature_c)), MIN_REVERSAL_SIGMAS * noise)
+    noise_c = temperature_noise_c(temperature_c)
+    threshold = max(MIN_REVERSAL_SHARE * float(np.ptp(temperature_c)), MIN_REVERSAL_SIGMAS * noise_c)
     direction = np.zeros(temperature_c.size)
     highest = lowest = 0
     now = 0.0
@@ -165,25 +171,20 @@ def find_dependence(means: IntervalMeans) -> TemperatureDependence | None:
     x, direction = _scaled(pooled)
     one_way = not _rose_and_fell(direction)
     curve = _polynomial(x, CURVE_ORDER)
-    regressors = {"cubic": [curve]}
+    candidates = [("cubic", curve)]
+    nuisance = np.zeros((x.size, 0))
     if not one_way:
-        regressors["cubic with hysteresis"] = [
-            np.hstack([curve, each]) for each in _hysteresis_regressors(x, direction).values()
-        ]
-    nuisance = np.zeros((x.size, 0)) if one_way else _linear_drift(x.size)
-    count = sum(len(each) for each in regressors.values())
+        loops = _hysteresis_regressors(x, direction).values()
+        candidates += [("cubic with hysteresis", np.hstack([curve, each])) for each in loops]
+        nuisance = _linear_drift(x.size)
     found: TemperatureDependence | None = None
-    for form, candidates in regressors.items():
-        for columns in candidates:
-            tested = _regression(y, nuisance, columns, known)
-            if tested is None:
-                continue
-            p_value = min(count * tested.p_value, 1.0)
-            if p_value >= SIGNIFICANCE:
-                continue
-            share = _validated_share(y, nuisance, columns, known, tested.noise)
-            if found is None or share > found.share + 0.01:  # a simpler form has precedence
-                found = TemperatureDependence(share, p_value, form, one_way, means.interval_s)
+    for form, columns in candidates:
+        tested = _regression(y, nuisance, columns, known)
+        if tested is None or (p_value := len(candidates) * tested.p_value) >= SIGNIFICANCE:
+            continue
+        share = _validated_share(y, nuisance, columns, known, tested.noise)
+        if found is None or share > found.share + 0.01:  # a simpler form has precedence
+            found = TemperatureDependence(share, p_value, form, one_way, means.interval_s)
     return found
 
 
@@ -205,19 +206,22 @@ def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
     if not _rose_and_fell(direction):
         return None
     curve, loops = _polynomial(x, HYSTERESIS_CURVE_ORDER), _hysteresis_regressors(x, direction)
-    drifting = np.hstack([_linear_drift(x.size), curve])
     # A single lag or play operator is also tested, because it leaves more degrees of freedom than all four together.
-    parts = [loops[name][:, [at]] for name in ("lag", "play") for at in range(loops[name].shape[1])]
-    tests = [_regression(pooled.bias, drifting, each, pooled.known) for each in (*loops.values(), *parts)]
-    p_values = [one.p_value for one in tests if one is not None]
+    candidates = [*loops.values(), *loops["lag"].T[:, :, None], *loops["play"].T[:, :, None]]
+
+    def regress(nuisance: Floats) -> list[_Regression]:
+        tested = (_regression(pooled.bias, nuisance, each, pooled.known) for each in candidates)
+        return [one for one in tested if one is not None]
+
+    tests = regress(np.hstack([_linear_drift(x.size), curve]))
     # Within one temperature cycle, a drift and hysteresis are nearly collinear, so the size comes from a fit without a
     # drift.
-    fits = [_regression(pooled.bias, curve, each, pooled.known) for each in (*loops.values(), *parts)]
-    best = max((one for one in fits if one is not None), key=lambda one: one.likelihood, default=None)
-    if not p_values or best is None:
+    fits = regress(curve)
+    if not tests or not fits:
         return None
+    best = max(fits, key=lambda one: one.likelihood)
     size = _loop_width(best.smooth, x[pooled.known], direction[pooled.known])
-    return Hysteresis(size, min(len(p_values) * min(p_values), 1.0))
+    return Hysteresis(size, min(len(tests) * min(one.p_value for one in tests), 1.0))
 
 
 def _pooled(means: IntervalMeans) -> IntervalMeans:

@@ -27,7 +27,6 @@ from monitor.estimation.analysis import Analysis, fit_other_samples
 from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 
 SLOW_LETTERS: Final = ("K", "R")
-"""Letters of the coefficients of slow variation."""
 
 
 @dataclass(frozen=True, slots=True)

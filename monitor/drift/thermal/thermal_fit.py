@@ -27,7 +27,7 @@ from drivers.errors import NotReady
 from drivers.number_ranges import HOUR_S
 from drivers.sample import Floats
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.temperature_dependence import find_hysteresis
+from monitor.drift.thermal.temperature_dependence import find_hysteresis, temperature_noise_c
 from monitor.drift.thermal.thermal_model import (
     ThermalModel,
     coefficient_covariance,
@@ -37,13 +37,10 @@ from monitor.drift.thermal.thermal_model import (
 from monitor.drift.thermal.thermal_response import ThermalModelForm, least_squares, regressors
 
 MIN_INTERVALS: Final = 12
-"""Smallest number of intervals for a fit."""
 MAX_POWER: Final = 5
-"""Highest order of a polynomial."""
 CUBIC: Final = 3
 """Highest order of a polynomial that needs no margin in AICc."""
 MAX_LAGS: Final = 3
-"""Highest order of a difference equation."""
 INTERVALS_PER_SQUARED_LAGS: Final = 8
 """Number of intervals, divided by k², that a model with k lags needs. With fewer intervals, the lags would follow a
 random walk of the bias."""
@@ -54,9 +51,7 @@ MIN_TIME_CONSTANT_INTERVALS: Final = 0.5
 MIN_TIME_CONSTANT_RATIO: Final = 2.0
 """Smallest ratio of two time constants. Closer time constants have large coefficients that cancel."""
 GRID_POINTS: Final = 20
-"""Number of time constants on the first grid."""
 PHI_VALUES: Final = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
-"""Values of φ to choose from."""
 FOLDS: Final = 6
 """Parts of the record that are each predicted from the others."""
 MAX_ERROR_RATIO: Final = 1.05
@@ -75,9 +70,7 @@ MIN_REVERSE_SHARE: Final = 0.1
 """Smallest share of the smaller direction in the total change of temperature, if temperature is said to rise and
 fall."""
 GOLDEN_STEPS: Final = 10
-"""Number of steps of the golden-section search."""
 GOLDEN_RATIO: Final = 0.6180339887498949
-"""Step of the golden-section search."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,14 +111,14 @@ def fit_thermal_model(means: IntervalMeans) -> ThermalFit:
     NotReady
         If there are too few intervals, or if temperature hardly changed.
     """
-    found = run_all_steps(fit_in_steps(means))
+    found = _run_all_steps(fit_in_steps(means))
     loop = find_hysteresis(means) if found.temperature_rose_and_fell else None
     if loop is None:
         return found
     return replace(found, hysteresis=loop.size if loop.hysteresis_is_significant else 0.0, hysteresis_p=loop.p_value)
 
 
-def run_all_steps(pieces: StepwiseWork[T]) -> T:
+def _run_all_steps(pieces: StepwiseWork[T]) -> T:
     """Run all steps and return the result."""
     try:
         while True:
@@ -207,12 +200,7 @@ def check_means_suffice(means: IntervalMeans) -> None:
         )
     known_temperature_c = means.temperature_c[means.known]
     swing = float(np.ptp(known_temperature_c))
-    noise = (
-        float(np.median(np.abs(np.diff(known_temperature_c, 2)))) / 6.0**0.5 / 0.6745
-        if known_temperature_c.size > 2
-        else 0.0
-    )
-    least = max(MIN_SWING_C, MIN_SWING_SIGMAS * noise)
+    least = max(MIN_SWING_C, MIN_SWING_SIGMAS * temperature_noise_c(known_temperature_c))
     if swing < least:
         raise NotReady(
             f"temperature hardly changed: by {swing:.2g} °C in {count * means.interval_s / HOUR_S:.3g} h; "

@@ -35,7 +35,6 @@ ROUND_INTERVALS_S: Final = (
     7200,
     14400,
 )
-"""Round lengths of an interval in seconds."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,7 +15,7 @@ import numpy as np
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import predict
 from tests.experiments.benchmarks.machine import console, table
-from tests.monitor.drift.made import hourly
+from tests.monitor.drift.made import first_intervals, hourly
 
 DAY = 24
 LAGS_H = (0.0, 1.0, 2.0, 4.0)
@@ -27,7 +27,7 @@ def cell(lag_h: float, noise: float, seeds: int) -> tuple[str, ...]:
     ratios, inside, names = [], [], Counter[str]()
     for seed in range(seeds):
         means = hourly(seed, lag_h, noise)
-        model = fit_thermal_model(means.first_intervals(DAY)).model
+        model = fit_thermal_model(first_intervals(means, DAY)).model
         multi = predict(model, means.temperature_c, began=True)
         one = predict(model, means.temperature_c, means.bias, began=True)
         cubic = np.polynomial.Polynomial.fit(means.temperature_c[:DAY], means.bias[:DAY], 3)(means.temperature_c)

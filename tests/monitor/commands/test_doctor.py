@@ -177,7 +177,7 @@ def test_a_bus_is_there_and_up_or_what_to_do_is_said(tmp_path: Path) -> None:
     interface("eth0", "1", "0x1003")
 
     def said(name: str) -> tuple[str, str]:
-        (found,) = doctor.check_can_interface("device a", "socketcan", name, tmp_path)
+        found = doctor.check_can_interface("device a", "socketcan", name, tmp_path)
         return found.mark, found.text
 
     assert said("can0") == ("well", "can0: is up")
@@ -188,7 +188,7 @@ def test_a_bus_is_there_and_up_or_what_to_do_is_said(tmp_path: Path) -> None:
 
 def test_a_package_that_the_interface_lacks_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "msgpack", None)  # as if it were not installed
-    (found,) = doctor.check_can_interface("device a", "udp_multicast", "239.74.163.2")
+    found = doctor.check_can_interface("device a", "udp_multicast", "239.74.163.2")
     assert (found.mark, found.text) == ("wrong", "CAN interface udp_multicast needs the package msgpack")
     assert found.do == 'pip install "imu-monitor[multicast]"'
 
@@ -217,7 +217,7 @@ def test_ports_that_are_taken_and_routers_that_do_not_answer_are_told(tmp_path: 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:99999", f"tcp/{'a' * 70}.example:1", "tcp/192.0.2.1:7447"])
 def test_an_address_that_cannot_be_listened_on_is_wrong(endpoint: str) -> None:
-    (found,) = doctor.check_port_free("zenoh", endpoint)
+    found = doctor.check_port_free("zenoh", endpoint)
     assert found.mark == "wrong"
     assert found.text.startswith(f"{endpoint}: cannot listen: ")
 
@@ -253,8 +253,7 @@ def test_a_rate_that_is_not_configured_leaves_the_disk_unjudged(tmp_path: Path) 
 def test_room_is_judged_by_days(tmp_path: Path) -> None:
     own = Storage(folder=tmp_path, keep_s=30 * 86400.0, disk_share=0.9)
     marks = [
-        check_disk_space(own, 1e9, 100_000_000_000, free)[0]
-        for free in (90_000_000_000, 25_000_000_000, 10_500_000_000)
+        check_disk_space(own, 1e9, 100_000_000_000, free) for free in (90_000_000_000, 25_000_000_000, 10_500_000_000)
     ]
     assert [one.mark for one in marks] == ["well", "doubt", "wrong"]
     assert "the oldest data will be deleted after about 15 days" in marks[1].text
@@ -331,7 +330,7 @@ def test_kernels_that_cannot_be_kept_are_told(tmp_path: Path) -> None:
 
 
 def test_the_clock_is_asked_and_an_answer_given() -> None:
-    (found,) = doctor.check_clock()
+    found = doctor.check_clock()
     assert found.mark in ("well", "doubt")
     assert bool(found.do) == ("not synchronised" in found.text)
 

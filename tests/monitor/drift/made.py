@@ -1,5 +1,7 @@
 """Biases that follow temperature, drawn apart from the room under test: heat flows minute by minute."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from drivers.sample import Floats
@@ -31,6 +33,10 @@ def late(temperature_c: Floats, lag_h: float) -> Floats:
         level = keep * level + (1.0 - keep) * now
         out[k] = level
     return out
+
+
+def first_intervals(means: IntervalMeans, n: int) -> IntervalMeans:
+    return replace(means, bias=means.bias[:n], error=means.error[:n], temperature_c=means.temperature_c[:n])
 
 
 def hourly(seed: int, lag_h: float, noise: float, hours: int = 72) -> IntervalMeans:

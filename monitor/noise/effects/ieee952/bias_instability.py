@@ -37,14 +37,11 @@ RESPONSE_CONSTANT: Final = 5.436556224293264
 
 FLICKER_AVAR: Final = float(2.0 * np.log(2.0) / np.pi)
 """Allan variance of continuous flicker noise with B = 1 (IEEE Std 952 eq. C.24)."""
-FLICKER_FLOOR: Final = float(FLICKER_AVAR**0.5)
-"""Allan deviation of continuous flicker noise divided by B, 0.664."""
 MAX_SAMPLED_FACTOR: Final = 128
 """Largest number of samples per cluster for which the sampled form of σ² is integrated. For larger clusters, the
 sampled form differs from the continuous form by less than 1e-4."""
 
 _MIDPOINT_COUNT: Final = 8192
-"""Points of the midpoint rule."""
 
 
 @dataclass(frozen=True, slots=True)

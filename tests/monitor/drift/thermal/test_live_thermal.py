@@ -87,7 +87,7 @@ def test_a_step_of_the_bias_is_an_event():
     assert event.since_ns == pytest.approx(AT_H * 3600e9, abs=INTERVAL_S * 1e9)
     assert event.t_ns - event.since_ns == pytest.approx(4 * INTERVAL_S * 1e9, rel=0.3)
     assert event.sigma > 5.0
-    assert event.text.startswith("gz is +0.01")
+    assert event.text.startswith("gz differs by +0.01")
     assert "4 of the last" in event.text
 
 

@@ -12,7 +12,7 @@ from monitor.drift.thermal.recursive_least_squares import RecursiveThermalFit
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import ThermalModel, predict
 from monitor.drift.thermal.thermal_response import ThermalModelForm
-from tests.monitor.drift.made import hourly
+from tests.monitor.drift.made import first_intervals, hourly
 
 
 def of(means: IntervalMeans, shape: ThermalModelForm, phi: float) -> ThermalModel:
@@ -33,7 +33,7 @@ def test_interval_by_interval_is_the_whole_at_once(shape, phi):
     bias[[30, 31, 45]] = np.nan
     means = replace(means, bias=bias)
     model = of(means, shape, phi)
-    one, whole = RecursiveThermalFit(model, means.first_intervals(20)), RecursiveThermalFit(model, means)
+    one, whole = RecursiveThermalFit(model, first_intervals(means, 20)), RecursiveThermalFit(model, means)
     for k in range(20, 72):
         one.update(float(means.temperature_c[k]), float(means.bias[k]))
     for name in ("coefficients", "initial_state", "sigma", "lowest_c", "highest_c"):
@@ -58,7 +58,7 @@ def test_it_begins_with_what_was_fitted(seed):
 def test_what_it_expects_is_what_the_model_predicts(to_c):
     """With Student's factor, as the scatter is known from 71 intervals less what was fitted."""
     means = hourly(4, 1, 0.05)
-    recursion = RecursiveThermalFit(replace(fit_thermal_model(means).model, phi=0.3), means.first_intervals(71))
+    recursion = RecursiveThermalFit(replace(fit_thermal_model(means).model, phi=0.3), first_intervals(means, 71))
     warmth = np.append(means.temperature_c[:71], to_c)
     measured = np.append(means.bias[:71], np.nan)
     wide = student.ppf(0.975, recursion.degrees_of_freedom) / Z95

@@ -11,7 +11,7 @@ from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import predict
 from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_study import compare_with_means
-from tests.monitor.drift.made import COEFFICIENT, hourly
+from tests.monitor.drift.made import COEFFICIENT, first_intervals, hourly
 
 DAY = 24  # h, to fit; two more to judge
 
@@ -19,7 +19,7 @@ DAY = 24  # h, to fit; two more to judge
 def errors(seed, lag_h, noise):
     """Multi-step error over that of a cubic on the two days that chose nothing; the share of means in the interval."""
     means = hourly(seed, lag_h, noise)
-    found = fit_thermal_model(means.first_intervals(DAY))
+    found = fit_thermal_model(first_intervals(means, DAY))
     model = predict(found.model, means.temperature_c, began=True)
     cubic = np.polynomial.Polynomial.fit(means.temperature_c[:DAY], means.bias[:DAY], 3)(means.temperature_c)
     apart, of_cubic = ((means.bias - one)[DAY:] for one in (model.bias, cubic))
@@ -43,7 +43,7 @@ def test_late_heat_is_followed(lag_h, noise, most):
     for seed in range(6):
         # one day is one cycle of the temperature, in which correlated noise explains the loop as well
         two_days, three_days = (
-            fit_thermal_model(hourly(seed, lag_h, noise).first_intervals(days * DAY)).hysteresis for days in (2, 3)
+            fit_thermal_model(first_intervals(hourly(seed, lag_h, noise), days * DAY)).hysteresis for days in (2, 3)
         )
         assert two_days > 0.0
         assert two_days == pytest.approx(three_days, rel=0.25)
@@ -64,7 +64,7 @@ def test_one_step_estimates_know_the_bias_before():
         means = hourly(seed, 2, 0.01)
         step = 0.04 * np.ptp(means.bias)
         moved = replace(means, bias=means.bias + step * np.random.default_rng(seed).standard_normal(72).cumsum())
-        model = fit_thermal_model(moved.first_intervals(48)).model
+        model = fit_thermal_model(first_intervals(moved, 48)).model
         one = predict(model, moved.temperature_c, moved.bias, began=True)
         ratios.append(np.std((moved.bias - one.bias)[48:]) / step)
         inside.append(np.mean(((one.lo < moved.bias) & (moved.bias < one.hi))[48:]))
@@ -146,7 +146,7 @@ def test_a_bias_that_temperature_does_not_move_is_a_constant():
 @pytest.mark.parametrize(
     ("means", "says"),
     [
-        (hourly(1, 1, 0.05).first_intervals(11), "11 intervals of 3600 s"),
+        (first_intervals(hourly(1, 1, 0.05), 11), "11 intervals of 3600 s"),
         (replace(hourly(1, 1, 0.05), temperature_c=np.full(72, 25.0)), "temperature hardly changed"),
         (
             replace(hourly(1, 1, 0.05), temperature_c=25.0 + 0.1 * np.random.default_rng(2).standard_normal(72)),
