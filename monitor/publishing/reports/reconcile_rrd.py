@@ -1,10 +1,10 @@
-"""Result of a reconciliation as a Rerun recording, ``reconcile.rrd``, with its own layout.
+"""Result of a reconciliation as a Rerun recording, ``reconcile.rrd``, with a separate layout.
 
 Each axis has a tab. On the left are the steps as text and the gap of each diagnostic relative to its threshold. On the
-right, each logarithmic diagnostic is drawn twice, with the first model and after the steps. The timeline ``step`` is
-the index of the model. Index 0 is the model that was given or fitted first, and the others are the models after each
-step. The right plot of a pair follows this timeline. Rerun has no logarithmic axes, so plots are drawn as lines by
-``allan_chart``. The stream is separate from that of the live view. Importing this module imports Rerun.
+right, each diagnostic with logarithmic axes is drawn twice: for the first model and for the model after the steps. The
+timeline ``step`` is the index of the model. Index 0 is the model that was given or fitted first, and each step adds an
+index. The right plot of a pair follows this timeline. Rerun has no logarithmic axes, so ``allan_chart`` converts plots
+to lines. The stream is separate from the stream of the live view. Importing this module imports Rerun.
 
 Entities: ``/<axis>/steps``, ``/<axis>/gap/<lens>``, ``/<axis>/<lens>/before``, ``/<axis>/<lens>/after``, ``/overview``.
 """
@@ -78,7 +78,7 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
 
 
 def blueprint(r: Reconciliation) -> rrb.Blueprint:
-    """Return the layout: a tab per axis, those that differ from the model first, and a tab for all axes."""
+    """Return the layout with one tab for each axis and one for all axes. Axes that differ from the model come first."""
     axes = sorted(_axes(r), key=lambda axis: r.axes[axis].verdict == "agrees")
     tabs: list[rrb.View | rrb.Container] = [_tab(r.axes[axis]) for axis in axes]
     tabs.append(rrb.TextDocumentView(origin="/overview", contents="$origin", name="All axes"))
@@ -135,12 +135,12 @@ def _axes(r: Reconciliation) -> list[str]:
 
 
 def _snapshots_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
-    """Return the diagnostics with the first model and after each step; the last one excludes withdrawn effects."""
+    """Return the diagnostics for the first model and after each step. Withdrawn effects are not in the last model."""
     return [result.start, *(step.look for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
 def _drawn_diagnostics(result: AxisResult) -> list[str]:
-    """Return the logarithmic diagnostics of an axis that are drawn."""
+    """Return the first diagnostics with logarithmic axes, which are drawn."""
     return [view.lens for view in result.start.views if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
 
@@ -169,7 +169,7 @@ def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
     """Return the view of one diagnostic, before or after the steps."""
     what = words.diagnostic_name(lens)
     what = what[0].upper() + what[1:]
-    names = {"before": f"{what}: beside the first model", "after": f"{what}: after the steps"}
+    names = {"before": f"{what}: first model", "after": f"{what}: after the steps"}
     return rrb.Spatial2DView(
         origin=f"/{result.axis}/{lens}/{when}",
         contents="$origin/**",
@@ -188,7 +188,7 @@ def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult)
 
 
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
-    """Log the gap of each diagnostic relative to its threshold, for the largest gaps, and the threshold, which is 1."""
+    """Log the largest gaps divided by their thresholds, and a line at 1 for the threshold."""
     snapshots = [
         {score.lens: words.gap_to_threshold_ratio(score) for score in snapshot.scores}
         for snapshot in _snapshots_by_step(result)
@@ -205,13 +205,13 @@ def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
 
 
 def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float]) -> None:
-    """Log values by step."""
+    """Log one value for each step."""
     steps = rr.TimeColumn(TIMELINE, sequence=range(len(values)))
     stream.send_columns(path, [steps], rr.Scalars.columns(scalars=np.array(values)))
 
 
 def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
-    """Log both plots of one diagnostic with the same scale."""
+    """Draw both plots of one diagnostic with the same scale."""
     axis = result.axis
     views = [
         next((view for view in snapshot.views if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
@@ -232,8 +232,8 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
 def _log_curves(
     stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str, static: bool
 ) -> None:
-    """Log the band, the measured curve and the expected curve."""
-    # A lower end of zero has no logarithm; it is drawn below the box.
+    """Draw the band, the measured curve and the expected curve."""
+    # A lower end of zero has no logarithm. It is drawn below the box.
     low, high = (scale.to_chart(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
     fill = rr.LineStrips2D(
         list(band_strokes(low, high)), colors=[BAND_COLOUR], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0
@@ -255,7 +255,7 @@ def _log_curves(
 
 
 def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, result: AxisResult, lens: str) -> None:
-    """Log a frame around each range in which this diagnostic found a gap."""
+    """Draw a frame around each range in which a diagnostic found a gap."""
     view = next(view for view in result.start.views if view.lens == lens)
     founds = [step.found for step in result.steps] + list(result.left_over)
     marks = [to_field_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
@@ -270,7 +270,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, resul
 
 
 def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str) -> None:
-    """Log frame, decade lines, labels and the key to the curves."""
+    """Draw the frame, the decade lines, the labels and the legend."""
     lines = grid_lines(scale)
     for name, strips, colour, order in (
         ("minor", lines.minor, colours.MINOR, -30.0),
@@ -296,7 +296,7 @@ def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Diagnos
 
 
 def _inside(at: Floats) -> Floats:
-    """Limit a curve to the box; outside values are drawn on its edge."""
+    """Limit a curve to the box. Values outside are drawn on the edge of the box."""
     return np.column_stack([at[:, 0], clip_to_box(at[:, 1])])
 
 

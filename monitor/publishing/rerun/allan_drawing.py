@@ -1,7 +1,7 @@
-"""Allan plots of the viewer: measured points with intervals, fitted curves, and the model in force.
+"""Allan plots of the viewer, with measured points, intervals, the fitted deviation and the noise model.
 
-The plot of an axis is a drawing. Its entity therefore also holds tau, deviation, lo and hi in SI, for programs that
-read the recording. Importing this module imports Rerun.
+Rerun draws a plot as lines and points in chart units. The entity of an axis therefore also contains tau, deviation, lo
+and hi in SI units, for programs that read the recording. Importing this module imports Rerun.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,7 +48,7 @@ class AllanPlot:
     def __init__(self, log: Log, path: str) -> None:
         self._log = log
         self._path = path
-        self._scales: dict[Kind, Scale] = {}  # scale of the grid that was drawn last
+        self._scales: dict[Kind, Scale] = {}  # scale of the newest grid
 
     def draw(self, estimate: Estimate, gap: ModelGap | None) -> None:
         """Draw the curves of an estimate.
@@ -58,7 +58,7 @@ class AllanPlot:
         estimate
             The estimate.
         gap
-            Comparison with the model in force, whose curves are dashed; None if there is no model.
+            Comparison with the noise model, which is drawn as dashed lines. None if there is no model.
         """
         for kind in KINDS:
             curves = [curve for axis in axes_of(kind) if (curve := _Curve.of(estimate, axis, gap)) is not None]
@@ -75,7 +75,7 @@ class AllanPlot:
                 self._draw_curve(scale, curve)
 
     def _draw_grid(self, kind: Kind, scale: Scale, axes: Sequence[str]) -> None:
-        """Log frame, decade lines and tick labels of a plot, and a legend above the right end of the box."""
+        """Draw frame, decade lines and tick labels of a plot, and a legend above the right end of the box."""
         path, lines = f"{self._path}/{kind}", grid_lines(scale)
         for name, strips, colour, order in (
             ("minor", lines.minor, colours.MINOR, -30.0),
@@ -94,7 +94,7 @@ class AllanPlot:
         self._log(f"{path}/legend", label_points([(x, -0.85, axis) for axis, x in ends]))
 
     def _draw_curve(self, scale: Scale, curve: "_Curve") -> None:
-        """Log band, fitted line, intervals and measured points of one axis, and the model in force as a dashed line."""
+        """Draw band, fitted line, intervals and measured points of one axis, and the noise model as a dashed line."""
         path, colour = f"{self._path}/{curve.axis}", colours.AXIS_COLOURS[curve.axis]
         low, high, fitted, model, deviation = (
             scale.to_chart(curve.tau, part) for part in (curve.lo, curve.hi, curve.fitted, curve.model, curve.deviation)
@@ -116,14 +116,14 @@ class AllanPlot:
     def _log_lines(
         self, path: str, strips: Sequence[Floats], line_colours: Sequence[Colour], radius: float, order: float
     ) -> None:
-        """Log lines, given their colours, radius in points and drawing order."""
+        """Log lines with the given colours, radius in points and drawing order."""
         radii = rr.Radius.ui_points(radius)
         self._log(path, rr.LineStrips2D(strips, colors=line_colours, radii=radii, draw_order=order))
 
 
 @dataclass(frozen=True)
 class _Curve:
-    """Allan curve of one axis at its measured points, in the unit of the field."""
+    """Deviations of one axis at its measured averaging times, in the unit of the plot."""
 
     axis: str
     tau: Floats
@@ -131,17 +131,17 @@ class _Curve:
     lo: Floats
     hi: Floats
     fitted: Floats
-    model: Floats  # deviation of the model in force; NaN if there is none
+    model: Floats  # deviation of the noise model; NaN without a model
     si: dict[str, Floats]
 
     @property
     def curves_for_height(self) -> tuple[Floats, ...]:
-        """Curves that determine the height of the plot; intervals may extend beyond it."""
+        """Curves that determine the range of the y axis. Intervals may extend beyond this range."""
         return self.deviation, self.fitted, self.model
 
     @classmethod
     def of(cls, estimate: Estimate, axis: str, gap: ModelGap | None) -> "_Curve | None":
-        """Return the curve of an axis; None if it has fewer than two points."""
+        """Return the deviations of an axis, or None if there are fewer than two points."""
         curve, i = estimate.curve, AXES.index(axis)
         rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)
         if int(rows.sum()) < 2:

@@ -1,8 +1,8 @@
 """Layout of the Rerun viewer: health, current noise, and changes.
 
-A single device fills the window. Several devices have an overview and one tab each. A second tab of a device shows
-its noise over time. Panels may add a tab of their own. The time panel follows the newest sample. This module defines
-only the layout and handles no data. Importing it imports Rerun.
+A single device fills the window. Several devices have an overview and one tab each. A second tab of a device shows its
+noise over time. Panels may add separate tabs. The time panel follows the newest sample. This module defines only the
+layout and handles no data. Importing it imports Rerun.
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ from monitor.publishing.rerun.views import RAW_SAMPLES_S, TIMELINE, temperature_
 NOW_COEFFICIENTS: Final = ("N", "B")
 DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")
 TYPICAL_TAU_COUNT: Final = 17
-"""Octaves of one hour at 100 Hz. A surface with another number of τ has a slightly different height."""
+"""Number of averaging times of one hour at 100 Hz. A heat map with another number has a slightly different height."""
 MAX_DEVICES_WITH_ACCEL: Final = 4
 """Largest number of devices for which the overview also shows accelerometers."""
 MAX_GRID_COLUMNS: Final = 4
@@ -38,7 +38,7 @@ def blueprint(devices: Sequence[DeviceInfo], fleet: bool = False) -> rrb.Bluepri
     devices
         The devices.
     fleet
-        True if there are many more devices; the overview is then a table of all devices.
+        True if the overview is a table of further devices.
     """
     pages, names = [_device(one) for one in devices], [one.name for one in devices]
     if fleet:
@@ -83,10 +83,10 @@ def _now(device: DeviceInfo) -> rrb.Container:
 
 
 def _dynamic(device: str) -> rrb.Container:
-    """Return the tab with the Allan surfaces of all axes and, below them, coefficients over time."""
+    """Return the tab with the heat maps of all axes and the coefficients over time."""
     columns = [
         rrb.Vertical(
-            *(_surface(device, axis) for axis in axes_of(kind)),
+            *(_heat_map(device, axis) for axis in axes_of(kind)),
             rrb.Horizontal(*(_coefficient(device, kind, symbol) for symbol in DYNAMIC_COEFFICIENTS)),
             row_shares=[3, 3, 3, 2.6],
         )
@@ -124,19 +124,19 @@ def _overview_texts() -> tuple[rrb.View, rrb.View]:
 
 
 def _event_log(origin: str) -> rrb.View:
-    """Return the view of events; the time of day is part of their text, as its column would be cut off."""
+    """Return the view of events. The time of day is part of the text, because the time column is too narrow."""
     hidden = TimelineColumn(timeline=TIMELINE, visible=False)
     columns = rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["LogLevel", "Body"])
     return rrb.TextLogView(origin=origin, name="Has it changed?", columns=columns)
 
 
-def _surface(device: str, axis: str) -> rrb.View:
-    """Return the view of the Allan surface of one axis."""
+def _heat_map(device: str, axis: str) -> rrb.View:
+    """Return the view of the heat map of one axis."""
     x, y = dynamic_heat_map.view_bounds(TYPICAL_TAU_COUNT)
     return rrb.Spatial2DView(
         origin=f"/{device}/dynamic/{axis}",
         contents="$origin/**",
-        name=f"{axis}: Allan deviation over time, against its median",
+        name=f"{axis}: Allan deviation over time, divided by its median",
         background=rrb.Background(color=colours.BACKGROUND),
         visual_bounds=rrb.VisualBounds2D(x_range=list(x), y_range=list(y)),
     )

@@ -1,8 +1,7 @@
-"""Points that the viewer draws for stored history: a few per bucket, including its extremes. The module does no I/O.
+"""Points that the viewer draws for stored history. The module does no I/O.
 
-Each bucket yields its last value with its interval, at the end of the bucket. An extreme outside this interval is more
-than chance explains and yields an additional point. The minimum is drawn at one third of the bucket, the maximum at
-two thirds.
+Each bucket has a point for its last value with the interval, at the end of the bucket. An extreme outside this interval
+has an additional point. A minimum is drawn after one third of the bucket, a maximum after two thirds.
 """
 
 from typing import Final
@@ -13,18 +12,20 @@ from drivers.sample import Floats
 from monitor.history.reading import ColumnStatistics, HistoryTable
 
 MAX_INTERVAL_RATIO: Final = 1.5
-"""Intervals whose ends differ from the value by more than this factor are not drawn: they would determine the scale."""
+"""Largest ratio between an end of an interval and the value. A wider interval would determine the scale."""
 
 
 def history_points(past: HistoryTable, course: ColumnStatistics, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
-    """Return Unix times [m] and value, lo and hi [m, 3]; a NaN row separates gaps and follows the last bucket.
+    """Return the Unix times [m] of the points, and their value, lo and hi [m, 3].
+
+    A row of NaN marks each gap and the end, so that the line is interrupted there.
 
     Parameters
     ----------
     past
         History that contains the p buckets.
     course
-        Number over the buckets.
+        Statistics of a number in each bucket.
     lo, hi
         Ends of the interval of each last value, shape [p]; NaN if there is none.
     """

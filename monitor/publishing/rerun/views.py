@@ -8,7 +8,7 @@ import rerun.blueprint as rrb
 
 TIMELINE: Final = "sample_time"
 RAW_SAMPLES_S: Final = 30.0
-"""Time range of raw samples in view, up to the cursor [s]."""
+"""Duration of the raw samples that a view shows [s]."""
 HALF_LABEL_SHARE: Final = 0.08
 """Width of half a tick label, as a share of the width of the plot."""
 
@@ -30,9 +30,9 @@ def time_series_view(
     name
         Title of the view.
     contents
-        Entities to show, without the sign of inclusion.
+        Entities to show.
     last_s
-        Time range before the cursor [s]; None shows everything from the beginning.
+        Time range before the cursor [s]. By default, the view begins with the first sample.
     legend
         True to show a legend.
     styles

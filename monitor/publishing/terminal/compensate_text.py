@@ -29,9 +29,10 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
     console
         Destination.
     """
+    learning, evaluated = (format_duration(one) for one in (result.learning_rest_s, result.evaluated_rest_s))
     console.print(
-        f"{result.recording}: {result.samples} samples at {result.rate_hz:g} Hz, {result.method}; judged on "
-        f"{format_duration(result.evaluated_rest_s)} at rest, after {format_duration(result.learning_rest_s)}",
+        f"{result.recording}: {result.samples} samples at {result.rate_hz:g} Hz, {result.method}; evaluated on "
+        f"{evaluated} at rest, after {learning} of learning",
         highlight=False,
     )
     rows = plain_table(
@@ -46,7 +47,7 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
         rows.add_row(axis, "—" if one.model is None else one.model.name, *(_format_pair(*pair) for pair in pairs))
     console.print(Padding(rows, (1, 0)))
     console.print(
-        "before → after, at rest; 1 min and more: rms of means over so long, by which heading would go wrong.",
+        "before → after, at rest; 1 min to 60 min: rms of the mean rate over this time, which is a heading drift",
         style="dim",
     )
     for axis, one in result.axes.items():
@@ -131,7 +132,7 @@ def _describe_exceptions(one: AxisCompensation, interval_s: float) -> str:
     """Describe the intervals that were left out and the steps of the bias."""
     parts = []
     if one.rejected_intervals:
-        parts.append(f"{one.rejected_intervals} intervals of {interval_s:g} s left out, as no drift explains them")
+        parts.append(f"{one.rejected_intervals} intervals of {interval_s:g} s left out, because no drift explains them")
     if one.steps:
         parts.append(f"{one.steps} step{'s' if one.steps > 1 else ''} of the bias")
     return "; ".join(parts)

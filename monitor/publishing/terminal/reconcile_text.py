@@ -1,9 +1,10 @@
-"""Result of a reconciliation as text for the terminal: summary, table of axes and steps, and unexplained remainder.
+"""Result of a reconciliation as text for the terminal: summary, table of axes and steps, and unexplained differences.
 
-Lines are rich text for any width; long lines wrap inside their column. Each result has a symbol and a word in
+Lines are rich text for any width, and long lines wrap inside their column. Each result has a symbol and a word in
 addition to its colour. Sentences and units come from ``reconcile_sentences``.
 
-For several recordings, the output is a table of axes and recordings, and a line for each common or single effect.
+For several recordings, the text is a table of axes and recordings, followed by a list of the effects that all
+recordings show and a list of the effects that only some recordings show.
 """
 
 from typing import Final
@@ -48,7 +49,7 @@ def print_report(r: Reconciliation, console: Console) -> None:
 
 
 def _axes_table(r: Reconciliation) -> RenderableType:
-    """Return a table with a row per axis, followed by its steps and its unexplained remainder."""
+    """Return a table with the result, the steps and the unexplained differences of each axis."""
     rows = plain_table("axis", "verdict")
     for head in ("gap", "conf."):
         rows.add_column(head, justify="right", no_wrap=True)
@@ -59,7 +60,7 @@ def _axes_table(r: Reconciliation) -> RenderableType:
 
 
 def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
-    """Add an axis to the table: its first line with the name of the axis, then its other lines."""
+    """Add the lines of an axis to the table. The first line has the name of the axis."""
     lines = [_step(r, result.axis, step) for step in result.steps]
     lines += [
         ("", "", Text(f"left over: {words.describe_gap(one, result.axis)}", style="yellow")) for one in result.left_over
@@ -81,7 +82,7 @@ def _step(r: Reconciliation, axis: str, step: ReconciliationStep) -> tuple[str, 
 
 
 def _verdict(verdict: str) -> Text:
-    """Return the symbol and word of a result in its colour."""
+    """Return the symbol and the word for a result, in the colour of the result."""
     sign, style = RESULT_STYLES[verdict]
     return Text(f"{sign} {words.RESULT_TEXTS[verdict]}", style=style)
 
@@ -139,7 +140,7 @@ def _lines(found: list[tuple[str, Text]]) -> Table:
 
 
 def _common(c: Comparison) -> list[tuple[str, Text]]:
-    """Return a line for each effect that all recordings show."""
+    """Return axis and text of each effect that all recordings show."""
     found = []
     for axis, one in c.axes.items():
         for seen in one.common:
@@ -152,7 +153,7 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
 
 
 def _single(c: Comparison) -> list[tuple[str, Text]]:
-    """Return the lines of effects that only some recordings show."""
+    """Return axis and text of each effect that only some recordings show."""
     return [line for axis, one in c.axes.items() for line in _single_on(c, axis, one)]
 
 

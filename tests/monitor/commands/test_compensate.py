@@ -31,7 +31,7 @@ def test_the_recording_comes_out_without_its_drift(tmp_path, capsys):
     plot, told = tmp_path / "a.png", tmp_path / "a.json"
     assert exit_status("compensate", recording, "--out", out, "--json", told, "--plot", plot) == 0
     text = capsys.readouterr().out
-    assert "adaptive; judged on" in text
+    assert "adaptive; evaluated on" in text
     assert "→" in text
     before, after = load_samples(recording), load_samples(out)
     assert after.axes == ("gx", "gz", "az")
