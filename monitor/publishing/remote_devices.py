@@ -10,6 +10,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from drivers.sample import AXES
@@ -40,6 +41,13 @@ FORGET_AFTER_S: Final = 600.0
 MAX_KEY_LENGTH: Final = 200
 MAX_EVENTS: Final = 5
 """Number of events that are kept."""
+DECODERS: Final[dict[topics.Topic, Callable[[bytes], Message]]] = {
+    topics.STATUS: StatusMessage.decode,
+    topics.EVENT: EventMessage.decode,
+    topics.COEFFICIENTS: partial(decode_message, CoefficientsMessage),
+    topics.GAP: partial(decode_message, GapMessage),
+}
+"""Decoder of each topic that tables of devices show."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +144,7 @@ class RemoteDevice:
             case CoefficientsMessage():
                 self.coefficients = DeviceCoefficients.from_message(message)
             case GapMessage():
-                self.disagreements = tuple(describe_disagreements(message))
+                self.disagreements = tuple(_describe_disagreements(message))
 
 
 class DeviceStates:
@@ -170,9 +178,9 @@ class DeviceStates:
         device, topic = split_key(key) or ("", topics.ALIVE)
         with self._lock:
             try:
-                message = _decode_for_table(topic, payload)
-                if message is None:
+                if topic not in DECODERS:
                     return None
+                message = DECODERS[topic](payload)
                 known = self._devices.get(device) or RemoteDevice(device, 0.0)
                 known.update(message)
             except ValueError:
@@ -257,18 +265,7 @@ def split_key(key: str) -> tuple[str, topics.Topic] | None:
     return None
 
 
-def _decode_for_table(topic: topics.Topic, payload: bytes) -> Message | None:
-    """Decode a message that tables of devices show. Return None for all other topics."""
-    if topic is topics.STATUS:
-        return StatusMessage.decode(payload)
-    if topic is topics.EVENT:
-        return EventMessage.decode(payload)
-    if topic is topics.COEFFICIENTS:
-        return decode_message(CoefficientsMessage, payload)
-    return decode_message(GapMessage, payload) if topic is topics.GAP else None
-
-
-def describe_disagreements(message: GapMessage) -> list[str]:
+def _describe_disagreements(message: GapMessage) -> list[str]:
     """Return a text for each axis that disagrees with its model."""
     found = [(axis, message.axes[axis]) for axis in AXES if axis in message.axes]
     return [

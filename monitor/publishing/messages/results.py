@@ -20,7 +20,7 @@ from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
-from monitor.noise.standard_terms import UNIT_SOURCES
+from monitor.noise.standard_terms import unit_allan_variances
 from monitor.publishing.messages.message import Count, Message, decode_message, remove_control_characters, shared_fields
 
 MAX_AVERAGING_TIMES: Final = 1000
@@ -217,27 +217,14 @@ class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.
         return cls(device=device, t=t, **known)
 
 
-class PredictedBias(msgspec.Struct, frozen=True):
-    """Predicted bias with its 95 % interval."""
-
-    bias: float | None
-    lo: float | None
-    hi: float | None
-
-    @classmethod
-    def of(cls, prediction: PredictionInterval | None) -> Self | None:
-        """Return the prediction; None if there is no model."""
-        return None if prediction is None else cls(prediction.bias, prediction.lo, prediction.hi)
-
-
 class AxisThermalValues(msgspec.Struct, frozen=True):
     """Mean bias of one axis in an interval, and its predictions. ``text`` states why a prediction is missing."""
 
     bias: float | None
     error: float | None
-    multi_step: PredictedBias | None
+    multi_step: PredictionInterval | None
     """Prediction from the temperature alone."""
-    one_step: PredictedBias | None
+    one_step: PredictionInterval | None
     """Prediction from the temperature and the preceding bias."""
     model: str | None
     slope: float | None
@@ -262,15 +249,7 @@ class ThermalMessage(
     def of(cls, device: str, t: float | None, samples: int, result: ThermalUpdate) -> Self:
         """Build the message from the result of the thermal model for an interval."""
         axes = {
-            axis: AxisThermalValues(
-                bias=one.bias,
-                error=one.error,
-                multi_step=PredictedBias.of(one.multi_step),
-                one_step=PredictedBias.of(one.one_step),
-                model=one.model or None,
-                slope=one.slope,
-                text=one.text,
-            )
+            axis: AxisThermalValues(**shared_fields(AxisThermalValues, one) | {"model": one.model or None})
             for axis, one in result.axes.items()
         }
         return cls(device=device, t=t, samples=samples, **shared_fields(cls, result) | {"axes": axes})
@@ -319,17 +298,12 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
     @classmethod
     def of(cls, device: str, t: float | None, samples: int, result: Event) -> Self:
         """Build the message from an event."""
-        return cls(
-            device=device,
-            t=t,
-            samples=samples,
-            kind=result.kind,
-            axis=result.axis,
-            what={name: dict(sides) for name, sides in result.values.items()},
-            since=None if t is None else event_start_s(t, result),
-            sigma=result.sigma,
-            text=mask_secrets(result.text),
-        )
+        changed = {
+            "what": {name: dict(sides) for name, sides in result.values.items()},
+            "since": None if t is None else event_start_s(t, result),
+            "text": mask_secrets(result.text),
+        }
+        return cls(device=device, t=t, samples=samples, **shared_fields(cls, result) | changed)
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
@@ -508,8 +482,7 @@ def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -
     coefficients
         Coefficients of all axes.
     """
-    unit_variances = np.column_stack([source.avar(tau_s, 1.0 / rate_hz) for source in UNIT_SOURCES])
-    total: Floats = unit_variances @ np.nan_to_num(coefficients.value) ** 2
+    total: Floats = unit_allan_variances(tau_s, 1.0 / rate_hz) @ np.nan_to_num(coefficients.value) ** 2
     total[:, np.isnan(coefficients.value).all(axis=0)] = np.nan
     return total
 

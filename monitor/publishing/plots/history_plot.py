@@ -30,7 +30,6 @@ PANEL_INCHES: Final = (7.4, 1.75)
 SPARE_INCHES: Final = 1.1  # height of title and time axis
 TITLE_PAD_POINTS: Final = 26.0  # space between the first panel and its title, for the labels of events
 EXTREMES_ALPHA: Final = 0.45
-MAX_INTERVAL_RATIO: Final = 1.5  # intervals whose ends differ from the value by more than this factor are not drawn
 NOT_RUNNING_COLOUR: Final = "#d9534f"
 EVENT_LABELS: Final = {
     "noise_changed": "noise",
@@ -112,8 +111,7 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
         ))  # fmt: skip
         if not np.isfinite(last).any():
             continue
-        near = (lo * MAX_INTERVAL_RATIO > last) & (hi < last * MAX_INTERVAL_RATIO)
-        style.draw_band(panel, t, np.where(near, lo, np.nan), np.where(near, hi, np.nan), colour)
+        style.draw_band(panel, t, *style.omit_wide_intervals(last, lo, hi), colour)
         style.draw_band(panel, t, low, high, colour, alpha=EXTREMES_ALPHA)
         panel.plot(t, last, color=colour, lw=1.1, label=axis)
         lows.append(np.nanmin(low))

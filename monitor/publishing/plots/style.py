@@ -69,6 +69,7 @@ RASTER_DPI: Final = 80  # resolution of heat maps and dense bands, which are ima
 FEW_DECADES_RATIO: Final = 60.0  # an axis with a smaller ratio of its ends has labels between the powers of ten
 MAX_LABELS: Final = 7  # largest number of powers of ten with a label
 LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
+MAX_INTERVAL_RATIO: Final = 1.5  # ratio between value and end of an interval above which the interval is not drawn
 SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 LABEL_BOX: Final[dict[str, Any]] = {
     "boxstyle": "square,pad=0.15",
@@ -257,6 +258,18 @@ def set_value_scale(panel: "Axes", low: float, high: float, margin: float) -> No
     else:
         space = margin * (high - low) + 0.02 * high
         panel.set_ylim(max(low - space, 0.0), high + space)
+
+
+def omit_wide_intervals(value: Floats, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
+    """Return the ends of intervals, with NaN for intervals that would determine the scale of a plot.
+
+    Parameters
+    ----------
+    value, lo, hi
+        Values and ends of their intervals, of one shape.
+    """
+    near = (lo * MAX_INTERVAL_RATIO > value) & (hi < value * MAX_INTERVAL_RATIO)
+    return np.where(near, lo, np.nan), np.where(near, hi, np.nan)
 
 
 def time_unit(duration_s: float) -> tuple[str, float]:

@@ -35,13 +35,13 @@ def describe_agreement(seen: MatchedEffect) -> str:
     """Return a text on whether the sizes of an effect agree between the recordings, with the p-value."""
     if seen.p is None:
         return "nothing to compare"
-    return f"sizes {'agree' if seen.consistent else 'differ'} ({format_p_value(seen.p)})"
+    return f"sizes {'agree' if seen.consistent else 'differ'} ({_format_p_value(seen.p)})"
 
 
-def format_p_value(p: float) -> str:
+def _format_p_value(p: float) -> str:
     """Format a p-value.
 
-    >>> format_p_value(0.413), format_p_value(2e-5)
+    >>> _format_p_value(0.413), _format_p_value(2e-5)
     ('p = 0.41', 'p < 0.001')
     """
     return "p < 0.001" if p < 0.001 else f"p = {format_number(p, 2)}"

@@ -50,7 +50,7 @@ def history_columns(past: HistoryTable) -> dict[str, Floats]:
         "width (s)": past.width_s.astype(np.float64),
     }
     for name in past.names:
-        course, unit = past.column(name), column_unit(name)
+        course, unit = past.column(name), _column_unit(name)
         columns[f"{name} ({unit})"] = course.last
         if name.endswith((".lo", ".hi", ".bound")):
             continue
@@ -63,10 +63,10 @@ def history_columns(past: HistoryTable) -> dict[str, Floats]:
     return columns
 
 
-def column_unit(name: str) -> str:
+def _column_unit(name: str) -> str:
     """Return the SI unit of a stored column in ASCII.
 
-    >>> column_unit("gz.N.lo"), column_unit("az.sigma.0.1"), column_unit("rate")
+    >>> _column_unit("gz.N.lo"), _column_unit("az.sigma.0.1"), _column_unit("rate")
     ('rad/sqrt(s)', 'm/s^2', 'Hz')
     """
     axis, _, rest = name.partition(".")

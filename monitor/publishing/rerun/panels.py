@@ -31,12 +31,13 @@ from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.history.reading import HistoryTable
 from monitor.publishing.plots import colours
 from monitor.publishing.plots.colours import Colour
+from monitor.publishing.plots.style import omit_wide_intervals
 from monitor.publishing.rerun import allan_drawing, dynamic_heat_map, past_points
 from monitor.publishing.rerun.allan_history import AllanHistory
 from monitor.publishing.rerun.decimation import average_buckets, decimate_extremes
 from monitor.publishing.rerun.panel_text import drift_text, health_text, noise_text, overview_text
 from monitor.publishing.rerun.viewer_settings import DeviceInfo
-from monitor.publishing.rerun.views import RAW_SAMPLES_S, temperature_view, time_series_view
+from monitor.publishing.rerun.views import RAW_SAMPLES_S, markdown, temperature_view, time_series_view
 
 if TYPE_CHECKING:
     from monitor.publishing.rerun.scene import Scene
@@ -48,9 +49,6 @@ MAX_INTERMEDIATE_POINTS: Final = 20
 be distinguished and would overload the viewer."""
 MAX_PAST_EVENTS: Final = 200
 """Largest number of stored events that are shown."""
-MAX_INTERVAL_RATIO: Final = 1.5
-"""Intervals whose ends differ from the value by more than this factor are not drawn, because they would determine the
-scale of the plot."""
 WARNING_EVENTS: Final = frozenset({
     "samples_lost",
     "noise_changed",
@@ -113,10 +111,25 @@ class Panel:
             self.entity_path(name), rr.SeriesLines(colors=line_colours, widths=widths, names=names), static=True
         )
 
+    def _style_samples(self, name: str, axes: Sequence[str]) -> None:
+        """Log the styles of the time series of samples."""
+        for axis in axes:
+            line = (f"{axis}, {SAMPLE_UNITS[sensor_kind(axis)].name}", colours.AXIS_COLOURS[axis], 1.0)
+            self._style_lines(f"{name}/{axis}", [line])
+
+    def _log_samples(self, name: str, axes: Sequence[str], results: "Sequence[SampleRows | CompensatedRows]") -> Floats:
+        """Log decimated time series of samples, and return the times of all samples."""
+        times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
+        for i, axis in enumerate(axes):
+            t, y = decimate_extremes(times, values[:, i])
+            factor = SAMPLE_UNITS[sensor_kind(axis)].factor
+            self.scene.log_scalars(self.entity_path(f"{name}/{axis}"), t, y * factor)
+        return times
+
     def _log_text(self, name: str, unix_s: float, text: str) -> None:
         """Log a Markdown text at a Unix time [s]."""
         self.scene.set_time(unix_s)
-        self.scene.log(self.entity_path(name), rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        self.scene.log(self.entity_path(name), markdown(text))
 
 
 class SamplesPanel(Panel):
@@ -124,17 +137,12 @@ class SamplesPanel(Panel):
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
-        for axis in AXES:
-            unit = SAMPLE_UNITS[sensor_kind(axis)].name
-            self._style_lines(f"samples/{axis}", [(f"{axis}, {unit}", colours.AXIS_COLOURS[axis], 1.0)])
+        self._style_samples("samples", AXES)
         self._style_lines("temperature", [("temperature, °C", colours.TEMPERATURE, 1.5)])
 
     def draw(self, unix_s: Floats, results: "Sequence[SampleRows]") -> None:
         """Draw the results."""
-        times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
-        for i, axis in enumerate(AXES):
-            t, y = decimate_extremes(times, values[:, i])
-            self.scene.log_scalars(self.entity_path(f"samples/{axis}"), t, y * SAMPLE_UNITS[sensor_kind(axis)].factor)
+        times = self._log_samples("samples", AXES, results)
         temperature_c = np.concatenate([one.temperature_c for one in results])
         self.scene.log_scalars(
             self.entity_path("temperature"), *average_buckets(times, temperature_c, TEMPERATURES_PER_S)
@@ -153,16 +161,11 @@ class CompensatedPanel(Panel):
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
-        for axis in axes_of("gyro"):
-            line = (f"{axis}, {SAMPLE_UNITS['gyro'].name}", colours.AXIS_COLOURS[axis], 1.0)
-            self._style_lines(f"compensated/{axis}", [line])
+        self._style_samples("compensated", axes_of("gyro"))
 
     def draw(self, unix_s: Floats, results: "Sequence[CompensatedRows]") -> None:
         """Draw the results."""
-        times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
-        for i, axis in enumerate(axes_of("gyro")):
-            t, y = decimate_extremes(times, values[:, i])
-            self.scene.log_scalars(self.entity_path(f"compensated/{axis}"), t, y * SAMPLE_UNITS["gyro"].factor)
+        self._log_samples("compensated", axes_of("gyro"), results)
 
 
 class DriftPanel(Panel):
@@ -411,7 +414,7 @@ class DeviceTablePanel(Panel):
             Table as Markdown.
         """
         self.scene.set_time(unix_s)
-        self.scene.log("overview", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        self.scene.log("overview", markdown(text))
 
 
 def _points_until(unix_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
@@ -420,8 +423,7 @@ def _points_until(unix_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
     Only the newest coefficients have intervals.
     """
     c, history = estimate.coefficients, estimate.history
-    near = (c.lo * MAX_INTERVAL_RATIO > c.value) & (c.hi < c.value * MAX_INTERVAL_RATIO)
-    newest = np.stack([c.value, np.where(near, c.lo, np.nan), np.where(near, c.hi, np.nan)], axis=-1)
+    newest = np.stack([c.value, *omit_wide_intervals(c.value, c.lo, c.hi)], axis=-1)
     newest[c.status != Status.ESTIMATED] = np.nan
     if history is None:
         return np.array([unix_s]), newest[None]

@@ -4,15 +4,11 @@ Each bucket has a point for its last value with the interval, at the end of the 
 has an additional point. A minimum is drawn after one third of the bucket, a maximum after two thirds.
 """
 
-from typing import Final
-
 import numpy as np
 
 from drivers.sample import Floats
 from monitor.history.reading import ColumnStatistics, HistoryTable
-
-MAX_INTERVAL_RATIO: Final = 1.5
-"""Largest ratio between an end of an interval and the value. A wider interval would determine the scale."""
+from monitor.publishing.plots.style import omit_wide_intervals
 
 
 def history_points(past: HistoryTable, course: ColumnStatistics, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
@@ -31,8 +27,7 @@ def history_points(past: HistoryTable, course: ColumnStatistics, lo: Floats, hi:
     """
     start_s, width_s = past.start_s.astype(np.float64), past.width_s.astype(np.float64)
     newest_s = start_s + width_s
-    near = (lo * MAX_INTERVAL_RATIO > course.last) & (hi < course.last * MAX_INTERVAL_RATIO)
-    lo, hi = np.where(near, lo, np.nan), np.where(near, hi, np.nan)
+    lo, hi = omit_wide_intervals(course.last, lo, hi)
     ends = [np.fmin(lo, course.last), np.fmax(hi, course.last)]
     parts = [_rows(newest_s, course.last, lo, hi, np.isfinite(course.last))]
     parts.append(_rows(start_s + width_s / 3.0, course.low, lo, hi, course.low < ends[0]))

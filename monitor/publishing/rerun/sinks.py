@@ -90,10 +90,6 @@ class ViewerProcess:
             self._process.wait(5.0)
         self._log.close()
 
-    def signal(self, number: int) -> None:
-        """Send a signal to the process."""
-        self._process.send_signal(number)
-
     def kill(self) -> None:
         """Kill the process. Any thread may call this method."""
         self._process.kill()
@@ -305,7 +301,7 @@ def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable
         raise ViewerError('no desktop here (DISPLAY and WAYLAND_DISPLAY are not set): use viewer mode "web"')
     child = ViewerProcess([
         *("--bind", LOOPBACK, "--port", str(port)),
-        *("--memory-limit", add_program_memory(settings.memory), "--server-memory-limit", "64MiB"),
+        *("--memory-limit", _add_program_memory(settings.memory), "--server-memory-limit", "64MiB"),
         *("--hide-welcome-screen", "--expect-data-soon"),
     ])  # fmt: skip
     _wait_for(port, child, given_up)
@@ -330,10 +326,10 @@ def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[]
     return output
 
 
-def add_program_memory(memory: str) -> str:
+def _add_program_memory(memory: str) -> str:
     """Return the memory limit of a viewer window: the limit for data plus PROGRAM_MIB. A percentage is not changed.
 
-    >>> add_program_memory("256MiB"), add_program_memory("1GiB"), add_program_memory("25%")
+    >>> _add_program_memory("256MiB"), _add_program_memory("1GiB"), _add_program_memory("25%")
     ('512MiB', '1280MiB', '25%')
     """
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(MiB|GiB)", memory.strip())
@@ -348,9 +344,7 @@ def server_url(port: int) -> str:
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
-def _connected(
-    port: int, recording_id: str, child: ViewerProcess | None = None, joined_port: int | None = None
-) -> Output:
+def _connected(port: int, recording_id: str, child: ViewerProcess | None = None) -> Output:
     """Return an output that is connected to a Rerun server."""
     stream = _stream(recording_id)
     stream.set_sinks(rr.GrpcSink(server_url(port)))

@@ -61,11 +61,11 @@ class RerunView:
         self,
         settings: ViewerSettings,
         devices: Sequence[DeviceInfo],
-        history_source: HistorySource | None = None,
+        history_source: HistorySource = lambda _device: None,
         fleet: bool = False,
     ) -> None:
         self._settings = settings
-        self._history_source = history_source or _no_history
+        self._history_source = history_source
         self._fleet = fleet
         self._devices = tuple(devices)
         self._backlog: BoundedQueue[tuple[str, float, Any]] = BoundedQueue(BACKLOG_BYTES)
@@ -75,7 +75,7 @@ class RerunView:
         self._stalled = False
         self._inside_since: float | None = None  # monotonic time at which the current Rerun call began [s]
         self._child: ViewerProcess | None = None
-        self._url = ""
+        self.url = ""  # address of the web page or of the Rerun server
         self._recording_id = str(uuid.uuid4())
 
     @property
@@ -86,11 +86,6 @@ class RerunView:
             return f"stalled ({self._backlog.dropped} dropped)"
         return self._phase
 
-    @property
-    def url(self) -> str:
-        """Address of the web page or of the Rerun server; "" if there is none."""
-        return self._url
-
     def start(self) -> None:
         """Start the thread. Errors are reported in ``state`` and the attempt is repeated."""
         if self._settings.mode == "none" or self._thread is not None:
@@ -100,13 +95,7 @@ class RerunView:
         self._thread.start()
 
     def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
-        """Set the devices to show. A device must be set before its first result is passed.
-
-        Parameters
-        ----------
-        devices
-            Devices to show in detail.
-        """
+        """Set the devices to show in detail. A device must be set before its first result is passed."""
         self._devices = tuple(devices)
 
     def put(self, device: str, unix_s: float, result: Any) -> None:
@@ -163,7 +152,7 @@ class RerunView:
         self, settings: ViewerSettings, started: float, attempt: int
     ) -> tuple[ViewerSettings, int]:
         """Wait before the next attempt. If a window does not work on this host, use the web page instead."""
-        self._stalled, self._inside_since, self._url = False, None, ""
+        self._stalled, self._inside_since, self.url = False, None, ""
         lived_s = time.monotonic() - started
         if self._closing.is_set():
             return settings, attempt
@@ -179,7 +168,7 @@ class RerunView:
         from monitor.publishing.rerun import sinks
 
         output = sinks.open_output(settings, self._recording_id, self._closing.is_set)
-        self._child, self._url = output.child, output.url
+        self._child, self.url = output.child, output.url
         try:
             scene = rerun_scene.Scene(output.stream, self._fleet)
             self._draw(output, scene)
@@ -191,7 +180,8 @@ class RerunView:
         """Send the layout for the devices and create their entities."""
         from monitor.publishing.rerun import blueprint
 
-        blueprint.send_layout(output.stream, devices, self._fleet)
+        layout = blueprint.blueprint(devices, self._fleet)
+        output.stream.send_blueprint(layout, make_active=True, make_default=True)
         scene.set_devices(devices)
         self._phase = f"ok, but {output.note}" if output.note else "ok"
 
@@ -241,11 +231,6 @@ class RerunView:
             if self._closing.is_set():
                 return
         self._stalled = False
-
-
-def _no_history(_device: str) -> HistoryTable | None:
-    """Return None: no history is stored."""
-    return None
 
 
 class _WaitingResults:

@@ -1,10 +1,12 @@
-"""Views of the Rerun viewer that several panels use. Importing this module imports Rerun."""
+"""Parts of a Rerun layout that several panels and reports use. Importing this module imports Rerun."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 import rerun as rr
 import rerun.blueprint as rrb
+
+from monitor.publishing.plots import colours
 
 TIMELINE: Final = "sample_time"
 RAW_SAMPLES_S: Final = 30.0
@@ -46,6 +48,46 @@ def time_series_view(
         overrides=styles,
         axis_x=_until_cursor() if last_s is None else _before_cursor(last_s),
     )
+
+
+def drawing_view(origin: str, name: str, contents: Any, x_range: Sequence[float], y_range: Sequence[float]) -> rrb.View:
+    """Return a view of a drawing in chart units.
+
+    Parameters
+    ----------
+    origin
+        Path of the entity.
+    name
+        Title of the view.
+    contents
+        Entities to show.
+    x_range, y_range
+        Limits of the view.
+    """
+    return rrb.Spatial2DView(
+        origin=origin,
+        contents=contents,
+        name=name,
+        background=rrb.Background(color=colours.BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=list(x_range), y_range=list(y_range)),
+    )
+
+
+def collapsed_blueprint(root: rrb.Container, timeline: str) -> rrb.Blueprint:
+    """Return a layout with collapsed panels around ``root``, which follows a timeline."""
+    return rrb.Blueprint(
+        root,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def markdown(text: str) -> rr.TextDocument:
+    """Return a Markdown document."""
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
 
 
 def temperature_view(device: str) -> rrb.TimeSeriesView:

@@ -131,10 +131,10 @@ def device_table(states: DeviceStates, now_s: float) -> RenderableType:
         Current time on the clock of the messages [s].
     """
     devices, events = states.devices(now_s), states.newest_events()
-    names = display_names([*(one.key for one in devices), *(key for key, _ in events)])
+    names = _display_names([*(one.key for one in devices), *(key for key, _ in events)])
     parts: list[RenderableType] = [_summary(states, devices, now_s)]
     if devices:
-        parts.append(FittedDeviceRows(devices, now_s))
+        parts.append(_FittedDeviceRows(devices, now_s))
     parts += _with_blank_line(_problem_lines(devices, now_s))
     if len(devices) == 1 and devices[0].coefficients is not None:
         parts += _with_blank_line(coefficient_tables(devices[0].coefficients))
@@ -142,7 +142,7 @@ def device_table(states: DeviceStates, now_s: float) -> RenderableType:
     return Group(*parts)
 
 
-class FittedDeviceRows:
+class _FittedDeviceRows:
     """Table of devices in the most detailed layout that fits the terminal."""
 
     def __init__(self, devices: list[RemoteDevice], now_s: float) -> None:
@@ -178,7 +178,7 @@ def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) 
     heads: list[str | Text] = ["Hz", "received", "lost", "bad", *(title for title, _ in columns), "p99 ms", "age"]
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
-    names = display_names([one.key for one in devices])
+    names = _display_names([one.key for one in devices])
     for i, one in enumerate(devices):
         cells = [Text(names[one.key], style="bold"), _state_cell(one.state(now_s)), *_count_cells(one, layout)]
         cells += [column[i] for _, column in columns]
@@ -186,7 +186,7 @@ def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) 
     return table
 
 
-def display_names(keys: Sequence[str]) -> dict[str, str]:
+def _display_names(keys: Sequence[str]) -> dict[str, str]:
     """Return the displayed name of each key: the last part if all keys share one prefix, else the whole key."""
     short = len({key.rpartition("/")[0] for key in keys}) == 1
     return {key: remove_control_characters(key.rpartition("/")[2] if short else key) for key in keys}
@@ -267,7 +267,7 @@ def _with_blank_line(lines: Sequence[RenderableType]) -> list[RenderableType]:
 
 def _problem_lines(devices: Sequence[RemoteDevice], now_s: float) -> list[Text]:
     """Return one line for each device with problems."""
-    names = display_names([one.key for one in devices])
+    names = _display_names([one.key for one in devices])
     lines = []
     for one in devices:
         if problems := one.problems():

@@ -131,17 +131,8 @@ class QueuedWriter:
         """Write all queued text and end the thread.
 
         If the destination is still blocked after the deadline, its descriptor is replaced with the null device, so that
-        the interpreter cannot block on it at exit.
-
-        Parameters
-        ----------
-        timeout_s : float
-            Seconds to wait for the reader.
-
-        Returns
-        -------
-        bool
-            False if the destination was still blocked at the deadline.
+        the interpreter cannot block on it at exit. Return False if the destination was still blocked after
+        ``timeout_s`` seconds.
         """
         self._begin_closing()
         if self._thread.is_alive() and not self._given_up:

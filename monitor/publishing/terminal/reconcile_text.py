@@ -18,9 +18,9 @@ from drivers.sample import AXES
 from monitor.common.units import format_duration
 from monitor.publishing.reports import comparison_sentences
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.publishing.terminal.tables import plain_table
+from monitor.publishing.terminal.tables import plain_table, print_notes
 from monitor.reconcile.result import AxisResult, Reconciliation, ReconciliationStep
-from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect
+from monitor.reconcile.several_recordings.comparison import Comparison, MatchedEffect
 
 RESULT_STYLES: Final = {
     "agrees": ("●", "green"),
@@ -44,8 +44,7 @@ def print_report(r: Reconciliation, console: Console) -> None:
     console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
     console.print(_verdict(r.verdict), Text(words.summarize(r)))
     console.print(_axes_table(r))
-    for note in r.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    print_notes(r.notes, console)
 
 
 def _axes_table(r: Reconciliation) -> RenderableType:
@@ -103,8 +102,7 @@ def print_comparison(c: Comparison, console: Console) -> None:
         if found:
             console.print(Text(title, style="bold"))
             console.print(Padding(_lines(found), (0, 0, 1, 2)))
-    for name, why in c.without_result.items():
-        console.print(f"note: {name} is left out: {why}", markup=False, highlight=False, soft_wrap=True)
+    print_notes([f"{name} is left out: {why}" for name, why in c.without_result.items()], console)
 
 
 def _axes_by_runs(c: Comparison) -> Table:
@@ -153,14 +151,9 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
 
 
 def _single(c: Comparison) -> list[tuple[str, Text]]:
-    """Return axis and text of each effect that only some recordings show."""
-    return [line for axis, one in c.axes.items() for line in _single_on(c, axis, one)]
-
-
-def _single_on(c: Comparison, axis: str, one: AxisRuns) -> list[tuple[str, Text]]:
-    """Return the lines of effects on one axis that only some recordings show, with reasons for their absence."""
+    """Return the effects that only some recordings show, with reasons for their absence in the others."""
     found = []
-    for seen in one.single:
+    for axis, seen in [(axis, seen) for axis, one in c.axes.items() for seen in one.single]:
         said = _effect(c, axis, seen)
         said.append(f"; in {', '.join(seen.steps)}")
         found.append((axis, said))

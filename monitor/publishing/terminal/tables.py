@@ -1,6 +1,7 @@
 """Helpers for tables in the terminal."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
@@ -28,6 +29,24 @@ def plain_table(*heads: str, wrapped: Sequence[str] = (), gap: int = 2, show_hea
     for head in wrapped:
         table.add_column(head)
     return table
+
+
+def print_notes(notes: Iterable[str], console: Console, refused: Any = ()) -> None:
+    """Print each note on a separate line.
+
+    Parameters
+    ----------
+    notes
+        The notes.
+    console
+        Destination.
+    refused
+        Reasons for missing results by axis, which are printed before the notes.
+    """
+    for axis, reason in dict(refused).items():
+        console.print(f"{axis}: {reason}", highlight=False, soft_wrap=True)
+    for note in notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 
 
 def table_width(table: Table, console: Console, options: ConsoleOptions) -> int:

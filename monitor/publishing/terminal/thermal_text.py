@@ -11,12 +11,11 @@ from monitor.common.units import DEVIATION_UNITS, format_duration, format_rate, 
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_share import SLOW_LETTERS, TemperatureShare
 from monitor.drift.thermal.thermal_fit import ThermalFit
-from monitor.drift.thermal.thermal_model import Prediction
 from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_study import ModelComparison, ThermalFitReport, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import encode_json
-from monitor.publishing.terminal.tables import plain_table
+from monitor.publishing.terminal.tables import plain_table, print_notes
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
@@ -48,7 +47,7 @@ def print_thermal_fit(study: ThermalFitReport, console: Console) -> None:
         )
     one_way = [axis for axis, one in study.fits.items() if not one.both_ways]
     notes = (*study.notes, *notes_on_hysteresis(study), *([ONE_WAY] if one_way else []))
-    _print_notes(study.refused, notes, console)
+    print_notes(notes, console, study.refused)
 
 
 def print_thermal_prediction(outlook: ThermalPredictionReport, console: Console) -> None:
@@ -70,7 +69,7 @@ def print_thermal_prediction(outlook: ThermalPredictionReport, console: Console)
             each = (one.rms_about_mean, one.rms, one.rms_without_offset, one.rms_one_step, one.offset)
             rows.add_row(axis, *(_format_deviation(axis, x) for x in each), f"{100.0 * one.coverage:.0f} %")
         console.print(Padding(rows, (1, 0)))
-    _print_notes(outlook.refused, outlook.notes, console)
+    print_notes(outlook.notes, console, outlook.refused)
 
 
 def temperature_notes(found: TemperatureShare) -> list[str]:
@@ -154,14 +153,9 @@ def _prediction_of_axis(means: IntervalMeans, one: ModelComparison) -> dict[str,
         "within": one.coverage,
         "temperature": means.temperature_c,
         "bias": means.bias,
-        "multi_step": _prediction(one.multi_step),
-        "one_step": _prediction(one.one_step),
+        "multi_step": one.multi_step,
+        "one_step": one.one_step,
     }
-
-
-def _prediction(one: Prediction) -> dict[str, Any]:
-    """Return a predicted bias with its interval."""
-    return {"bias": one.bias, "lo": one.lo, "hi": one.hi}
 
 
 def _json(
@@ -206,11 +200,3 @@ def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
 def _format_deviation(axis: str, si: float) -> str:
     """Format a rate or an acceleration in the unit of the axis."""
     return DEVIATION_UNITS[sensor_kind(axis)].text(si)
-
-
-def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:
-    """Print the reasons for axes without a model, and the notes."""
-    for axis, why in refused.items():
-        console.print(f"{axis}: {why}", highlight=False, soft_wrap=True)
-    for note in notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)

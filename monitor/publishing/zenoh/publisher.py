@@ -352,11 +352,6 @@ class _DuplicatePublishers:
 
     If two programs publish under one key, a subscriber receives a mixture of messages, and both programs execute a
     command.
-
-    Parameters
-    ----------
-    prefix
-        Prefix of the keys.
     """
 
     def __init__(self, prefix: str) -> None:
