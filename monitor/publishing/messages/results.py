@@ -86,8 +86,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
     axes: dict[str, AllanAxis]
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: Estimate) -> Self:
-        """Build the message from an estimate."""
+    def _convert(cls, _t: float | None, result: Estimate) -> dict[str, Any]:
         recent = result.display_curve
         axes = {
             axis: AllanAxis(
@@ -96,8 +95,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
             )
             for i, axis in measured_axes(result.curve)
         }
-        filled_s, shared = result.curve.n / result.rate_hz, shared_fields(cls, result)
-        return cls(device=device, t=t, filled_s=filled_s, tau_s=result.curve.tau_s, axes=axes, **shared)
+        return {"filled_s": result.curve.n / result.rate_hz, "tau_s": result.curve.tau_s, "axes": axes}
 
     def to_estimate(self, coefficients: Coefficients, k_or_r: frozenset[str]) -> Estimate:
         """Build an estimate. Its degrees of freedom and numbers of terms are unknown, because the message lacks them.
@@ -146,14 +144,12 @@ class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=to
     axes: dict[str, dict[str, CoefficientValue]]
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: Estimate) -> Self:
-        """Build the message from an estimate."""
+    def _convert(cls, _t: float | None, result: Estimate) -> dict[str, Any]:
         axes = {
             axis: coefficient_values(result.coefficients, i, bool(result.k_or_r[i]))
             for i, axis in measured_axes(result.curve)
         }
-        filled_s = result.curve.n / result.rate_hz
-        return cls(device=device, t=t, filled_s=filled_s, axes=axes, **shared_fields(cls, result))
+        return {"filled_s": result.curve.n / result.rate_hz, "axes": axes}
 
     def to_coefficients(self) -> Coefficients:
         """Return the coefficients of all axes.
@@ -205,16 +201,14 @@ class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.
     axes: dict[str, AxisGapValues]
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: ModelGap) -> Self:
-        """Build the message from a comparison with the model."""
+    def _convert(cls, _t: float | None, result: ModelGap) -> dict[str, Any]:
         axes = {
             axis: AxisGapValues(
                 agrees=result.agrees.get(axis), where=TauRange(one.tau_s), **shared_fields(AxisGapValues, one)
             )
             for axis, one in result.axes.items()
         }
-        known = shared_fields(cls, result) | {"filled_s": result.n / result.rate_hz, "axes": axes}
-        return cls(device=device, t=t, **known)
+        return {"filled_s": result.n / result.rate_hz, "axes": axes}
 
 
 class AxisThermalValues(msgspec.Struct, frozen=True):
@@ -246,13 +240,12 @@ class ThermalMessage(
     axes: dict[str, AxisThermalValues]
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: ThermalUpdate) -> Self:
-        """Build the message from the result of the thermal model for an interval."""
+    def _convert(cls, _t: float | None, result: ThermalUpdate) -> dict[str, Any]:
         axes = {
             axis: AxisThermalValues(**shared_fields(AxisThermalValues, one) | {"model": one.model or None})
             for axis, one in result.axes.items()
         }
-        return cls(device=device, t=t, samples=samples, **shared_fields(cls, result) | {"axes": axes})
+        return {"axes": axes}
 
 
 class DeviationTable(msgspec.Struct, frozen=True, eq=False):
@@ -276,10 +269,8 @@ class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()
     hadamard: DeviationTable
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: SlowStatistics) -> Self:
-        """Build the message from the total and Hadamard deviations."""
-        total, hadamard = DeviationTable.of(result.total), DeviationTable.of(result.hadamard)
-        return cls(device=device, t=t, samples=samples, total=total, hadamard=hadamard)
+    def _convert(cls, _t: float | None, result: SlowStatistics) -> dict[str, Any]:
+        return {"total": DeviationTable.of(result.total), "hadamard": DeviationTable.of(result.hadamard)}
 
 
 class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()):
@@ -296,14 +287,12 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
     text: str
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: Event) -> Self:
-        """Build the message from an event."""
-        changed = {
+    def _convert(cls, t: float | None, result: Event) -> dict[str, Any]:
+        return {
             "what": {name: dict(sides) for name, sides in result.values.items()},
             "since": None if t is None else event_start_s(t, result),
             "text": mask_secrets(result.text),
         }
-        return cls(device=device, t=t, samples=samples, **shared_fields(cls, result) | changed)
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
@@ -344,7 +333,7 @@ class StatusMessage(
     tag=topics.STATUS.schema(),
     rename={"rate_hz": "rate", "memory_bytes": "memory", "uptime_s": "uptime"},
 ):
-    """Message ``imu/<device>/status``; see ``Health`` for the meaning of the fields."""
+    """Message ``imu/<device>/status``. The fields have the meaning of the fields of ``Health``."""
 
     topic = topics.STATUS
     state: str
@@ -365,14 +354,13 @@ class StatusMessage(
     text: str = ""
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: Health) -> Self:
-        """Build the message from the health of a device."""
-        changed = {
+    def _convert(cls, _t: float | None, result: Health) -> dict[str, Any]:
+        return {
+            "samples": result.received,
             "latency": Latency(result.latency_p50_s, result.latency_p99_s),
             "outputs": {name: mask_secrets(state) for name, state in result.outputs.items()},
             "text": mask_secrets(result.text),
         }
-        return cls(device=device, t=t, samples=result.received, **shared_fields(cls, result) | changed)
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
@@ -403,9 +391,8 @@ class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
     text: str
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: str) -> Self:
-        """Build the message from the text."""
-        return cls(device=device, t=t, samples=samples, text=result)
+    def _convert(cls, _t: float | None, result: str) -> dict[str, Any]:
+        return {"text": result}
 
 
 class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):

@@ -156,7 +156,7 @@ def _draw_other(
     line = points | (other.tau_s == longest_s) if other.only_beyond else points
     y, colour = other.deviation[:, i] * factor, COLOURS[number]
     panel.plot(other.tau_s[line], y[line], line_style, color=colour, linewidth=0.9, alpha=0.8, zorder=2)
-    if other.only_beyond:  # at shorter τ, the markers would hide those of the Allan deviation
+    if other.only_beyond:  # at shorter τ, the markers would hide the Allan deviation
         ends = np.abs([y - other.lo[:, i] * factor, other.hi[:, i] * factor - y])[:, points]
         style = {"mfc": "white", "color": colour, "mew": 0.9, "markersize": 4.5, "elinewidth": 0.7}
         panel.errorbar(other.tau_s[points], y[points], ends, fmt=MARKERS[number], zorder=4, **style)  # type: ignore[arg-type]

@@ -175,7 +175,7 @@ def to_field_units(title: str, view: PlotData, axis: str, where: Location | None
     axis
         Name of the axis.
     where
-        Range to mark. It is omitted if it is not a range of the quantity on the x axis.
+        Range to mark. A range of another quantity than the x axis is omitted.
     """
     x_unit, y_unit = (
         field_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)))

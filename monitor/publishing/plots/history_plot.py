@@ -151,7 +151,7 @@ def _draw_losses(panel: "Axes", past: HistoryTable) -> None:
 
 
 def _draw_absence(panel: "Axes", text: str) -> None:
-    """Write into an empty panel the reason why it is empty."""
+    """Write the reason for missing data into an empty panel."""
     panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", color=style.GREY)
 
 

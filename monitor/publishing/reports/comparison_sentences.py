@@ -18,7 +18,7 @@ ABSENCE_TEXTS: Final = {
 
 
 def summarize(c: Comparison) -> str:
-    """Return a summary of the effects that all recordings show and of those that only some recordings show."""
+    """Return a summary of the effects in all recordings and of the effects in some recordings only."""
     model = "the model" if c.fitted_to is None else f"the five classic terms, fitted to {c.fitted_to}"
     compared = f"{len(c.runs)} recordings were compared with {model}."
     if c.verdict == "agrees":

@@ -11,7 +11,7 @@ from drivers.sample import AXES, Floats, Ints
 from monitor.estimation.estimate import Estimate
 
 COLUMNS = 300
-"""Largest number of columns; it must be even, because columns are merged in pairs."""
+"""Largest number of columns. The number must be even, because columns are merged in pairs."""
 INITIAL_COLUMN_S = 2.0
 """Initial duration of a column [s], in the time of the samples."""
 

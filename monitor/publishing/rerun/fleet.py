@@ -59,7 +59,7 @@ class FleetView:
     subscriber
         Subscriber, including the topics of devices shown in detail.
     viewer
-        Viewer whose devices are those shown in detail, named by their keys.
+        Viewer of the devices shown in detail, which are named by their keys.
     detail
         Keys of the devices shown in detail.
     """

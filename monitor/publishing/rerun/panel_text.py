@@ -131,7 +131,7 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
 
 
 def _escape_cell(text: str) -> str:
-    """Escape text of another process for a table cell, so that it cannot end the cell or form a link or an image."""
+    """Escape text of another process, so that the text cannot end a table cell or form a link or an image."""
     return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remove_control_characters(text))
 
 

@@ -71,7 +71,7 @@ class ViewerProcess:
         return self._process.pid
 
     def exit_reason(self) -> str | None:
-        """Return why the process has ended; None if it is running."""
+        """Return why the process has ended, or None if the process is running."""
         status = self._process.poll()
         return None if status is None else f"viewer ended ({status}): {self._last_log_line()}"
 
@@ -262,7 +262,7 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
 
 
 def _open_file(path: Path, recording_id: str) -> Output:
-    """Open a file and lock it."""
+    """Open and lock a file."""
     try:
         if path.exists():
             check_regular(path)  # opening a FIFO would block until a reader opens it

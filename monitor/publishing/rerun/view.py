@@ -144,7 +144,7 @@ class RerunView:
                 self._phase = str(trouble)
             except ImportError as missing:
                 self._phase = MISSING if missing.name in ("rerun", "rerun_cli", "rerun_bindings") else str(missing)
-            except Exception as error:  # noqa: BLE001 - a drawing error must not end the view; it is reported in state
+            except Exception as error:  # noqa: BLE001 - reported in state; a drawing error must not end the view
                 self._phase = f"{type(error).__name__}: {error}"
             settings, attempt = self._wait_and_select_mode(settings, started, attempt)
 
@@ -163,7 +163,7 @@ class RerunView:
         return settings, attempt
 
     def _show(self, settings: ViewerSettings) -> None:
-        """Open a viewer and draw until it ends."""
+        """Open a viewer and draw until the viewer ends."""
         from monitor.publishing.rerun import scene as rerun_scene
         from monitor.publishing.rerun import sinks
 

@@ -38,7 +38,7 @@ def time_series_view(
     legend
         True to show a legend.
     styles
-        Styles of entities that differ from those of other views, by path.
+        Styles for this view only, by path of the entity.
     """
     return rrb.TimeSeriesView(
         origin=origin,

@@ -50,7 +50,8 @@ class QueuedWriter:
     render : callable, optional
         Converts the queued lines to the text that is written. It runs in the thread. By default, lines are joined.
     period_s : float, optional
-        Interval in seconds at which ``render`` is called without queued lines. By default, it is called only for lines.
+        Interval in seconds at which ``render`` is called without queued lines. By default, ``render`` is called only
+        for lines.
     limit : int
         Number of queued characters above which the oldest entries are dropped. The newest entry is always kept.
     tell : callable, optional
@@ -122,7 +123,7 @@ class QueuedWriter:
         self._queue.wake()
 
     def finish(self, stop: threading.Event) -> None:
-        """Write all queued text. Wait until it is written or ``stop`` is set."""
+        """Write all queued text. Wait until the text is written or ``stop`` is set."""
         self._begin_closing()
         while self._thread.is_alive() and not stop.is_set():
             self._thread.join(0.1)
@@ -263,7 +264,7 @@ class QueuedLines(io.TextIOBase):
 
 
 def descriptor_of(stream: TextIO | None) -> int | None:
-    """Return the file descriptor of a stream, or None if it has none."""
+    """Return the file descriptor of a stream, or None for a stream without descriptor."""
     try:
         descriptor = -1 if stream is None else stream.fileno()
     except (OSError, ValueError):
@@ -290,7 +291,7 @@ def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
     descriptor : int or None
         File descriptor; None counts as writable.
     timeout_s : float
-        Longest time to wait until it is writable [s].
+        Longest time to wait until a write does not block [s].
     """
     if descriptor is None:
         return True

@@ -1,7 +1,6 @@
 """Helpers for tables in the terminal."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
@@ -31,20 +30,8 @@ def plain_table(*heads: str, wrapped: Sequence[str] = (), gap: int = 2, show_hea
     return table
 
 
-def print_notes(notes: Iterable[str], console: Console, refused: Any = ()) -> None:
-    """Print each note on a separate line.
-
-    Parameters
-    ----------
-    notes
-        The notes.
-    console
-        Destination.
-    refused
-        Reasons for missing results by axis, which are printed before the notes.
-    """
-    for axis, reason in dict(refused).items():
-        console.print(f"{axis}: {reason}", highlight=False, soft_wrap=True)
+def print_notes(notes: Iterable[str], console: Console) -> None:
+    """Print each note on a separate line."""
     for note in notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 

@@ -47,7 +47,7 @@ def print_thermal_fit(study: ThermalFitReport, console: Console) -> None:
         )
     one_way = [axis for axis, one in study.fits.items() if not one.both_ways]
     notes = (*study.notes, *notes_on_hysteresis(study), *([ONE_WAY] if one_way else []))
-    print_notes(notes, console, study.refused)
+    _print_notes(study.refused, notes, console)
 
 
 def print_thermal_prediction(outlook: ThermalPredictionReport, console: Console) -> None:
@@ -69,7 +69,7 @@ def print_thermal_prediction(outlook: ThermalPredictionReport, console: Console)
             each = (one.rms_about_mean, one.rms, one.rms_without_offset, one.rms_one_step, one.offset)
             rows.add_row(axis, *(_format_deviation(axis, x) for x in each), f"{100.0 * one.coverage:.0f} %")
         console.print(Padding(rows, (1, 0)))
-    print_notes(outlook.notes, console, outlook.refused)
+    _print_notes(outlook.refused, outlook.notes, console)
 
 
 def temperature_notes(found: TemperatureShare) -> list[str]:
@@ -200,3 +200,10 @@ def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
 def _format_deviation(axis: str, si: float) -> str:
     """Format a rate or an acceleration in the unit of the axis."""
     return DEVIATION_UNITS[sensor_kind(axis)].text(si)
+
+
+def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:
+    """Print the reasons for axes without a model, and the notes."""
+    for axis, reason in refused.items():
+        console.print(f"{axis}: {reason}", highlight=False, soft_wrap=True)
+    print_notes(notes, console)
