@@ -47,7 +47,7 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
         rows.add_row(axis, "—" if one.model is None else one.model.name, *(_format_pair(*pair) for pair in pairs))
     console.print(Padding(rows, (1, 0)))
     console.print(
-        "before → after, at rest; 1 min to 60 min: rms of the mean rate over this time, which is a heading drift",
+        "before → after, at rest; 1 min to 60 min: rms of the means over this time (drift rate of the heading)",
         style="dim",
     )
     for axis, one in result.axes.items():
