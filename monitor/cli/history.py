@@ -52,7 +52,7 @@ def history(
     """Print past coefficients, temperatures, lost samples and events, over periods from hours to years."""
     from rich.console import Console
 
-    from drivers.recordings.formats import format_for_path
+    from drivers.recordings.formats import find_format
     from drivers.sample import AXES
     from monitor.estimation.fit.coefficients import SYMBOLS
     from monitor.history.query import PARTS, HistoryQuery
@@ -66,7 +66,7 @@ def history(
     output.check_output_file("--json", json)
     output.check_output_file("--out", out)
     if out is not None:
-        format_for_path(out)
+        find_format(out)
     live = connect is not None or zenoh is not None
     if source is not None and live:
         raise ConfigError(f"{source}: give either a file or --connect, not both")

@@ -1,4 +1,4 @@
-"""Bounded queue between the service and a slow output: it never blocks, and drops and counts its oldest items."""
+"""Bounded queue between the service and a slow output. Adding an item never blocks. The oldest items are dropped."""
 
 import threading
 from collections import deque
@@ -8,7 +8,7 @@ T = TypeVar("T")
 
 
 class BoundedQueue(Generic[T]):
-    """Queue whose items have a total weight of at most ``limit`` (bytes); thread-safe.
+    """Thread-safe queue with a limit of the total weight of its items, such as their size in bytes.
 
     >>> backlog = BoundedQueue[str](limit=2)
     >>> for word in ("a", "b", "c"):
@@ -25,7 +25,7 @@ class BoundedQueue(Generic[T]):
         self.dropped = 0  # number of items dropped since creation
 
     def push(self, item: T, weight: int) -> None:
-        """Add an item and drop the oldest items beyond the limit; at least one item is kept. Return at once.
+        """Add an item, and drop and count the oldest items beyond the limit. At least one item is kept.
 
         Parameters
         ----------
@@ -43,7 +43,7 @@ class BoundedQueue(Generic[T]):
             self._ready.notify()
 
     def take(self, timeout_s: float) -> list[T]:
-        """Return and remove all items, oldest first; wait up to ``timeout_s`` seconds if there are none."""
+        """Return and remove all items, oldest first. If the queue is empty, wait up to ``timeout_s`` seconds."""
         with self._ready:
             if not self._items and timeout_s > 0:
                 self._ready.wait(timeout_s)
@@ -53,6 +53,6 @@ class BoundedQueue(Generic[T]):
             return items
 
     def wake(self) -> None:
-        """End a waiting ``take``."""
+        """End the wait of a call of ``take``."""
         with self._ready:
             self._ready.notify_all()

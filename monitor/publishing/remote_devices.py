@@ -1,6 +1,6 @@
 """State of all devices that daemons publish, from their messages.
 
-``watch``, ``view`` and the table of ``run`` show these states. The messages may come from any program on the network.
+``watch``, ``view`` and the table of ``run`` show these states. The messages may be sent by any program on the network.
 Malformed messages are counted, and the memory for devices and texts is limited. The module does no I/O.
 """
 
@@ -10,6 +10,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from drivers.sample import AXES
@@ -28,10 +29,10 @@ from monitor.publishing.messages.results import (
 NORMAL_OUTPUT_STATES: Final = ("ok", "off")
 """States of an output that are not shown."""
 GONE_TIMEOUT_S: Final = 1.5
-"""Age of the newest message [s] after which a device without liveliness token is gone. The status comes at 1 Hz, so a
-daemon that is killed is reported within two seconds."""
+"""Age of the newest message [s] above which a device without liveliness token is gone. The status is published at 1 Hz,
+so a killed daemon is reported within two seconds."""
 SILENCE_TIMEOUT_S: Final = 5.0
-"""Age of the newest message [s] after which a device is silent, if its token exists or was never seen."""
+"""Age of the newest message [s] above which a device with a liveliness token, or without known token, is silent."""
 MAX_NAMED_LIMITS: Final = 6
 """Largest number of exceeded limits that are listed by name."""
 MAX_DEVICES: Final = 20_000
@@ -39,7 +40,14 @@ MAX_DEVICES: Final = 20_000
 FORGET_AFTER_S: Final = 600.0
 MAX_KEY_LENGTH: Final = 200
 MAX_EVENTS: Final = 5
-"""Number of newest events that are kept."""
+"""Number of events that are kept."""
+DECODERS: Final[dict[topics.Topic, Callable[[bytes], Message]]] = {
+    topics.STATUS: StatusMessage.decode,
+    topics.EVENT: EventMessage.decode,
+    topics.COEFFICIENTS: partial(decode_message, CoefficientsMessage),
+    topics.GAP: partial(decode_message, GapMessage),
+}
+"""Decoder of each topic that tables of devices show."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,17 +82,17 @@ class DeviceCoefficients:
 
 @dataclass(slots=True)
 class RemoteDevice:
-    """State of a remote device. All times are of the receiver's monotonic clock."""
+    """State of a remote device. All times are measured with the monotonic clock of the receiver."""
 
     key: str  # key of the device, without the topic
     last_message_s: float  # time of the newest message of any topic
     status: StatusMessage | None = None
     coefficients: DeviceCoefficients | None = None
     disagreements: tuple[str, ...] = ()  # one text for each axis that disagrees with its model
-    token_exists: bool | None = None  # True if its liveliness token exists; None if unknown
+    token_exists: bool | None = None  # True if the liveliness token of the device exists; None if unknown
 
     def state(self, now_s: float) -> str:
-        """Return the state that the daemon reports, or gone, silent or present (no status received yet)."""
+        """Return the state that the daemon reports. Return gone, silent or present if there is no current status."""
         age_s = now_s - self.last_message_s
         ended = self.status is not None and self.status.state == "ended"
         if age_s > GONE_TIMEOUT_S and self.token_exists is False and not ended:
@@ -94,7 +102,7 @@ class RemoteDevice:
         return "present" if self.status is None else self.status.state
 
     def rank(self, now_s: float) -> int:
-        """Return the sort key, worst first: 0 no data, 1 a problem or not ready, 2 running, 3 ended."""
+        """Return the rank in tables: 0 no data, 1 a problem or not ready, 2 running, 3 ended."""
         state, status = self.state(now_s), self.status
         if state in ("lost", "gone", "silent"):
             return 0
@@ -107,17 +115,19 @@ class RemoteDevice:
         return 2 if outputs_work and not troubled else 1
 
     def problems(self) -> str:
-        """Return a description of all problems; empty if there are none."""
+        """Return a description of all problems, or "" if there are none."""
         if self.status is None:
             return ""
         found = [self.status.text] if self.status.text else []
         outputs = self.status.outputs.items()
         found += [f"{name}: {state}" for name, state in outputs if state not in NORMAL_OUTPUT_STATES]
         if self.status.overflowed:
-            found.append(f"{self.status.overflowed:,} samples overwritten before they were used: too slow here")
+            found.append(
+                f"{self.status.overflowed:,} samples overwritten before they were used: this computer is too slow"
+            )
         if crossed := self.status.crossed:
             more = f" and {len(crossed) - MAX_NAMED_LIMITS} more" if len(crossed) > MAX_NAMED_LIMITS else ""
-            found.append(f"beyond its limit: {', '.join(crossed[:MAX_NAMED_LIMITS])}{more}")
+            found.append(f"limits exceeded: {', '.join(crossed[:MAX_NAMED_LIMITS])}{more}")
         return "; ".join([*found, *self.disagreements])
 
     def update(self, message: Message) -> None:
@@ -134,7 +144,7 @@ class RemoteDevice:
             case CoefficientsMessage():
                 self.coefficients = DeviceCoefficients.from_message(message)
             case GapMessage():
-                self.disagreements = tuple(describe_disagreements(message))
+                self.disagreements = tuple(_describe_disagreements(message))
 
 
 class DeviceStates:
@@ -147,7 +157,7 @@ class DeviceStates:
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        self.note = ""  # note for the user, e.g. which endpoints cannot be reached
+        self.note = ""  # note for the user, such as a list of unreachable endpoints
         self.malformed = 0  # number of messages that could not be decoded
         self.ignored = 0  # number of messages of devices beyond MAX_DEVICES
         self._clock = clock
@@ -156,7 +166,7 @@ class DeviceStates:
         self._lock = threading.Lock()
 
     def process_message(self, key: str, payload: bytes) -> Message | None:
-        """Process a message, and return it; None if its topic is not shown in tables or if it is malformed.
+        """Process a message and return it. Return None if the topic is not shown in tables or the message is malformed.
 
         Parameters
         ----------
@@ -168,9 +178,9 @@ class DeviceStates:
         device, topic = split_key(key) or ("", topics.ALIVE)
         with self._lock:
             try:
-                message = _decode_for_table(topic, payload)
-                if message is None:
+                if topic not in DECODERS:
                     return None
+                message = DECODERS[topic](payload)
                 known = self._devices.get(device) or RemoteDevice(device, 0.0)
                 known.update(message)
             except ValueError:
@@ -202,7 +212,7 @@ class DeviceStates:
                 known.token_exists = exists
 
     def remove(self, key: str) -> None:
-        """Remove the state and the events of the device that ``key`` belongs to."""
+        """Remove the state and the events of the device to which a key belongs."""
         device, _ = split_key(key) or ("", None)
         with self._lock:
             self._devices.pop(device, None)
@@ -216,7 +226,7 @@ class DeviceStates:
         return sorted(found, key=lambda one: (one.rank(now_s), one.key))
 
     def coefficients(self, device: str) -> DeviceCoefficients | None:
-        """Return the newest coefficients of a device; None if there are none."""
+        """Return the newest coefficients of a device, or None if there are none."""
         with self._lock:
             known = self._devices.get(device)
         return None if known is None else known.coefficients
@@ -227,7 +237,7 @@ class DeviceStates:
             return list(self._events)
 
     def _add(self, device: RemoteDevice) -> bool:
-        """Add a device if it is new; return False if there are too many devices."""
+        """Add a device if it is new. Return False if there are too many devices."""
         if device.key in self._devices:
             return True
         full = len(self._devices) >= MAX_DEVICES
@@ -242,7 +252,7 @@ class DeviceStates:
 
 
 def split_key(key: str) -> tuple[str, topics.Topic] | None:
-    """Split a key into the key of the device and the topic; None if the topic is not in ``monitor.common.topics``.
+    """Split a key into the key of the device and the topic. Return None if the topic is unknown.
 
     >>> split_key("imu/bench-1/status")
     ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz', kept=1))
@@ -255,18 +265,7 @@ def split_key(key: str) -> tuple[str, topics.Topic] | None:
     return None
 
 
-def _decode_for_table(topic: topics.Topic, payload: bytes) -> Message | None:
-    """Decode a message that tables of devices show; None for all other topics."""
-    if topic is topics.STATUS:
-        return StatusMessage.decode(payload)
-    if topic is topics.EVENT:
-        return EventMessage.decode(payload)
-    if topic is topics.COEFFICIENTS:
-        return decode_message(CoefficientsMessage, payload)
-    return decode_message(GapMessage, payload) if topic is topics.GAP else None
-
-
-def describe_disagreements(message: GapMessage) -> list[str]:
+def _describe_disagreements(message: GapMessage) -> list[str]:
     """Return a text for each axis that disagrees with its model."""
     found = [(axis, message.axes[axis]) for axis in AXES if axis in message.axes]
     return [

@@ -1,7 +1,7 @@
 """Table of the kinds of results that leave the pipeline of a device.
 
-A row of ``RESULT_KINDS`` names the messages that are published and the panels of the viewer that draw the result. It
-also says how often the panels draw, and how results are merged while they wait for a slow viewer. A new kind of result
+A row of ``RESULT_KINDS`` lists the messages that are published and the viewer panels that draw the result. It also
+states how often the panels draw, and how results are merged while they wait for a slow viewer. A new kind of result
 needs a row here, a message in ``monitor.publishing.messages.results``, a panel in ``monitor.publishing.rerun.panels``
 and the code that produces the result. The module does no I/O and does not import Rerun.
 """
@@ -29,19 +29,19 @@ from monitor.publishing.messages.results import (
 )
 
 POINT_INTERVAL_S: Final = 1.0
-"""Interval between two points of a time series of estimates, in sample time."""
+"""Interval between two points of a time series of estimates, in the time of the samples."""
 SMALL_RESULT_BYTES: Final = 1000
 """Approximate size of a result without large arrays."""
 
 TimedResult = tuple[float, Any]
 """Unix time of a result [s], and the result."""
 Merge = Callable[[list[TimedResult], TimedResult], None]
-"""Function that adds a new result to the results that wait for a drawing."""
+"""Function that adds a new result to the results that wait to be drawn."""
 
 
 @dataclass(frozen=True, slots=True)
 class SampleRows:
-    """Samples of a batch."""
+    """Batch of samples."""
 
     unix_s: Floats  # [n]
     values: Floats  # [n, 6] rad/s and m/s²; NaN if not measured
@@ -50,7 +50,7 @@ class SampleRows:
 
 @dataclass(frozen=True, slots=True)
 class CompensatedRows:
-    """Angular rates of a batch without their drift."""
+    """Batch of angular rates without drift."""
 
     unix_s: Floats  # [n]
     values: Floats  # [n, 3] rad/s
@@ -58,7 +58,7 @@ class CompensatedRows:
 
 @dataclass(frozen=True, slots=True)
 class DeviceTableText:
-    """Table of all devices as Markdown. It belongs to no device, so the name of its device is empty."""
+    """Table of all devices as Markdown. It is passed on with an empty device name."""
 
     text: str
 
@@ -69,7 +69,7 @@ def keep_all(waiting: list[TimedResult], new: TimedResult) -> None:
     Parameters
     ----------
     waiting
-        Results that wait for a drawing. The list is changed.
+        Results that wait to be drawn. The list is changed.
     new
         The new result.
     """
@@ -82,9 +82,9 @@ def keep_newest(waiting: list[TimedResult], new: TimedResult) -> None:
 
 
 def keep_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
-    """Replace the previous result by the new one if it is too close to the result before it.
+    """Add the new result, and drop the previous result if it follows the result before it too closely.
 
-    The values that an estimate has for every sample are kept. The parameters are those of ``keep_all``.
+    The coefficients for each sample of a dropped estimate are kept. The parameters are those of ``keep_all``.
     """
     if len(waiting) > 1 and new[0] - waiting[-2][0] < POINT_INTERVAL_S:
         _, previous = waiting.pop()
@@ -97,7 +97,7 @@ def keep_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
 
 @dataclass(frozen=True, slots=True)
 class Drawing:
-    """Drawing of a kind of result in the viewer."""
+    """Rule for drawing one kind of result in one panel of the viewer."""
 
     panel: str
     """Class in ``monitor.publishing.rerun.panels``."""
@@ -105,7 +105,7 @@ class Drawing:
     period_s: float = 0.0
     """Shortest interval between two drawings of a device [s]."""
     shares_rate: bool = False
-    """True if the devices share a limited rate of drawings; the period of each device then grows with their number."""
+    """True if all devices share a limited drawing rate, so that the period grows with the number of devices."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +140,7 @@ RESULT_KINDS: Final = (
     ResultKind(DriftUpdate, drawings=(Drawing("DriftPanel"),)),
     ResultKind(SlowStatistics, (TotalMessage,)),
     ResultKind(
-        ModelGap,  # before the estimate, because the Allan plot also shows the curve of the model
+        ModelGap,  # before the estimate, because the Allan plot also shows the deviations of the model
         (GapMessage,),
         (Drawing("GapPanel", keep_spaced, period_s=1.0),),
         size_bytes=lambda one: 6 * 4 * int(one.tau_s.nbytes),
@@ -155,8 +155,7 @@ RESULT_KINDS: Final = (
         size_bytes=lambda one: 8 * int(one.curve.avar.nbytes),
     ),
 )
-"""All kinds of results, in the order in which the viewer draws them. Dynamic Allan deviations are drawn from the
-estimates, and the agreement with the model is a part of ``ModelGap``."""
+"""All kinds of results, in the order in which the viewer draws them."""
 _BY_TYPE: Final = {kind.result: kind for kind in RESULT_KINDS}
 
 

@@ -39,8 +39,8 @@ def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
     lines = [
         "% Noise of an IMU for imuSensor (Navigation Toolbox, or Sensor Fusion and Tracking Toolbox), R2023b or newer",
         *header_comments(noise, inflation, "%"),
-        "% single-sided: white noise of sigma = NoiseDensity*sqrt(rate) a sample, N of IEEE Std 952",
-        f"% fractalcoef({N_POLES}): 1/f noise down to about rate/{N_POLES}; more poles reach lower and take longer",
+        "% single-sided: white noise with sigma = NoiseDensity*sqrt(rate) per sample, N of IEEE Std 952",
+        f"% fractalcoef({N_POLES}): 1/f noise down to about rate/{N_POLES}; more poles extend the range",
     ]
     made = []
     kinds: tuple[tuple[Kind, str, str], ...] = (
@@ -73,7 +73,7 @@ def _property(noise: NoiseCoefficients, kind: Kind, letter: str, name: str, unit
         term = known.get(axis)
         values.append("0" if term is None or term.bound else number(term.value * inflation))
         if term is None:
-            said += f"; {axis} not known"
+            said += f"; {axis} unknown"
         elif term.bound:
             said += f"; {axis} only bounded, <= {term.value:.3g}"
     return f"    '{name}', [{' '.join(values)}], ... % {letter}, {unit}{said}"

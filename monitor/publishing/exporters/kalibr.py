@@ -24,7 +24,7 @@ from monitor.publishing.exporters.noise import (
 )
 
 INFLATION_COMMENT: Final = (
-    "# Kalibr's wiki, IMU Noise Model: a sensor at rest at one temperature shows too little; for the",
+    "# Kalibr's wiki, IMU Noise Model: a sensor at rest at constant temperature has less noise; for the",
     "# lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (--inflation 10)",
 )
 
@@ -51,7 +51,7 @@ def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/i
     if noise.sample_rate_hz is None:
         raise ConfigError("kalibr needs an update_rate, and the model has no sample_rate")
     lines = [
-        "# imu.yaml for Kalibr: continuous-time noise; one value for all axes of a kind, that of the worst axis",
+        "# imu.yaml for Kalibr: continuous-time noise; one value for each kind of sensor, from the worst axis",
         *header_comments(noise, inflation, "#"),
         *INFLATION_COMMENT,
         f"rostopic: {rostopic}",
@@ -76,6 +76,6 @@ def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[Te
     rank = {axis: (not term.bound, term.value) for axis, term in known.items()}
     axis = max(rank, key=lambda one: rank[one])
     listed = ", ".join(f"{one} {'<= ' if term.bound else ''}{term.value:.3g}" for one, term in known.items())
-    only = ", an UPPER BOUND: the data show no more" if known[axis].bound else ""
+    only = ", UPPER BOUND instead of a value" if known[axis].bound else ""
     alike = len(known) > 1 and len(set(rank.values())) == 1
     return known[axis], f"{'all axes alike' if alike else f'worst axis {axis}'}{only} ({listed})"

@@ -47,10 +47,10 @@ SERIES_BELOW: Final = 0.1
 """Value of dt/T below which differences of exponentials are computed from a power series."""
 
 HEADER_COMMENT: Final = (
-    "# Process noise of a Kalman filter. States of an axis: angle (velocity) error, bias that walks, and a first-order",
-    "# Gauss-Markov bias that stands for the bias instability B (peak of its Allan deviation on the floor 0.664 B):",
+    "# Process noise of a Kalman filter. States of an axis: angle (velocity) error, random-walk bias, first-order",
+    "# Gauss-Markov bias for the bias instability B (its Allan deviation has the peak value 0.664 B):",
     "#   angle' = bias_walk + bias_markov + w_white,  bias_walk' = w_walk,  bias_markov' = -bias_markov/T + w_markov",
-    "# psd: two-sided densities of the w; white noise of a sample has variance psd_white/dt",
+    "# psd: two-sided densities of w_white, w_walk and w_markov; the white noise of a sample has variance psd_white/dt",
     "# x[k+1] = F x[k] + w[k], cov(w) = Q: exact over dt",
 )
 
@@ -180,7 +180,7 @@ def _axis(
     ]
     sigma = _markov_sigma(B)
     if B and time_s is None:
-        lines.append("# B is left out: without N and K its correlation time must be given (--correlation-time S)")
+        lines.append("# B is omitted: without N and K, the correlation time must be given (--correlation-time S)")
     elif B and time_s is not None:
         states.append("bias_markov")
         densities += [
@@ -204,8 +204,8 @@ def _remarks(terms: Mapping[str, Term]) -> list[str]:
     """Return comments on the unknown coefficients and upper bounds of one axis."""
     unknown = [letter for letter in "NBK" if letter not in terms]
     bounds = [letter for letter in "NBK" if letter in terms and terms[letter].bound]
-    lines = [f"# not known, counted as 0: {', '.join(unknown)}"] if unknown else []
-    return lines + ([f"# an UPPER BOUND, the data show no more: {', '.join(bounds)}"] if bounds else [])
+    lines = [f"# unknown, set to 0: {', '.join(unknown)}"] if unknown else []
+    return lines + ([f"# UPPER BOUND instead of a value: {', '.join(bounds)}"] if bounds else [])
 
 
 def _matrix(rows: Floats) -> str:

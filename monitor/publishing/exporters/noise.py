@@ -207,7 +207,7 @@ def header_comments(noise: NoiseCoefficients, inflation: float, mark: str) -> li
         Comment mark of the format.
     """
     source = noise.source.encode("ascii", "replace").decode()
-    done = "none" if inflation == 1.0 else f"N, B and K are {inflation:g} times those of the source"
+    done = "none" if inflation == 1.0 else f"N, B and K are {inflation:g} times the values of the source"
     return [
         f"{mark} source: {source}",
         f"{mark} inflation: {done}",

@@ -15,7 +15,6 @@ from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.analysis import Analysis
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.publishing.messages.message import encode_json, shared_fields
 from monitor.publishing.messages.results import (
@@ -92,11 +91,6 @@ class MotionValues(msgspec.Struct, frozen=True):
     seconds: float
     peak: float
     text: str
-
-    @classmethod
-    def of(cls, motion: Motion, rate_hz: float) -> Self:
-        """Return the values of a motion."""
-        return cls(motion.kind, motion.axis, motion.since / rate_hz, motion.seconds, motion.peak, motion.text)
 
 
 class ChangeValues(msgspec.Struct, frozen=True):
@@ -215,7 +209,10 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
             seconds=result.seconds,
             notes=result.notes,
             axes=axes,
-            motions=[MotionValues.of(motion, estimate.rate_hz) for motion in result.motions],
+            motions=[
+                MotionValues(t=one.since / estimate.rate_hz, **shared_fields(MotionValues, one))
+                for one in result.motions
+            ],
             changes=[ChangeValues.of(change, estimate.rate_hz) for change in result.changes],
             dynamic=UNSET
             if dynamic is None

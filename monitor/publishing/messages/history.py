@@ -43,9 +43,9 @@ class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         """Return the history of a stored column."""
         return cls(value=_nine_digits(column.last), low=_nine_digits(column.low), high=_nine_digits(column.high))
 
-    def to_column(self, buckets: int) -> ColumnStatistics:
-        """Return the stored column."""
-        low, high, last = (_checked(one, (buckets,)) for one in (self.low, self.high, self.value))
+    def to_column(self, *shape: int) -> ColumnStatistics:
+        """Return the stored column, or several columns for an array of shape [buckets, columns]."""
+        low, high, last = (_checked(one, shape) for one in (self.low, self.high, self.value))
         return ColumnStatistics((~np.isnan(last)).astype(np.int64), low, high, last)
 
 
@@ -111,22 +111,21 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         for axis in axes:
             columns = [past.column(f"{axis}.sigma.{tau}") for tau in taus]
             if any(one.n.any() for one in columns):
-                last, low, high = (
-                    np.column_stack([_nine_digits(getattr(one, part)) for one in columns])
-                    for part in ("last", "low", "high")
+                n, low, high, last = (
+                    np.column_stack([getattr(one, part) for one in columns]) for part in ("n", "low", "high", "last")
                 )
-                found[axis] = NumberHistory(value=last, low=low, high=high)
+                found[axis] = NumberHistory.from_column(ColumnStatistics(n, low, high, last))
         return cls(tau=[float(tau) for tau in taus], axes=found)
 
     def deviation_columns(self, buckets: int) -> dict[str, ColumnStatistics]:
         """Return the stored columns of all axes."""
-        columns, shape = {}, (buckets, len(self.tau))
+        columns = {}
         for axis in (axis for axis in self.axes if axis in AXES):
-            one = self.axes[axis]
-            value, low, high = (_checked(part, shape) for part in (one.value, one.low, one.high))
+            one = self.axes[axis].to_column(buckets, len(self.tau))
             for i, tau in enumerate(self.tau):
-                there = np.isfinite(value[:, i]).astype(np.int64)
-                columns[f"{axis}.sigma.{tau:g}"] = ColumnStatistics(there, low[:, i], high[:, i], value[:, i])
+                columns[f"{axis}.sigma.{tau:g}"] = ColumnStatistics(
+                    one.n[:, i], one.low[:, i], one.high[:, i], one.last[:, i]
+                )
         return columns
 
 
@@ -318,7 +317,7 @@ def _column_without_extremes(last: Floats) -> ColumnStatistics:
 
 def _nine_digits(column: Floats) -> Floats:
     """Return values rounded to nine digits, which identify every float32."""
-    return np.array([float(f"{one:.9g}") for one in column.tolist()])
+    return np.array([float(f"{one:.9g}") for one in column.ravel().tolist()]).reshape(column.shape)
 
 
 def _checked(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:

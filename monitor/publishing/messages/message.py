@@ -49,6 +49,12 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="sc
         result
             Result of the daemon.
         """
+        head = {"device": device, "t": t, "samples": samples}
+        return cls(**head | shared_fields(cls, result) | cls._convert(t, result))
+
+    @classmethod
+    def _convert(cls, _t: float | None, _result: Any) -> dict[str, Any]:
+        """Return the fields that are not equal to an attribute of the result with the same name."""
         raise NotImplementedError
 
     def encode(self) -> bytes:
@@ -93,7 +99,7 @@ def encode_json(value: Any) -> bytes:
 
 
 def shared_fields(kind: type[msgspec.Struct], source: object) -> dict[str, Any]:
-    """Return those attributes of an object that a struct has as fields.
+    """Return the attributes of an object for which a struct has a field of the same name.
 
     Parameters
     ----------

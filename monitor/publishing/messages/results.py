@@ -20,7 +20,7 @@ from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
-from monitor.noise.standard_terms import UNIT_SOURCES
+from monitor.noise.standard_terms import unit_allan_variances
 from monitor.publishing.messages.message import Count, Message, decode_message, remove_control_characters, shared_fields
 
 MAX_AVERAGING_TIMES: Final = 1000
@@ -86,8 +86,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
     axes: dict[str, AllanAxis]
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: Estimate) -> Self:
-        """Build the message from an estimate."""
+    def _convert(cls, _t: float | None, result: Estimate) -> dict[str, Any]:
         recent = result.display_curve
         axes = {
             axis: AllanAxis(
@@ -96,8 +95,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
             )
             for i, axis in measured_axes(result.curve)
         }
-        filled_s, shared = result.curve.n / result.rate_hz, shared_fields(cls, result)
-        return cls(device=device, t=t, filled_s=filled_s, tau_s=result.curve.tau_s, axes=axes, **shared)
+        return {"filled_s": result.curve.n / result.rate_hz, "tau_s": result.curve.tau_s, "axes": axes}
 
     def to_estimate(self, coefficients: Coefficients, k_or_r: frozenset[str]) -> Estimate:
         """Build an estimate. Its degrees of freedom and numbers of terms are unknown, because the message lacks them.
@@ -146,14 +144,12 @@ class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=to
     axes: dict[str, dict[str, CoefficientValue]]
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: Estimate) -> Self:
-        """Build the message from an estimate."""
+    def _convert(cls, _t: float | None, result: Estimate) -> dict[str, Any]:
         axes = {
             axis: coefficient_values(result.coefficients, i, bool(result.k_or_r[i]))
             for i, axis in measured_axes(result.curve)
         }
-        filled_s = result.curve.n / result.rate_hz
-        return cls(device=device, t=t, filled_s=filled_s, axes=axes, **shared_fields(cls, result))
+        return {"filled_s": result.curve.n / result.rate_hz, "axes": axes}
 
     def to_coefficients(self) -> Coefficients:
         """Return the coefficients of all axes.
@@ -205,29 +201,14 @@ class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.
     axes: dict[str, AxisGapValues]
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: ModelGap) -> Self:
-        """Build the message from a comparison with the model."""
+    def _convert(cls, _t: float | None, result: ModelGap) -> dict[str, Any]:
         axes = {
             axis: AxisGapValues(
                 agrees=result.agrees.get(axis), where=TauRange(one.tau_s), **shared_fields(AxisGapValues, one)
             )
             for axis, one in result.axes.items()
         }
-        known = shared_fields(cls, result) | {"filled_s": result.n / result.rate_hz, "axes": axes}
-        return cls(device=device, t=t, **known)
-
-
-class PredictedBias(msgspec.Struct, frozen=True):
-    """Predicted bias with its 95 % interval."""
-
-    bias: float | None
-    lo: float | None
-    hi: float | None
-
-    @classmethod
-    def of(cls, prediction: PredictionInterval | None) -> Self | None:
-        """Return the prediction; None if there is no model."""
-        return None if prediction is None else cls(prediction.bias, prediction.lo, prediction.hi)
+        return {"filled_s": result.n / result.rate_hz, "axes": axes}
 
 
 class AxisThermalValues(msgspec.Struct, frozen=True):
@@ -235,9 +216,9 @@ class AxisThermalValues(msgspec.Struct, frozen=True):
 
     bias: float | None
     error: float | None
-    multi_step: PredictedBias | None
+    multi_step: PredictionInterval | None
     """Prediction from the temperature alone."""
-    one_step: PredictedBias | None
+    one_step: PredictionInterval | None
     """Prediction from the temperature and the preceding bias."""
     model: str | None
     slope: float | None
@@ -259,21 +240,12 @@ class ThermalMessage(
     axes: dict[str, AxisThermalValues]
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: ThermalIntervalResult) -> Self:
-        """Build the message from the result of the thermal model for an interval."""
+    def _convert(cls, _t: float | None, result: ThermalIntervalResult) -> dict[str, Any]:
         axes = {
-            axis: AxisThermalValues(
-                bias=one.bias,
-                error=one.error,
-                multi_step=PredictedBias.of(one.multi_step),
-                one_step=PredictedBias.of(one.one_step),
-                model=one.model or None,
-                slope=one.slope,
-                text=one.text,
-            )
+            axis: AxisThermalValues(**shared_fields(AxisThermalValues, one) | {"model": one.model or None})
             for axis, one in result.axes.items()
         }
-        return cls(device=device, t=t, samples=samples, **shared_fields(cls, result) | {"axes": axes})
+        return {"axes": axes}
 
 
 class DeviationTable(msgspec.Struct, frozen=True, eq=False):
@@ -297,10 +269,8 @@ class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()
     hadamard: DeviationTable
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: SlowStatistics) -> Self:
-        """Build the message from the total and Hadamard deviations."""
-        total, hadamard = DeviationTable.of(result.total), DeviationTable.of(result.hadamard)
-        return cls(device=device, t=t, samples=samples, total=total, hadamard=hadamard)
+    def _convert(cls, _t: float | None, result: SlowStatistics) -> dict[str, Any]:
+        return {"total": DeviationTable.of(result.total), "hadamard": DeviationTable.of(result.hadamard)}
 
 
 class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()):
@@ -317,19 +287,12 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
     text: str
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: Event) -> Self:
-        """Build the message from an event."""
-        return cls(
-            device=device,
-            t=t,
-            samples=samples,
-            kind=result.kind,
-            axis=result.axis,
-            what={name: dict(sides) for name, sides in result.values.items()},
-            since=None if t is None else event_start_s(t, result),
-            sigma=result.sigma,
-            text=mask_secrets(result.text),
-        )
+    def _convert(cls, t: float | None, result: Event) -> dict[str, Any]:
+        return {
+            "what": {name: dict(sides) for name, sides in result.values.items()},
+            "since": None if t is None else event_start_s(t, result),
+            "text": mask_secrets(result.text),
+        }
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
@@ -370,7 +333,7 @@ class StatusMessage(
     tag=topics.STATUS.schema(),
     rename={"rate_hz": "rate", "memory_bytes": "memory", "uptime_s": "uptime"},
 ):
-    """Message ``imu/<device>/status``; see ``Health`` for the meaning of the fields."""
+    """Message ``imu/<device>/status``. The fields have the meaning of the fields of ``Health``."""
 
     topic = topics.STATUS
     state: str
@@ -391,14 +354,13 @@ class StatusMessage(
     text: str = ""
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: Health) -> Self:
-        """Build the message from the health of a device."""
-        changed = {
+    def _convert(cls, _t: float | None, result: Health) -> dict[str, Any]:
+        return {
+            "samples": result.received,
             "latency": Latency(result.latency_p50_s, result.latency_p99_s),
             "outputs": {name: mask_secrets(state) for name, state in result.outputs.items()},
             "text": mask_secrets(result.text),
         }
-        return cls(device=device, t=t, samples=result.received, **shared_fields(cls, result) | changed)
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
@@ -429,9 +391,8 @@ class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
     text: str
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: str) -> Self:
-        """Build the message from the text."""
-        return cls(device=device, t=t, samples=samples, text=result)
+    def _convert(cls, _t: float | None, result: str) -> dict[str, Any]:
+        return {"text": result}
 
 
 class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
@@ -508,8 +469,7 @@ def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -
     coefficients
         Coefficients of all axes.
     """
-    unit_variances = np.column_stack([source.avar(tau_s, 1.0 / rate_hz) for source in UNIT_SOURCES])
-    total: Floats = unit_variances @ np.nan_to_num(coefficients.value) ** 2
+    total: Floats = unit_allan_variances(tau_s, 1.0 / rate_hz) @ np.nan_to_num(coefficients.value) ** 2
     total[:, np.isnan(coefficients.value).all(axis=0)] = np.nan
     return total
 

@@ -1,9 +1,9 @@
-"""Allan plot of one kind of sensor, used by the image of ``analyze --plot`` and by its report.
+"""Allan plot of one kind of sensor, for the image of ``analyze --plot`` and for the HTML report.
 
 The plot shows the measured Allan deviation of three axes with 95 % bands, and the fitted deviation as a dashed line.
-Each estimated noise term has a thin line and a ring. The ring is at the averaging time at which the coefficient is read
-(IEEE Std 952). Rings that would overlap share a letter. Markers and rings of the second and third axis are smaller, and
-the dashes of each fit lie in the gaps of the others, so that identical axes do not hide each other.
+Each estimated noise term has a thin line. A ring on this line marks the averaging time at which the coefficient is read
+(IEEE Std 952). Rings that would overlap share one label. Markers, rings and dashes differ between the axes, so that
+identical deviations of two axes do not hide each other.
 """
 
 from collections.abc import Collection, Sequence
@@ -29,33 +29,38 @@ MARKERS: Final = ("o", "s", "^")
 MARKER_SIZES: Final = (5.0, 6.2, 7.4)  # points; a filled circle is visible inside an open square or triangle
 RING_SIZES: Final = (13.0, 10.5, 8.0)  # points
 FIT_DASHES: Final = ((0, (4, 8)), (4, (4, 8)), (8, (4, 8)))
-READING_TAU_S: Final = {"Q": 3.0**0.5, "N": 1.0, "K": 3.0, "R": 2.0**0.5}  # τ at which the term's deviation equals it
+READING_TAU_S: Final = {
+    "Q": 3.0**0.5,
+    "N": 1.0,
+    "K": 3.0,
+    "R": 2.0**0.5,
+}  # τ at which the deviation of the term equals the coefficient
 LINE_TAU_S: Final = np.array([1e-6, 1e9])  # ends of the line of a term, beyond any plot
-TAU0_S: Final = 1e-9  # sample interval for the line of a term; so short that sampling has no effect on the line
+TAU0_S: Final = 1e-9  # sample interval for the line of a term, so short that sampling has no effect
 LEGEND_TEXT: Final = (
     "○ a coefficient, read on its own line: Q at √3 s, N at 1 s, K at 3 s, R at √2 s; 0.664 B where the curve is lowest"
 )
 OTHER_LINE_STYLES: Final = ("-", ":", "-.")
 TERM_LINE_ALPHA: Final = 0.4
-MAX_DEPTH_RATIO: Final = 300.0  # a ring further below the lowest point is omitted, as it would flatten the plot
-MAX_BAND_RATIO: Final = 3.0  # a band extends the plot at most by this factor beyond its points
+MAX_DEPTH_RATIO: Final = 300.0  # a ring further below the lowest point is omitted
+MAX_BAND_RATIO: Final = 3.0  # a band extends the plot by at most this factor beyond the points
 MARGIN_FACTOR: Final = 1.6
-MIN_LETTER_DISTANCE: Final = 0.045  # rings closer than this share of the plot's height share a letter
+MIN_LETTER_DISTANCE: Final = 0.045  # rings closer than this share of the height of the plot share a label
 
 
 @dataclass(frozen=True, slots=True)
 class OtherDeviation:
-    """Another deviation of the same recording, drawn next to the overlapping Allan deviation."""
+    """Total or Hadamard deviation that is drawn in addition to the Allan deviation."""
 
     name: str  # "total" or "Hadamard"
     tau_s: Floats  # [k]
     deviation: Floats  # [k, 6] SI unit of the axis
     lo: Floats  # [k, 6] ends of the 95 % interval; NaN if unknown
     hi: Floats
-    only_beyond: bool = False  # True to draw only τ longer than the longest of the Allan deviation
+    only_beyond: bool = False  # True to draw only τ longer than the longest τ of the Allan deviation
 
     def drawn_points(self, axis: int, longest_s: float) -> NDArray[np.bool_]:
-        """Return which of the k points of an axis are drawn.
+        """Return a mask of the points of an axis that are drawn, shape [k].
 
         Parameters
         ----------
@@ -69,7 +74,7 @@ class OtherDeviation:
 
 
 def other_deviations(total: TotalCurve | None = None, hadamard: HadamardCurve | None = None) -> list[OtherDeviation]:
-    """Return the other deviations to draw: total deviation beyond the Allan deviation, Hadamard deviation everywhere.
+    """Return the total deviation, to be drawn beyond the longest τ of the Allan deviation, and the Hadamard deviation.
 
     Parameters
     ----------
@@ -88,13 +93,13 @@ def other_deviations(total: TotalCurve | None = None, hadamard: HadamardCurve | 
 
 @dataclass(frozen=True, slots=True)
 class _Ring:
-    """Ring at the reading point of one coefficient of one axis."""
+    """Ring that marks where one coefficient of one axis is read from the plot."""
 
     letter: str
     tau_s: float
-    sigma: float  # deviation in the unit of the field
+    sigma: float  # deviation in the unit of the plot
     number: int  # 0, 1 or 2 for x, y or z
-    line: Floats  # deviation of the term in the unit of the field, at both ends of LINE_TAU_S
+    line: Floats  # deviation of the term at both ends of LINE_TAU_S
 
 
 def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequence[OtherDeviation] = ()) -> None:
@@ -151,7 +156,7 @@ def _draw_other(
     line = points | (other.tau_s == longest_s) if other.only_beyond else points
     y, colour = other.deviation[:, i] * factor, COLOURS[number]
     panel.plot(other.tau_s[line], y[line], line_style, color=colour, linewidth=0.9, alpha=0.8, zorder=2)
-    if other.only_beyond:  # at shorter τ, the markers would hide those of the Allan deviation
+    if other.only_beyond:  # at shorter τ, the markers would hide the Allan deviation
         ends = np.abs([y - other.lo[:, i] * factor, other.hi[:, i] * factor - y])[:, points]
         style = {"mfc": "white", "color": colour, "mew": 0.9, "markersize": 4.5, "elinewidth": 0.7}
         panel.errorbar(other.tau_s[points], y[points], ends, fmt=MARKERS[number], zorder=4, **style)  # type: ignore[arg-type]
@@ -159,7 +164,7 @@ def _draw_other(
 
 
 def _tau_of_minimum_s(estimate: Estimate, kind: Kind) -> float:
-    """Return the τ [s] at which the mean deviation of all axes of a kind has its minimum, where B is read."""
+    """Return the averaging time [s] at which the mean deviation of all axes has its minimum; B is read there."""
     avar = estimate.curve.avar[:, [AXES.index(axis) for axis in axes_of(kind)]]
     good = np.isfinite(avar) & (avar > 0)
     common = (good | ~good.any(axis=0)).all(axis=1) & good.any(axis=1)
@@ -183,7 +188,7 @@ def _rings(estimate: Estimate, i: int, factor: float, minimum_tau_s: float, lowe
 
 
 def _set_limits(panel: "Axes", shown: Sequence[Floats], rings: Sequence[_Ring]) -> None:
-    """Set limits that contain all data and rings, and the letters next to the rings."""
+    """Set limits that contain all data, rings and labels."""
     panel.set(xscale="log", yscale="log")
     values = np.concatenate([*shown, [ring.sigma for ring in rings]]) if shown else np.array([1.0])
     values = values[np.isfinite(values) & (values > 0)]
@@ -194,7 +199,7 @@ def _set_limits(panel: "Axes", shown: Sequence[Floats], rings: Sequence[_Ring]) 
 
 
 def _draw_terms(panel: "Axes", rings: Sequence[_Ring]) -> None:
-    """Draw the line and the ring of each term, and a letter for each group of rings."""
+    """Draw a line and a ring for each noise term, and a label for each group of rings."""
     for ring in rings:
         colour, size = COLOURS[ring.number], RING_SIZES[ring.number]
         panel.plot(LINE_TAU_S, ring.line, color=colour, linewidth=0.7, alpha=TERM_LINE_ALPHA, zorder=1, scalex=False)
@@ -216,7 +221,7 @@ def _draw_terms(panel: "Axes", rings: Sequence[_Ring]) -> None:
 
 
 def _group_rings(panel: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
-    """Group rings of one letter whose letters would overlap, lowest first."""
+    """Group the rings of one coefficient whose labels would overlap; the lowest ring is first."""
     bottom, top = np.log(panel.get_ylim())
     groups: list[list[_Ring]] = []
     for ring in sorted(rings, key=lambda one: (one.letter, one.sigma)):
@@ -230,7 +235,7 @@ def _group_rings(panel: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
 
 
 def _draw_labels(panel: "Axes", kind: Kind, others: Sequence[OtherDeviation], drawn: Collection[str]) -> None:
-    """Draw labels, grid and legend; the legend names only those other deviations that are drawn."""
+    """Draw axis labels, grid and legend."""
     panel.plot([], [], "--", color=GREY, label="fit")
     panel.fill_between([], [], [], color=GREY, alpha=0.25, label="95 %")
     for line_style, other in zip(OTHER_LINE_STYLES, others, strict=False):

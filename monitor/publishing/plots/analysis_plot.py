@@ -31,16 +31,16 @@ from monitor.publishing.plots.style import COLOURS, GREY, create_figure, figure_
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-INCHES: Final = (7.2, 7.6)  # size of one Allan plot with its table
+INCHES: Final = (7.2, 7.6)  # size of one Allan plot and the table below it
 COLUMNS: Final = (0.0, 0.46, 0.65, 0.84)  # left edges of the table's columns, as shares of its width
 TABLE_LEGEND: Final = (
-    "small print: 95 % interval;  ≤ one-sided 95 % bound;  — too few data;  K or R: the data do not tell which"
+    "small print: 95 % interval;  ≤ one-sided 95 % bound;  — too few data;  K or R: the data do not show which"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class AnalysisPlotData:
-    """Analysis of a recording with everything that its plot and its report show."""
+    """Content of the plot and of the HTML report of one recording."""
 
     analysis: Analysis
     others: Sequence[OtherDeviation] = ()  # such as total and Hadamard deviation
@@ -84,7 +84,7 @@ def save_analysis_plot(drawn: AnalysisPlotData, path: Path, title: str = "") -> 
 
 
 def measured_kinds(estimate: Estimate) -> list[Kind]:
-    """Return the kinds of sensor that are measured; both kinds if none is."""
+    """Return the measured kinds of sensor, or both kinds if no axis is measured."""
     present = {axis for _, axis in measured_axes(estimate.curve)}
     return [kind for kind in KINDS if set(axes_of(kind)) & present] or list(KINDS)
 
@@ -98,7 +98,7 @@ def recording_line(estimate: Estimate) -> str:
 
 
 def is_k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
-    """Return True if this coefficient is K or R with an upper bound, and the data do not show which of them is present.
+    """Return True if a coefficient is K or R with an upper bound, and the data do not show which of the two is present.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def is_k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
 
 
 def _draw_table(panel: "Axes", analysis: Analysis, kind: Kind) -> None:
-    """Draw the table of coefficients: each value, and its interval in small print."""
+    """Draw the table of coefficients with their intervals in small print."""
     estimate = analysis.estimate
     panel.axis("off")
     rows = np.linspace(0.97, 0.19, len(SYMBOLS) + 1)

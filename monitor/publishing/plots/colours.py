@@ -26,7 +26,7 @@ TEMPERATURE: Final[Colour] = (236, 180, 72)
 
 
 def blend(colour: Colour, share: float, ground: Colour = BACKGROUND) -> Colour:
-    """Return the mix of a colour and a background, as a translucent fill would appear.
+    """Return the mixture of a colour and a background, as a translucent area would appear.
 
     Parameters
     ----------

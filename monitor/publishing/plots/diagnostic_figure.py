@@ -1,8 +1,9 @@
 """Figures of the reports of ``reconcile``, as SVG elements.
 
-A diagnostic figure shows measurement, expectation of the model, and the band that holds 95 of 100 recordings simulated
-from the model. Panels side by side have the same limits, so that a reader sees how a gap closes. A gap chart shows the
-gap of each diagnostic divided by its threshold. An interval chart shows one parameter in several recordings.
+A diagnostic figure shows the measurement, the expectation of the model, and the band that contains 95 of 100 recordings
+simulated from the model. Panels side by side have the same limits, so that the figures of two models can be compared.
+A gap is the difference between measurement and model. A gap chart shows the gap of each diagnostic divided by the
+threshold. An interval chart shows one parameter in several recordings.
 """
 
 from collections.abc import Sequence
@@ -35,7 +36,7 @@ ABOVE_THRESHOLD_COLOUR: Final = "#b3261e"
 BELOW_THRESHOLD_COLOUR: Final = "#1b7f4d"
 MAX_MARKERS: Final = 60  # largest number of points that are drawn with markers
 MARGIN_SHARE: Final = 0.06  # margin above and below the curves, as a share of their height
-MAX_BAND_SHARE: Final = 0.35  # a band extends a panel at most by this share of the height of the curves
+MAX_BAND_SHARE: Final = 0.35  # a band extends a panel by at most this share of the height of the curves
 LOWEST_SHARE: Final = 0.02  # share of the points that may lie below a logarithmic panel
 MIN_RANGE_SHARE: Final = 0.08  # a range narrower than this share of the width has a detail plot
 DETAIL_WIDTHS: Final = 4.0  # a detail plot extends by this multiple of the range's width to either side
@@ -49,7 +50,7 @@ MIN_GAP_RATIO: Final = 0.05  # a smaller ratio of gap to threshold is drawn at t
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticPlot:
-    """Data of one panel in the units of the field."""
+    """Data of one panel in the units of the plot."""
 
     title: str
     x_label: str
@@ -96,7 +97,7 @@ def compared_diagnostic_svg(
 
 
 def select_view(views: Sequence[PlotData], lens: str, where: Location) -> PlotData | None:
-    """Return the data of a diagnostic; if it has none, those of the first diagnostic that resolves the range.
+    """Return the data of a diagnostic, or the data of the first diagnostic whose x axis contains the range.
 
     Parameters
     ----------
@@ -112,7 +113,7 @@ def select_view(views: Sequence[PlotData], lens: str, where: Location) -> PlotDa
 
 
 def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | None:
-    """Return the part of a range that lies along the x axis of a diagnostic, in the diagnostic's unit.
+    """Return the part of a range that lies along the x axis of a diagnostic, in the unit of the diagnostic.
 
     Parameters
     ----------
@@ -136,7 +137,7 @@ def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | No
 
 
 def detail_view(view: PlotData, where: Location) -> PlotData | None:
-    """Return the data around a range that is too narrow to be seen in the whole plot; None if it is wide enough.
+    """Return the data around a range that is too narrow to be visible. Return None if the range is wide enough.
 
     Parameters
     ----------
@@ -163,7 +164,7 @@ def detail_view(view: PlotData, where: Location) -> PlotData | None:
 
 
 def to_field_units(title: str, view: PlotData, axis: str, where: Location | None) -> DiagnosticPlot:
-    """Convert the data of a diagnostic to the units of the field.
+    """Convert the data of a diagnostic to the units of the plot.
 
     Parameters
     ----------
@@ -174,7 +175,7 @@ def to_field_units(title: str, view: PlotData, axis: str, where: Location | None
     axis
         Name of the axis.
     where
-        Range to mark; it is omitted if it does not lie along x.
+        Range to mark. A range of another quantity than the x axis is omitted.
     """
     x_unit, y_unit = (
         field_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)))
@@ -204,13 +205,13 @@ def to_field_units(title: str, view: PlotData, axis: str, where: Location | None
 
 
 def value_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
-    """Return the common lower and upper limit of all panels: curves in full, bands as far as they stay near."""
+    """Return the common limits of all panels, which contain all curves and the parts of the bands near the curves."""
     log = plots[0].log
     curves = _finite([line for plot in plots for line in (plot.measured, plot.expected)], log)
     if curves.size == 0:
         return (0.1, 10.0) if log else (-1.0, 1.0)
     low, high = float(curves.min()), float(curves.max())
-    if log:  # an almost empty bin of a spectrum lies decades below the others
+    if log:  # an almost empty bin of a spectrum lies decades below the other bins
         low = float(min(np.quantile(curves, LOWEST_SHARE), *_finite([plot.expected for plot in plots], log), high))
     reach = MAX_BAND_SHARE * (high - low)
     bands = _finite([line for plot in plots for line in (plot.lo, plot.hi)], log).clip(low - reach, high + reach)
@@ -220,20 +221,20 @@ def value_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
 
 
 def _finite(lines: Sequence[Floats], log: bool) -> Floats:
-    """Return all values that a panel can show, as logarithms for a logarithmic panel."""
+    """Return all values that a panel can show. The values of a logarithmic panel are returned as logarithms."""
     values = np.concatenate(lines)
     values = values[np.isfinite(values) & ((values > 0) | (not log))]
     return np.log10(values) if log else values
 
 
 def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[float, float]) -> None:
-    """Draw one panel: band, measurement, expectation, and the marked range."""
+    """Draw the band, the measurement, the expectation and the marked range of one panel."""
     x = plot.x[np.isfinite(plot.x) & ((plot.x > 0) | (not plot.log))]
     left, right = (float(x.min()), float(x.max())) if np.ptp(x) > 0 else (0.5, 1.5)
     scale = "log" if plot.log else "linear"
     panel.set(xscale=scale, yscale=scale, xlim=(left, right), ylim=limits, xlabel=plot.x_label)
     panel.autoscale(False)
-    # A lower end of zero has no logarithm; it is drawn below the panel.
+    # A lower end of zero has no logarithm. It is drawn below the panel.
     lo, hi = (np.fmax(line, 0.1 * limits[0]) if plot.log else line for line in (plot.lo, plot.hi))
     panel.fill_between(plot.x, lo, hi, where=np.isfinite(plot.hi).tolist(), color=BAND_COLOUR, linewidth=0)
     few = plot.x.size <= MAX_MARKERS
@@ -241,7 +242,7 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[
     panel.plot(plot.x, plot.expected, "--", color=style.DARK, linewidth=1.0)
     if plot.mark is not None:
         ends = np.clip(plot.mark, left, right).tolist()
-        # A line around the range keeps a very narrow range visible.
+        # The edge of the area keeps a very narrow range visible.
         panel.axvspan(*ends, facecolor=style.ORANGE, edgecolor=style.ORANGE, alpha=0.35, linewidth=3)
         panel.set_title(plot.mark_label, loc="right", fontsize=9, color=RANGE_TEXT_COLOUR, fontweight="bold")
     else:
@@ -263,7 +264,7 @@ def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap
     before
         Gaps with one model.
     after
-        Gaps with the next model; empty if there is only one model.
+        Gaps with the next model. Empty if there is only one model.
     """
     later = {score.lens: score for score in after}
     with style.figure_style():
@@ -295,7 +296,7 @@ def interval_chart_svg(
     Parameters
     ----------
     intervals
-        Name and interval of each row; the last row is the pooled value.
+        Name and interval of each row. The last row is the pooled value.
     x_label
         Name and unit of the parameter.
     factor
@@ -319,7 +320,7 @@ def interval_chart_svg(
 
 
 def _create_row_panel(names: Sequence[str], x_label: str) -> "tuple[Figure, Axes]":
-    """Return a figure and its panel with one row for each name, the first name on top."""
+    """Return a figure and a panel with one row for each name. The first name is on top."""
     figure = style.create_figure(ROWS_WIDTH_INCHES, 0.75 + ROW_INCHES * len(names))
     panel = figure.subplots()
     short = [name if len(name) <= MAX_NAME_LENGTH else f"{name[: MAX_NAME_LENGTH - 1]}…" for name in names]

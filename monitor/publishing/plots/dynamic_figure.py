@@ -1,9 +1,10 @@
 """Plot of the dynamic Allan deviation of one kind of sensor: heat maps over time, and the coefficients over time.
 
-All panels share one time axis, the end of the window. A heat map shows each τ over time. Its colour is the deviation
-divided by the median over time, so that all τ share one scale. Cells whose 95 % interval contains the median are pale.
-A coefficient has a panel if it is estimated for some time on some axis. A change is a vertical line, with a label in
-the heat map of its axis and in the colour of the axis in the panels of the coefficients.
+The time axis of all panels is the time at the end of the window. A heat map shows each τ over time. Its colour is the
+deviation divided by the median over time, so that all τ share one scale. Cells whose 95 % interval contains the median
+are pale. A coefficient has a panel if it is estimated for some time on some axis. A vertical line marks a change. In
+the heat map of the changed axis, the line has a label. In the panels of the coefficients, it has the colour of the
+axis.
 """
 
 import warnings
@@ -31,14 +32,14 @@ SPARE_INCHES: Final = 1.2  # height of title, colour bar and time axis
 MIN_ESTIMATED_SHARE: Final = 0.05  # smallest share of time steps with an estimate for a coefficient to have a panel
 PALE_ALPHA: Final = 0.3
 MIN_LABEL_DISTANCE: Final = 0.13  # smallest distance between two labels, as a share of the width
-COLOUR_SCALE_RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # possible ends of the colour scale
+COLOUR_SCALE_RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # possible upper ends of the colour scale
 MIN_CELLS_IN_SCALE: Final = 0.95  # smallest share of the cells inside the colour scale
-BAND_ENDS_INSIDE: Final = 0.9  # share of the ends of the bands inside a panel; the widest would determine its scale
+BAND_ENDS_INSIDE: Final = 0.9  # share of the ends of the bands that lie inside a panel
 
 
 @dataclass(frozen=True, slots=True)
 class ChangeMark:
-    """Change of one axis to mark in the plot."""
+    """Time and axis of a change that the plot marks."""
 
     t_s: float  # time since the first sample
     axis: str
@@ -71,7 +72,7 @@ def height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
 
 
 def divide_by_median(dynamic: DynamicAllan) -> Floats:
-    """Return the deviation divided by its median over time, shape [T, m, 6]; NaN if missing or if the median is 0.
+    """Return the deviation divided by the median over time, shape [T, m, 6]. NaN if it is missing or the median is 0.
 
     >>> from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan as of
     >>> steady = of(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0)
@@ -96,7 +97,7 @@ def draw_dynamic_panels(
     kind
         Kind of sensor.
     marks
-        Changes of all axes; those of this kind are drawn.
+        Changes of all axes. Only changes of this kind of sensor are drawn.
     """
     axes, letters = _shown_axes(dynamic, kind), _shown_coefficients(dynamic, kind)
     ratios = [HEAT_MAP_INCHES] * len(axes) + [COEFFICIENT_INCHES] * len(letters)
@@ -172,7 +173,7 @@ def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Float
 
 
 def _draw_colour_bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "list[Axes]", ratio: float) -> None:
-    """Draw the colour scale, labelled with factors."""
+    """Draw the colour scale with factors as labels."""
     from matplotlib.cm import ScalarMappable
 
     # A separate mappable is used, because the colour bar of the mesh would be as pale as its cells.
@@ -195,7 +196,7 @@ def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: 
             np.where(estimated, part[:, row, i] * unit.factor, np.nan)
             for part in (dynamic.value, dynamic.value_lo, dynamic.value_hi)
         )
-        style.draw_band(panel, t, lo, hi, colour, rasterized=True)  # hundreds of corners would enlarge a report
+        style.draw_band(panel, t, lo, hi, colour, rasterized=True)  # hundreds of corners would make a report larger
         panel.plot(t, value, color=colour, label=axis)
         alone = _isolated(estimated)
         panel.plot(t[alone], value[alone], ".", color=colour, markersize=3.5)
@@ -213,13 +214,13 @@ def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: 
 
 
 def _isolated(estimated: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return the points without a neighbour, which no line shows."""
+    """Return a mask of the points without a neighbour, which a line does not show."""
     padded = np.concatenate([[False], estimated, [False]])
     return np.asarray(estimated & ~padded[:-2] & ~padded[2:])
 
 
 def _median(dynamic: DynamicAllan) -> Floats:
-    """Return the median of the deviation over time, shape [1, m, 6]; NaN if there is none."""
+    """Return the median of the deviation over time, shape [1, m, 6]. NaN if it is missing or 0."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # raised for an axis that is not measured
         median = np.nanmedian(dynamic.deviation, axis=0, keepdims=True)
@@ -227,7 +228,7 @@ def _median(dynamic: DynamicAllan) -> Floats:
 
 
 def _colour_scale_end(ratios: Floats) -> float:
-    """Return the smallest possible end of the colour scale that holds most cells."""
+    """Return the smallest of the COLOUR_SCALE_RATIOS that contains MIN_CELLS_IN_SCALE of the cells."""
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.abs(np.log(ratios))
     size = size[np.isfinite(size)]
@@ -242,7 +243,7 @@ def _time_edges(t: Floats) -> Floats:
 
 
 def _tau_edges(tau_s: Floats) -> Floats:
-    """Return the edges of the cells around the τ, at the means of their logarithms."""
+    """Return the edges of the cells: the geometric means of neighbouring τ."""
     if tau_s.size == 1:
         return np.array([0.7, 1.4]) * float(tau_s[0])
     middle = np.sqrt(tau_s[1:] * tau_s[:-1])

@@ -1,8 +1,8 @@
-"""Plot of a device's history: coefficients with their extremes, temperature, lost samples and events.
+"""Plot of the history of a device: coefficients with their extremes, temperature, lost samples and events.
 
 Gyroscopes are on the left and accelerometers on the right, with one row for each coefficient that was ever estimated. A
-line shows the last value of each bucket, the dark band the extremes, and the pale band the 95 % interval. Lines have a
-gap where the device gave no data. An event is a vertical line with a label above it.
+line shows the last value of each bucket, the dark band the extremes, and the pale band the 95 % interval. Lines have
+gaps where the device sent no data. A vertical line with a label marks an event.
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,6 @@ PANEL_INCHES: Final = (7.4, 1.75)
 SPARE_INCHES: Final = 1.1  # height of title and time axis
 TITLE_PAD_POINTS: Final = 26.0  # space between the first panel and its title, for the labels of events
 EXTREMES_ALPHA: Final = 0.45
-MAX_INTERVAL_RATIO: Final = 1.5  # intervals whose ends differ from the value by more than this factor are not drawn
 NOT_RUNNING_COLOUR: Final = "#d9534f"
 EVENT_LABELS: Final = {
     "noise_changed": "noise",
@@ -42,8 +41,8 @@ EVENT_LABELS: Final = {
     "temperature_unexplained": "temperature",
     "drift_unexplained": "drift",
 }
-"""Label of each kind of event that is drawn; lost samples have a panel of their own."""
-MAX_EVENTS: Final = 40  # largest number of events that are drawn; the most significant ones are selected
+"""Label of each kind of event that is drawn. Lost samples have a separate panel."""
+MAX_EVENTS: Final = 40  # largest number of events that are drawn; the most significant events are selected
 MIN_LABEL_DISTANCE: Final = 0.055  # smallest distance between two labels, as a share of the width
 PRIORITY_KINDS: Final = ("noise_changed", "bias_stepped", "limit_crossed", "model_disagrees")
 
@@ -68,7 +67,7 @@ def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES
         If the history has no rows.
     """
     if not len(past):
-        raise NotReady(f"{past.device}: events alone are not drawn; there are no rows in that time")
+        raise NotReady(f"{past.device}: no rows in the time range; events alone cannot be drawn")
     with style.figure_style():
         drawn = {
             kind: [axis for axis in axes_of(kind) if axis in axes and _estimated_coefficients(past, axis)]
@@ -112,8 +111,7 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
         ))  # fmt: skip
         if not np.isfinite(last).any():
             continue
-        near = (lo * MAX_INTERVAL_RATIO > last) & (hi < last * MAX_INTERVAL_RATIO)
-        style.draw_band(panel, t, np.where(near, lo, np.nan), np.where(near, hi, np.nan), colour)
+        style.draw_band(panel, t, *style.omit_wide_intervals(last, lo, hi), colour)
         style.draw_band(panel, t, low, high, colour, alpha=EXTREMES_ALPHA)
         panel.plot(t, last, color=colour, lw=1.1, label=axis)
         lows.append(np.nanmin(low))
@@ -153,14 +151,14 @@ def _draw_losses(panel: "Axes", past: HistoryTable) -> None:
 
 
 def _draw_absence(panel: "Axes", text: str) -> None:
-    """Write in the middle of a panel why it is empty."""
+    """Write the reason for missing data into an empty panel."""
     panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", color=style.GREY)
 
 
 def _draw_title(panel: "Axes", text: str) -> None:
-    """Write the title of a panel inside it, because event labels are above it."""
-    place: dict[str, Any] = {"transform": panel.transAxes, "ha": "right", "va": "top", "bbox": style.LABEL_BOX}
-    panel.text(0.995, 0.95, text, fontsize=9, color=style.GREY, **place)
+    """Write the title into the panel, because the labels of events are above the panel."""
+    position: dict[str, Any] = {"transform": panel.transAxes, "ha": "right", "va": "top", "bbox": style.LABEL_BOX}
+    panel.text(0.995, 0.95, text, fontsize=9, color=style.GREY, **position)
 
 
 def _select_events(past: HistoryTable) -> list[StoredEvent]:
@@ -171,7 +169,7 @@ def _select_events(past: HistoryTable) -> list[StoredEvent]:
 
 
 def _draw_events(panels: "Sequence[Axes]", events: Sequence[StoredEvent]) -> None:
-    """Draw event lines through the panels and labels above the first one; labels that would overlap are omitted."""
+    """Draw event lines through all panels, and labels above the first panel. Labels that would overlap are omitted."""
     left, right = panels[0].get_xlim()
     last_label = -np.inf
     for event in events:
@@ -203,7 +201,7 @@ def _set_dates(panels: Any, past: HistoryTable) -> None:
 
 
 def _with_gaps(past: HistoryTable, *columns: Floats) -> tuple[Floats, ...]:
-    """Return times in days and the columns, with a NaN wherever buckets are missing."""
+    """Return the times in days and the given columns, with NaN inserted where buckets are missing."""
     ends, starts = past.end_s[:-1], past.start_s[1:]
     gaps: NDArray[np.int64] = np.flatnonzero(starts > ends) + 1
     t = np.insert(_days(past.start_s + 0.5 * past.width_s), gaps, _days(ends[gaps - 1].astype(np.float64)))
@@ -211,5 +209,5 @@ def _with_gaps(past: HistoryTable, *columns: Floats) -> tuple[Floats, ...]:
 
 
 def _days(unix_s: "Floats | NDArray[np.int64]") -> Floats:
-    """Convert Unix seconds to the dates of matplotlib: days since 1970."""
+    """Convert Unix times [s] to the dates of matplotlib, which are days since 1970."""
     return np.asarray(unix_s, np.float64) / DAY_S

@@ -1,8 +1,8 @@
 """Style of all figures, and their output as image files and as SVG elements of a page.
 
 Figures are ``Figure`` objects of matplotlib without pyplot, so they need no display. ``figure_style`` applies the
-colours, line widths and text sizes. Equal figures give equal bytes: identifiers in an SVG depend only on its content,
-and no file contains a date. matplotlib is imported when a figure is drawn.
+colours, line widths and text sizes. Two files of the same figure are identical: identifiers in an SVG depend only on
+its content, and no file contains a date. matplotlib is imported when a figure is drawn.
 """
 
 import hashlib
@@ -63,13 +63,13 @@ STYLE: Final[dict[Any, Any]] = {
     "svg.fonttype": "none",
     "svg.hashsalt": "imu-monitor",
 }
-"""Settings of matplotlib that all figures share."""
 UNDATED: Final[dict[str, dict[str, Any]]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
 """Metadata that keep the date out of a file, by suffix."""
 RASTER_DPI: Final = 80  # resolution of heat maps and dense bands, which are images inside an SVG
 FEW_DECADES_RATIO: Final = 60.0  # an axis with a smaller ratio of its ends has labels between the powers of ten
 MAX_LABELS: Final = 7  # largest number of powers of ten with a label
 LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
+MAX_INTERVAL_RATIO: Final = 1.5  # ratio between value and end of an interval above which the interval is not drawn
 SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 LABEL_BOX: Final[dict[str, Any]] = {
     "boxstyle": "square,pad=0.15",
@@ -79,17 +79,17 @@ LABEL_BOX: Final[dict[str, Any]] = {
 }
 """Box behind a label inside a panel, so that curves do not cross the text."""
 TIME_UNITS: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
-"""Name of each time unit, its length [s], and the duration [s] below which it is used."""
+"""Name of each time unit, its length [s], and the duration [s] below which the unit is used."""
 
 
 def axis_colour(axis: str) -> str:
-    """Return the colour of an axis: x, y and z of both kinds of sensor have one colour each."""
+    """Return the colour of an axis, which is the same for both kinds of sensor."""
     return COLOURS[AXES.index(axis) % 3]
 
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Apply the style to everything that is drawn inside the ``with`` block.
+    """Apply the style to all figures that are drawn inside the ``with`` block.
 
     Raises
     ------
@@ -113,7 +113,7 @@ def create_figure(width: float, height: float, layout: Literal["constrained"] | 
     width, height
         Size [inches].
     layout
-        By default, panels are arranged so that no labels overlap. None keeps them where they are placed.
+        By default, panels are arranged so that no labels overlap. None keeps the given positions.
     """
     from matplotlib.figure import Figure
 
@@ -158,8 +158,8 @@ def svg_element(figure: "Figure", description: str) -> str:
     element = element.replace("<svg", f'<svg role="img" aria-label="{html.escape(description)}"', 1)
     element = re.sub(r'<g id="[^"]*"', "<g", element)  # nothing refers to these identifiers
     element = re.sub(r"<[^>]*>", lambda tag: re.sub(r"\d+\.\d{3,}", _shorten, tag[0]), element)
-    element = re.sub(r"\n(?:L )?\s*", " ", element)  # a path continues with lines if no letter is given
-    prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # identifiers of figures in one page must differ
+    element = re.sub(r"\n(?:L )?\s*", " ", element)  # without a letter, a path continues with lines
+    prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # figures on one page must have different identifiers
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}", element)
 
 
@@ -219,7 +219,7 @@ def draw_band(panel: "Axes", x: Floats, lo: Floats, hi: Floats, colour: str, **o
     colour
         Colour of the band.
     options
-        Other options of ``fill_between``.
+        Further options of ``fill_between``.
     """
     panel.fill_between(x, lo, hi, **{"color": colour, "alpha": BAND_ALPHA, "linewidth": 0, **options})
 
@@ -234,13 +234,13 @@ def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
     columns
         Number of columns of the legend.
     options
-        Other options of ``legend``.
+        Further options of ``legend``.
     """
     panel.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=columns, **options)
 
 
 def set_value_scale(panel: "Axes", low: float, high: float, margin: float) -> None:
-    """Set the limits of the y axis of a positive quantity, with a logarithmic scale if its values differ much.
+    """Set scale and limits of the y axis of a positive quantity. The scale is logarithmic if the values differ much.
 
     Parameters
     ----------
@@ -258,6 +258,18 @@ def set_value_scale(panel: "Axes", low: float, high: float, margin: float) -> No
     else:
         space = margin * (high - low) + 0.02 * high
         panel.set_ylim(max(low - space, 0.0), high + space)
+
+
+def omit_wide_intervals(value: Floats, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
+    """Return the ends of intervals, with NaN for intervals that would determine the scale of a plot.
+
+    Parameters
+    ----------
+    value, lo, hi
+        Values and ends of their intervals, of one shape.
+    """
+    near = (lo * MAX_INTERVAL_RATIO > value) & (hi < value * MAX_INTERVAL_RATIO)
+    return np.where(near, lo, np.nan), np.where(near, hi, np.nan)
 
 
 def time_unit(duration_s: float) -> tuple[str, float]:

@@ -1,8 +1,8 @@
 """Report of one analysis as a self-contained HTML page, for ``imu-monitor analyze --plot FILE.html``.
 
-The page needs no network. It holds the Allan plot of each kind of sensor, the table of coefficients with intervals in
-the units of the field, facts about the recording, notes, and the dynamic Allan deviation if it was computed. Heat maps
-are images inside the SVG, so that the page stays below one megabyte.
+The page needs no network. It contains the Allan plot of each kind of sensor, the table of coefficients with intervals,
+facts about the recording, notes, and the dynamic Allan deviation if it was computed. Heat maps are images inside the
+SVG, so that the page stays below one megabyte.
 """
 
 from pathlib import Path
@@ -87,7 +87,7 @@ def recording_facts(analysis: Analysis) -> tuple[tuple[str, str], ...]:
 
 
 def format_cell(estimate: Estimate, letter: str, axis: str) -> tuple[str, str]:
-    """Return the value of a coefficient with its unit, and its interval or the reason why it has none.
+    """Return the value of a coefficient with its unit, and its interval or the reason for a missing interval.
 
     Parameters
     ----------
@@ -107,7 +107,7 @@ def format_cell(estimate: Estimate, letter: str, axis: str) -> tuple[str, str]:
 
 
 def _part(drawn: AnalysisPlotData, kind: Kind) -> dict[str, Any]:
-    """Return the values of the template for one kind of sensor."""
+    """Return the values for the template for one kind of sensor."""
     name, heat_maps = KIND_NAMES[kind], ""
     with figure_style():
         figure = create_figure(*ALLAN_INCHES)

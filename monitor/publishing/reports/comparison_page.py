@@ -1,8 +1,8 @@
 """Comparison of several recordings of one sensor as a self-contained HTML page, ``report.html``.
 
-The page needs no network. It holds a summary, a table of axes and recordings with links to the single reports, and the
-effects. A common effect has a table and a chart of its sizes in all recordings. An effect of some recordings only has
-the meaning of its absence in the others.
+The page needs no network. The page contains a summary, a table of axes and recordings with links to the report of each
+recording, and the effects. A common effect has a table and a chart of its parameters in all recordings. If an effect
+was found in some recordings only, the page states for each other recording why it may be absent there.
 """
 
 from monitor.common.units import format_duration
@@ -40,7 +40,7 @@ def render_page(c: Comparison) -> str:
 
 
 def _rows(seen: MatchedEffect) -> list[tuple[str, AddedOrResizedEffect]]:
-    """Return the name and the step of each recording, and of all recordings together."""
+    """Return the name and the step of each recording and of the pooled recordings."""
     return [*seen.steps.items(), ("all together", seen.pooled_step())]
 
 
@@ -50,7 +50,7 @@ def _parameters_by_name(c: Comparison, step: AddedOrResizedEffect, axis: str) ->
 
 
 def _draw_intervals(seen: MatchedEffect, axis: str) -> str:
-    """Draw the first parameter that has an interval, in all recordings; "" if no parameter has one."""
+    """Draw the first parameter that has an interval, in all recordings. Return "" if no parameter has an interval."""
     name = next((name for name, one in seen.parameters.items() if one.freedom), "")
     rows = [(run, step.parameters[name]) for run, step in _rows(seen) if name in step.parameters]
     if not any(one.lo is not None and one.hi is not None and one.hi > one.lo for _, one in rows):

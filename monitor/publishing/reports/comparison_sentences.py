@@ -14,11 +14,11 @@ ABSENCE_TEXTS: Final = {
     "unnamed": "unnamed there",
     "may_differ": "may differ",
 }
-"""Meaning of the absence of an effect in a recording."""
+"""Text for each reason why an effect is absent from a recording."""
 
 
 def summarize(c: Comparison) -> str:
-    """Return a few sentences on common effects and on effects of some recordings only."""
+    """Return a summary of the effects in all recordings and of the effects in some recordings only."""
     model = "the model" if c.fitted_to is None else f"the five classic terms, fitted to {c.fitted_to}"
     compared = f"{len(c.runs)} recordings were compared with {model}."
     if c.verdict == "agrees":
@@ -32,16 +32,16 @@ def summarize(c: Comparison) -> str:
 
 
 def describe_agreement(seen: MatchedEffect) -> str:
-    """Return whether the sizes of an effect agree between the recordings, with the p-value."""
+    """Return a text on whether the sizes of an effect agree between the recordings, with the p-value."""
     if seen.p is None:
         return "nothing to compare"
-    return f"sizes {'agree' if seen.consistent else 'differ'} ({format_p_value(seen.p)})"
+    return f"sizes {'agree' if seen.consistent else 'differ'} ({_format_p_value(seen.p)})"
 
 
-def format_p_value(p: float) -> str:
+def _format_p_value(p: float) -> str:
     """Format a p-value.
 
-    >>> format_p_value(0.413), format_p_value(2e-5)
+    >>> _format_p_value(0.413), _format_p_value(2e-5)
     ('p = 0.41', 'p < 0.001')
     """
     return "p < 0.001" if p < 0.001 else f"p = {format_number(p, 2)}"
@@ -57,5 +57,5 @@ def count_findings(result: AxisResult | None) -> str:
 
 
 def _name_effect(seen: MatchedEffect) -> str:
-    """Return the name of an effect, with a remark if it is a changed term of the model."""
+    """Return the name of an effect, with a remark if the effect is a changed term of the model."""
     return readable_name(seen.effect) + (" of another size" if seen.kind == "retuned" else "")

@@ -1,7 +1,8 @@
 """Export of a history as a table: CSV, Parquet, Arrow or .npz, one row per bucket and one column per number, in SI.
 
-Column names include the unit in ASCII: ``gz.N (rad/sqrt(s))``, and for the extremes ``gz.N low (rad/sqrt(s))`` and
-``gz.N high (rad/sqrt(s))``. Missing values are empty or NaN. If writing fails, no file is left.
+Column names include the unit in ASCII, as in ``gz.N (rad/sqrt(s))``. The columns of the extremes are named
+``gz.N low (rad/sqrt(s))`` and ``gz.N high (rad/sqrt(s))``. Missing values are empty or NaN. If writing fails, no file
+remains.
 """
 
 from pathlib import Path
@@ -43,13 +44,13 @@ def save_history(past: HistoryTable, path: Path) -> None:
 
 
 def history_columns(past: HistoryTable) -> dict[str, Floats]:
-    """Return the columns by name, shape [p] each; interval ends and bounds have only their last value per bucket."""
+    """Return all columns by name, each of shape [p]. Interval ends and bounds have no extremes."""
     columns: dict[str, Floats] = {
         "t (Unix s)": past.start_s.astype(np.float64),
         "width (s)": past.width_s.astype(np.float64),
     }
     for name in past.names:
-        course, unit = past.column(name), column_unit(name)
+        course, unit = past.column(name), _column_unit(name)
         columns[f"{name} ({unit})"] = course.last
         if name.endswith((".lo", ".hi", ".bound")):
             continue
@@ -62,10 +63,10 @@ def history_columns(past: HistoryTable) -> dict[str, Floats]:
     return columns
 
 
-def column_unit(name: str) -> str:
-    """Return the SI unit of a column of a history row.
+def _column_unit(name: str) -> str:
+    """Return the SI unit of a stored column in ASCII.
 
-    >>> column_unit("gz.N.lo"), column_unit("az.sigma.0.1"), column_unit("rate")
+    >>> _column_unit("gz.N.lo"), _column_unit("az.sigma.0.1"), _column_unit("rate")
     ('rad/sqrt(s)', 'm/s^2', 'Hz')
     """
     axis, _, rest = name.partition(".")

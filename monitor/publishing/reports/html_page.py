@@ -1,4 +1,4 @@
-"""Self-contained HTML pages from the templates of this package. Equal values give equal pages."""
+"""Self-contained HTML pages from the templates of this package. Equal values give identical pages."""
 
 from typing import Any, Final
 

@@ -1,9 +1,9 @@
 """Report of a reconciliation as a self-contained HTML page, ``report.html``.
 
-The page needs no network. It holds a summary, a table of the axes, and a section for each step. A section shows where
-measurement and model differed, the added or changed effect with its parameters, and every diagnostic before and after.
-Axes that agree with the model share a table of their diagnostics. The template ``reconcile.html.j2`` arranges the
-sentences of ``reconcile_sentences`` and the figures of ``diagnostic_figure``.
+The page needs no network. It contains a summary, a table of the axes, and a section for each step. A section shows
+where measurement and model differed, the added or changed effect with its parameters, and every diagnostic before and
+after the step. Axes that agree with the model share a table of their diagnostics. The template ``reconcile.html.j2``
+arranges the sentences of ``reconcile_sentences`` and the figures of ``diagnostic_figure``.
 """
 
 from collections.abc import Sequence
@@ -69,19 +69,19 @@ def render_page(r: Reconciliation, title: str = "") -> str:
 def _pair_scores(
     before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap]
 ) -> list[tuple[DiagnosticGap, DiagnosticGap | None]]:
-    """Return each score with the score of the same diagnostic after a step; None if there is none."""
+    """Return each score with the score of the same diagnostic after a step, or None if that score is missing."""
     later = {score.lens: score for score in after}
     return [(score, later.get(score.lens)) for score in before]
 
 
 def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list[DiagnosticGap | None]]]:
-    """Return each diagnostic with the scores of the first model, one for each axis; None if an axis has no score."""
+    """Return each diagnostic with the scores of all axes for the first model. None if an axis has no score."""
     known = [{score.lens: score for score in result.start.gaps} for result in results]
     return [(lens, [scores.get(lens) for scores in known]) for lens in dict.fromkeys(one for k in known for one in k)]
 
 
 def _draw_single(view: PlotData, axis: str) -> str:
-    """Draw one diagnostic with one model."""
+    """Draw one diagnostic for one model."""
     return compared_diagnostic_svg([("", view)], axis, *SINGLE_INCHES)
 
 

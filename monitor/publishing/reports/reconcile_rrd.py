@@ -1,15 +1,16 @@
-"""Result of a reconciliation as a Rerun recording, ``reconcile.rrd``, with its own layout.
+"""Result of a reconciliation as a Rerun recording, ``reconcile.rrd``, with a separate layout.
 
 Each axis has a tab. On the left are the steps as text and the gap of each diagnostic relative to its threshold. On the
-right, each logarithmic diagnostic is drawn twice, with the first model and after the steps. The timeline ``step`` is
-the index of the model. Index 0 is the model that was given or fitted first, and the others are the models after each
-step. The right plot of a pair follows this timeline. Rerun has no logarithmic axes, so plots are drawn as lines by
-``allan_chart``. The stream is separate from that of the live view. Importing this module imports Rerun.
+right, each diagnostic with logarithmic axes is drawn twice: for the first model and for the model after the steps. The
+timeline ``step`` is the index of the model. Index 0 is the model that was given or fitted first, and each step adds an
+index. The right plot of a pair follows this timeline. Rerun has no logarithmic axes, so ``allan_chart`` converts plots
+to lines. The stream is separate from the stream of the live view. Importing this module imports Rerun.
 
 Entities: ``/<axis>/steps``, ``/<axis>/gap/<lens>``, ``/<axis>/<lens>/before``, ``/<axis>/<lens>/after``, ``/overview``.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -23,17 +24,9 @@ from monitor.common.units import format_duration
 from monitor.publishing.plots import colours
 from monitor.publishing.plots.diagnostic_figure import MAX_MARKERS, DiagnosticPlot, to_field_units, value_limits
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.publishing.rerun.allan_chart import (
-    FILL_STEPS,
-    HEIGHT,
-    WIDTH,
-    Scale,
-    band_strokes,
-    clip_to_box,
-    decade_range,
-    finite_sections,
-    grid_lines,
-)
+from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH, Scale, clip_to_box, decade_range, finite_sections
+from monitor.publishing.rerun.allan_drawing import fill_band, log_grid, log_lines
+from monitor.publishing.rerun.views import collapsed_blueprint, drawing_view, markdown
 from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation
 
 APPLICATION: Final = "imu-monitor"
@@ -70,7 +63,7 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.save(path, default_blueprint=blueprint(r))
-    stream.log("overview", _markdown(_overview(r)), static=True)
+    stream.log("overview", markdown(_overview(r)), static=True)
     for axis in _axes(r):
         _log_axis(stream, r, r.axes[axis])
     stream.flush()
@@ -78,18 +71,11 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
 
 
 def blueprint(r: Reconciliation) -> rrb.Blueprint:
-    """Return the layout: a tab per axis, those that differ from the model first, and a tab for all axes."""
+    """Return the layout with one tab for each axis and one for all axes. Axes that differ from the model come first."""
     axes = sorted(_axes(r), key=lambda axis: r.axes[axis].verdict == "agrees")
     tabs: list[rrb.View | rrb.Container] = [_tab(r.axes[axis]) for axis in axes]
     tabs.append(rrb.TextDocumentView(origin="/overview", contents="$origin", name="All axes"))
-    return rrb.Blueprint(
-        rrb.Tabs(*tabs, active_tab=0),
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
-        auto_views=False,
-        auto_layout=False,
-    )
+    return collapsed_blueprint(rrb.Tabs(*tabs, active_tab=0), TIMELINE)
 
 
 def _overview(r: Reconciliation) -> str:
@@ -135,12 +121,12 @@ def _axes(r: Reconciliation) -> list[str]:
 
 
 def _snapshots_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
-    """Return the diagnostics with the first model and after each step; the last one excludes withdrawn effects."""
+    """Return the diagnostics for the first model and after each step. Withdrawn effects are not in the last model."""
     return [result.start, *(step.snapshot_after for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
 def _drawn_diagnostics(result: AxisResult) -> list[str]:
-    """Return the logarithmic diagnostics of an axis that are drawn."""
+    """Return the first diagnostics with logarithmic axes, which are drawn."""
     return [view.lens for view in result.start.plots if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
 
@@ -169,26 +155,21 @@ def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
     """Return the view of one diagnostic, before or after the steps."""
     what = words.diagnostic_name(lens)
     what = what[0].upper() + what[1:]
-    names = {"before": f"{what}: beside the first model", "after": f"{what}: after the steps"}
-    return rrb.Spatial2DView(
-        origin=f"/{result.axis}/{lens}/{when}",
-        contents="$origin/**",
-        name=names[when],
-        background=rrb.Background(color=colours.BACKGROUND),
-        visual_bounds=rrb.VisualBounds2D(x_range=[-1.7, WIDTH + 0.7], y_range=[-1.5, HEIGHT + 1.7]),
-    )
+    names = {"before": f"{what}: first model", "after": f"{what}: after the steps"}
+    origin = f"/{result.axis}/{lens}/{when}"
+    return drawing_view(origin, names[when], "$origin/**", (-1.7, WIDTH + 0.7), (-1.5, HEIGHT + 1.7))
 
 
 def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
     """Log all entities of one axis."""
-    stream.log(f"{result.axis}/steps", _markdown(_steps_text(r, result)), static=True)
+    stream.log(f"{result.axis}/steps", markdown(_steps_text(r, result)), static=True)
     for lens in _drawn_diagnostics(result):
         _log_diagnostic(stream, result, lens)
     _log_gaps(stream, result)
 
 
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
-    """Log the gap of each diagnostic relative to its threshold, for the largest gaps, and the threshold, which is 1."""
+    """Log the largest gaps divided by their thresholds, and a line at 1 for the threshold."""
     snapshots = [
         {score.lens: words.gap_to_threshold_ratio(score) for score in snapshot.gaps}
         for snapshot in _snapshots_by_step(result)
@@ -205,13 +186,13 @@ def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
 
 
 def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float]) -> None:
-    """Log values by step."""
+    """Log one value for each step."""
     steps = rr.TimeColumn(TIMELINE, sequence=range(len(values)))
     stream.send_columns(path, [steps], rr.Scalars.columns(scalars=np.array(values)))
 
 
 def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
-    """Log both plots of one diagnostic with the same scale."""
+    """Draw both plots of one diagnostic with the same scale."""
     axis = result.axis
     views = [
         next((view for view in snapshot.plots if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
@@ -232,30 +213,21 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
 def _log_curves(
     stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str, static: bool
 ) -> None:
-    """Log the band, the measured curve and the expected curve."""
-    # A lower end of zero has no logarithm; it is drawn below the box.
+    """Draw the band, the measured curve and the expected curve."""
+    # A lower end of zero has no logarithm. It is drawn below the box.
     low, high = (scale.to_chart(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
-    fill = rr.LineStrips2D(
-        list(band_strokes(low, high)), colors=[BAND_COLOUR], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0
-    )
-    stream.log(f"{path}/band", fill, static=static)
+    log = partial(stream.log, static=static)
+    log(f"{path}/band", fill_band(low, high, BAND_COLOUR))
     colour, at = colours.AXIS_COLOURS[axis], _inside(scale.to_chart(plot.x, plot.measured))
-    thin = rr.Radius.ui_points(0.8)
-    stream.log(
-        f"{path}/measured",
-        rr.LineStrips2D(finite_sections(at), colors=[colour], radii=thin, draw_order=5.0),
-        static=static,
-    )
+    log_lines(log, f"{path}/measured", finite_sections(at), [colour], 0.8, 5.0)
     if len(at) <= MAX_MARKERS:
-        dots = rr.Points2D(at, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0)
-        stream.log(f"{path}/points", dots, static=static)
+        log(f"{path}/points", rr.Points2D(at, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
     expected = finite_sections(_inside(scale.to_chart(plot.x, plot.expected)))
-    line = rr.LineStrips2D(expected, colors=[colours.TEXT], radii=rr.Radius.ui_points(1.0), draw_order=10.0)
-    stream.log(f"{path}/expected", line, static=static)
+    log_lines(log, f"{path}/expected", expected, [colours.TEXT], 1.0, 10.0)
 
 
 def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, result: AxisResult, lens: str) -> None:
-    """Log a frame around each range in which this diagnostic found a gap."""
+    """Draw a frame around each range in which a diagnostic found a gap."""
     view = next(view for view in result.start.plots if view.lens == lens)
     founds = [step.before for step in result.steps] + list(result.left_over)
     marks = [to_field_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
@@ -265,41 +237,20 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, resul
     one = 10.0 ** np.array([scale.y[0], scale.y[0]], float)
     ends = [np.clip(scale.to_chart(np.array(bound), one)[:, 0], 0.0, WIDTH) for bound in bounds]
     frames = [np.array([[a, 0], [b, 0], [b, HEIGHT], [a, HEIGHT], [a, 0]]) for a, b in ends]
-    strips = rr.LineStrips2D(frames, colors=[RANGE_COLOUR], radii=rr.Radius.ui_points(0.75), draw_order=-5.0)
-    stream.log(f"{path}/place", strips, static=True)
+    log_lines(partial(stream.log, static=True), f"{path}/place", frames, [RANGE_COLOUR], 0.75, -5.0)
 
 
 def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str) -> None:
-    """Log frame, decade lines, labels and the key to the curves."""
-    lines = grid_lines(scale)
-    for name, strips, colour, order in (
-        ("minor", lines.minor, colours.MINOR, -30.0),
-        ("major", lines.major, colours.MAJOR, -29.0),
-        ("frame", lines.frame, colours.FRAME, -10.0),
-    ):
-        strip = rr.LineStrips2D(strips, colors=[colour], radii=rr.Radius.ui_points(0.5), draw_order=order)
-        stream.log(f"{path}/grid/{name}", strip, static=True)
+    """Draw the frame, the decade lines, the labels and the legend."""
+    log = partial(stream.log, static=True)
     key = [("measured", colours.AXIS_COLOURS[axis]), ("model", colours.TEXT), ("95 %", BAND_COLOUR)]
-    at = [(x, -0.85, name) for x, (name, _) in zip(LEGEND_X, key, strict=True)]
+    names = [(x, -0.85, name) for x, (name, _) in zip(LEGEND_X, key, strict=True)]
     strokes = [np.array([[x - 1.9, -0.42], [x - 1.2, -0.42]]) for x in LEGEND_X]
-    strip = rr.LineStrips2D(strokes, colors=[tint for _, tint in key], radii=rr.Radius.ui_points(2.0), draw_order=30.0)
-    stream.log(f"{path}/grid/key", strip, static=True)
-    labels = [*lines.ticks, (WIDTH / 2, HEIGHT + 0.85, plot.x_label), (2.4, -0.85, plot.y_label), *at]
-    points = rr.Points2D(
-        [(x, y) for x, y, _ in labels],
-        labels=[text for _, _, text in labels],
-        colors=[colours.TEXT],
-        radii=[0.0],
-        show_labels=True,
-    )
-    stream.log(f"{path}/grid/labels", points, static=True)
+    log_lines(log, f"{path}/grid/key", strokes, [tint for _, tint in key], 2.0, 30.0)
+    labels = [(WIDTH / 2, HEIGHT + 0.85, plot.x_label), (2.4, -0.85, plot.y_label), *names]
+    log_grid(log, f"{path}/grid", scale, f"{path}/grid/labels", labels)
 
 
 def _inside(at: Floats) -> Floats:
-    """Limit a curve to the box; outside values are drawn on its edge."""
+    """Limit a curve to the box. Values outside are drawn on the edge of the box."""
     return np.column_stack([at[:, 0], clip_to_box(at[:, 1])])
-
-
-def _markdown(text: str) -> rr.TextDocument:
-    """Return a Markdown document."""
-    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)

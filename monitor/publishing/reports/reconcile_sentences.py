@@ -1,8 +1,8 @@
 """Sentences and formatted values for the results of ``reconcile``, used by the page, the viewer and the terminal.
 
-Functions convert the types of ``monitor.reconcile.result`` (SI) into short text. The SI unit selects the unit of the
-field. The size of the number is also considered if one SI unit serves for small and large quantities, such as rad/s
-for a bias and for a range. A value has as many digits as its 95 % interval allows. This module does not depend on
+The functions of this module convert the types of ``monitor.reconcile.result``, which are in SI units, into short text.
+The SI unit of a quantity selects the displayed unit. A small rate is displayed in °/h and a large rate in °/s, although
+both have the SI unit rad/s. A value has as many digits as its 95 % interval allows. This module does not depend on
 HTML, Rerun or a terminal.
 """
 
@@ -43,9 +43,9 @@ RESULT_TEXTS: Final = {
     "partly_explained": "partly explained",
     "unexplained": "unexplained",
 }
-"""Text of each result."""
+"""Text for each result of an axis or a recording."""
 DIAGNOSTIC_NAMES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
-"""Names of diagnostics that differ from their identifier."""
+"""Displayed names of the diagnostics whose identifier is no plain word."""
 SAMPLE_SI_UNITS: Final[dict[Kind, str]] = {"gyro": "rad/s", "accel": "m/s²"}
 GRAVITY: Final = 9.80665  # m/s², standard (CGPM 1901)
 SMALL_UNIT_BELOW: Final = 0.1  # °/s or m/s²; below it, a rate or an acceleration is shown in °/h or µg
@@ -70,23 +70,23 @@ FIELD_UNITS: Final = {
     "m/s²/√Hz": Unit(MICRO_G, "µg/√Hz"),
     **dict.fromkeys(("(m/s²)²", "m²/s⁴"), Unit(MICRO_G**2, "µg²")),
 }
-"""Unit of the field for each SI unit; units that are absent (Hz, s, °C) are used as they are."""
+"""Displayed unit for each SI unit. Units that are absent, such as Hz, s and °C, are displayed unchanged."""
 UNITS_BY_NAME: Final = {"phase": Unit(DEGREE, "°"), "fraction": Unit(100.0, "%")}
-"""Units of parameters that their SI unit does not determine."""
+"""Displayed units of the parameters whose SI unit does not determine the displayed unit."""
 RANGE_FORMATS: Final = {
     "frequency": ("", Unit(1.0, "Hz")),
     "tau": ("τ = ", Unit(1.0, "s")),
     "time": ("t = ", Unit(1.0, "s")),
     "temperature": ("", Unit(1.0, "°C")),
 }
-"""Prefix and unit of each kind of range."""
+"""Prefix and unit for each kind of range."""
 MIN_RANGE_SHARE: Final = 1e-3  # a range narrower than this share of its position is written as one number
 SYMMETRY_TOLERANCE: Final = 0.1  # sides of an interval that differ by less than this share are written as ±
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """Text of one parameter; unknown parts are empty."""
+    """Texts for one parameter. Unknown parts are empty."""
 
     name: str
     value: str  # "30.94", "ax"
@@ -97,7 +97,7 @@ class Parameter:
 
 
 def field_unit(si: str, size: float) -> Unit:
-    """Return the unit of the field for a quantity of this size.
+    """Return the displayed unit of a quantity.
 
     >>> field_unit("rad/s", 1e-4).name, field_unit("rad/s", 5.0).name, field_unit("Hz", 17.0).name
     ('°/h', '°/s', 'Hz')
@@ -107,7 +107,7 @@ def field_unit(si: str, size: float) -> Unit:
     si
         SI unit.
     size
-        Size of the quantity in the SI unit.
+        Value of the quantity in the SI unit.
     """
     for kind in KINDS:
         if si == SAMPLE_SI_UNITS[kind]:
@@ -127,7 +127,7 @@ def diagnostic_name(lens: str) -> str:
 
 
 def format_probability(share: float) -> str:
-    """Format a probability; values near 0 and 1 are written as inequalities.
+    """Format a probability. Values near 0 and 1 are written as inequalities.
 
     >>> format_probability(0.998), format_probability(0.99999), format_probability(0.0002)
     ('99.8 %', '> 99.9 %', '< 0.1 %')
@@ -140,7 +140,7 @@ def format_probability(share: float) -> str:
 
 
 def format_range(where: Location, axis: str) -> str:
-    """Format the range in which a diagnostic found a gap; "everywhere" if no range is given.
+    """Format the range in which a diagnostic found a gap. Return "everywhere" if no range is given.
 
     >>> format_range(Location(tau=(1.0, 4.0), source="ax"), "gz"), format_range(Location(time=(1800.0, 1800.5)), "gz")
     ('τ = 1 … 4 s, from ax', 't = 1800 s')
@@ -193,13 +193,13 @@ def format_gap(size: float) -> str:
 
 
 def gap_to_threshold_ratio(one: DiagnosticGap) -> float:
-    """Return gap divided by threshold; 0 if the ratio is not finite."""
+    """Return the gap divided by the threshold, or 0 if this ratio is not finite."""
     share = one.gap / one.threshold if one.threshold > 0.0 else 0.0
     return share if isfinite(share) else 0.0
 
 
 def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> tuple[Parameter, ...]:
-    """Return the text of all parameters of a step; for a changed term, also its value in the model under test.
+    """Return the texts of all parameters of a step.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def describe_step(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -
 
 
 def summarize(r: Reconciliation) -> str:
-    """Return the result of the whole recording in one or two sentences."""
+    """Return the result of the whole recording in a few sentences."""
     differ = [axis for axis in AXES if axis in r.axes and r.axes[axis].verdict != "agrees"]
     unexplained = [axis for axis in differ if r.axes[axis].left_over]
     model = "The model of five classic terms, fitted first," if r.fitted_first else "The model"
@@ -276,7 +276,7 @@ def describe_alternatives(step: AddedOrResizedEffect) -> str:
 
 
 def describe_held_out_gap(step: AddedOrResizedEffect) -> str:
-    """Return how the gap changed on the held-out data, which were not used to choose the effect."""
+    """Return the gap before and after a step on held-out data, which were not used to choose the effect."""
     before, after = step.held_out_before, step.held_out_after
     if before is None or after is None:
         return f"None: {step.held_out_reason}."
@@ -284,7 +284,7 @@ def describe_held_out_gap(step: AddedOrResizedEffect) -> str:
 
 
 def parameter_unit(effect: str, name: str, axis: str, size: float) -> Unit:
-    """Return the unit of the field for a parameter of an effect.
+    """Return the displayed unit of a parameter of an effect.
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ def parameter_unit(effect: str, name: str, axis: str, size: float) -> Unit:
     axis
         Name of the axis.
     size
-        Size of the value in the SI unit.
+        Value of the parameter in the SI unit.
     """
     si = gyro_and_accel_units(EFFECTS[effect])[name][KINDS.index(sensor_kind(axis))]
     return UNITS_BY_NAME.get(name) or field_unit(si, size)
@@ -322,7 +322,7 @@ def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: s
 
 
 def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str:
-    """Format a value with ±, or with both ends if its interval is asymmetric."""
+    """Format a value with ±, or with both ends of an asymmetric interval."""
     below, above = value - lo, hi - value
     if abs(above - below) > SYMMETRY_TOLERANCE * (above + below):
         return f"{texts[0]} ({texts[1]} … {texts[2]})"
@@ -330,7 +330,7 @@ def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str
 
 
 def _with_interval(value: float, lo: float, hi: float) -> tuple[str, ...]:
-    """Format value, lo, hi and half the width of the interval to the second digit of the half width."""
+    """Format value, lo, hi and half width of an interval with the two leading digits of the half width."""
     half = 0.5 * (hi - lo)
     decimals = 1 - floor(log10(half))
     if 0 <= decimals <= 9 and max(map(abs, (value, lo, hi))) < 1e6:

@@ -1,8 +1,9 @@
 """Geometry of a log-log Allan plot for a viewer without logarithmic axes.
 
-Curves in the units of the field are converted to points and lines in chart units. The chart is a box of ``WIDTH`` by
-``HEIGHT`` with equal units on both axes. The y axis points down, as in Rerun's 2D view. The box is fixed, so the
-bounds of the view are set once. The decades inside the box follow the data. The module does no I/O.
+Averaging times and deviations are converted to points and lines in chart units. The chart is a box of ``WIDTH`` by
+``HEIGHT`` with equal units on both axes. The y axis points down, as in the 2D view of Rerun. The size of the box is
+fixed, so that the limits of the view are set only once. The range of decades is chosen from the data. The module does
+no I/O.
 """
 
 import math
@@ -17,25 +18,25 @@ from drivers.sample import Floats
 WIDTH: Final = 16.0
 HEIGHT: Final = 11.5
 MIN_DECADES: Final = 2.0
-FILL_STEPS: Final = 96  # number of vertical strokes that fill a band over the width of its curve
+FILL_STEPS: Final = 96  # number of vertical strokes that fill a band
 
 
 @dataclass(frozen=True, slots=True)
 class Scale:
-    """Range of τ and σ shown in the box, as exponents of ten."""
+    """Range of averaging times and deviations that the box shows, as exponents of ten."""
 
     x: tuple[int, int]
     y: tuple[int, int]
 
     def to_chart(self, tau: Floats, sigma: Floats) -> Floats:
-        """Return chart positions, shape [n, 2]; NaN if σ is not positive.
+        """Return positions in chart units, shape [n, 2]. NaN where the deviation is not positive.
 
         Parameters
         ----------
         tau
             Averaging times [s], shape [n].
         sigma
-            Deviations in the unit of the field, shape [n].
+            Deviations in the unit of the plot, shape [n].
         """
         with np.errstate(divide="ignore", invalid="ignore"):
             log_tau, log_sigma = np.log10(tau), np.log10(np.where(sigma > 0, sigma, np.nan))
@@ -68,12 +69,12 @@ def decade_range(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tup
 
 
 def clip_to_box(y: Floats) -> Floats:
-    """Limit heights to the box, because an interval may extend far below the plot."""
+    """Limit heights to the box. An interval may extend far below the plot."""
     return np.clip(y, 0.0, HEIGHT)
 
 
 def finite_sections(positions: Floats) -> list[Floats]:
-    """Return the finite sections of a line with at least two points; NaN separates sections."""
+    """Return the sections of a line with at least two finite points. NaN separates sections."""
     good = np.isfinite(positions).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
     return [positions[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
@@ -141,7 +142,7 @@ class Grid:
 
 
 def grid_lines(scale: Scale) -> Grid:
-    """Return decade lines, fainter lines at 2 … 9, and labels below and to the left of the box."""
+    """Return lines at the powers of ten, minor lines at multiples, and labels below and to the left of the box."""
     x_at, x_minor = _line_positions(scale.x, WIDTH)
     y_at, y_minor = _line_positions(scale.y, HEIGHT)
     flip = HEIGHT
@@ -156,7 +157,7 @@ def grid_lines(scale: Scale) -> Grid:
 
 
 def _line_positions(span: tuple[int, int], length: float) -> tuple[list[float], list[float]]:
-    """Return the positions of the decades along an axis, and of 2 … 9 between them."""
+    """Return the positions of the powers of ten along an axis, and of 2 to 9 times each power of ten."""
     per_decade = length / (span[1] - span[0])
     at = [i * per_decade for i in range(span[1] - span[0] + 1)]
     between = [a + math.log10(k) * per_decade for a in at[:-1] for k in range(2, 10)]
@@ -174,5 +175,5 @@ def _horizontal(y: float) -> Floats:
 
 
 def _tick(power: int) -> str:
-    """Format a power of ten: 0.01, 1, 1000, and 1e6 outside 10⁻⁴ to 10⁴."""
+    """Format a power of ten, as a plain number between 0.0001 and 10000 and otherwise as 1e6."""
     return f"{10.0**power:g}" if -4 <= power <= 4 else f"1e{power}"

@@ -1,7 +1,7 @@
-"""Allan plots of the viewer: measured points with intervals, fitted curves, and the model in force.
+"""Allan plots of the viewer, with measured points, intervals, the fitted deviation and the noise model.
 
-The plot of an axis is a drawing. Its entity therefore also holds tau, deviation, lo and hi in SI, for programs that
-read the recording. Importing this module imports Rerun.
+Rerun draws a plot as lines and points in chart units. The entity of an axis therefore also contains tau, deviation, lo
+and hi in SI units, for programs that read the recording. Importing this module imports Rerun.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,7 +48,7 @@ class AllanPlot:
     def __init__(self, log: Log, path: str) -> None:
         self._log = log
         self._path = path
-        self._scales: dict[Kind, Scale] = {}  # scale of the grid that was drawn last
+        self._scales: dict[Kind, Scale] = {}  # scale of the newest grid
 
     def draw(self, estimate: Estimate, gap: ModelGap | None) -> None:
         """Draw the curves of an estimate.
@@ -58,7 +58,7 @@ class AllanPlot:
         estimate
             The estimate.
         gap
-            Comparison with the model in force, whose curves are dashed; None if there is no model.
+            Comparison with the noise model, which is drawn as dashed lines. None if there is no model.
         """
         for kind in KINDS:
             curves = [curve for axis in axes_of(kind) if (curve := _Curve.of(estimate, axis, gap)) is not None]
@@ -75,55 +75,41 @@ class AllanPlot:
                 self._draw_curve(scale, curve)
 
     def _draw_grid(self, kind: Kind, scale: Scale, axes: Sequence[str]) -> None:
-        """Log frame, decade lines and tick labels of a plot, and a legend above the right end of the box."""
-        path, lines = f"{self._path}/{kind}", grid_lines(scale)
-        for name, strips, colour, order in (
-            ("minor", lines.minor, colours.MINOR, -30.0),
-            ("major", lines.major, colours.MAJOR, -29.0),
-            ("frame", lines.frame, colours.FRAME, -10.0),
-        ):
-            self._log_lines(f"{path}/{name}", strips, [colour], 0.5, order)
+        """Draw frame, decade lines and tick labels of a plot, and a legend above the right end of the box."""
+        path = f"{self._path}/{kind}"
         titles = [
             (WIDTH / 2, HEIGHT + 0.85, "averaging time τ, s"),
             (1.2, -0.85, f"σ(τ), {DEVIATION_UNITS[kind].name}"),
         ]
-        self._log(f"{path}/ticks", label_points([*lines.ticks, *titles]))
+        log_grid(self._log, path, scale, f"{path}/ticks", titles)
         ends = [(axis, WIDTH - 2.0 * (len(axes) - 1 - i) - 0.5) for i, axis in enumerate(axes)]
         strokes = [np.array([[x - 1.15, -0.42], [x - 0.5, -0.42]]) for _, x in ends]
-        self._log_lines(f"{path}/legend/strokes", strokes, [colours.AXIS_COLOURS[axis] for axis in axes], 2.0, 30.0)
+        log_lines(
+            self._log, f"{path}/legend/strokes", strokes, [colours.AXIS_COLOURS[axis] for axis in axes], 2.0, 30.0
+        )
         self._log(f"{path}/legend", label_points([(x, -0.85, axis) for axis, x in ends]))
 
     def _draw_curve(self, scale: Scale, curve: "_Curve") -> None:
-        """Log band, fitted line, intervals and measured points of one axis, and the model in force as a dashed line."""
+        """Draw band, fitted line, intervals and measured points of one axis, and the noise model as a dashed line."""
         path, colour = f"{self._path}/{curve.axis}", colours.AXIS_COLOURS[curve.axis]
         low, high, fitted, model, deviation = (
             scale.to_chart(curve.tau, part) for part in (curve.lo, curve.hi, curve.fitted, curve.model, curve.deviation)
         )
-        fill = rr.LineStrips2D(
-            list(band_strokes(low, high)),
-            colors=[colours.blend(colour, 0.22)],
-            radii=[WIDTH / FILL_STEPS / 2],
-            draw_order=-20.0,
-        )
+        fill = fill_band(low, high, colours.blend(colour, 0.22))
         self._log(f"{path}/band", fill)
-        self._log_lines(f"{path}/interval", list(interval_strokes(low, high)), [colours.blend(colour, 0.6)], 0.75, 5.0)
-        self._log_lines(f"{path}/fit", finite_sections(fitted), [colour], 1.25, 10.0)
+        log_lines(
+            self._log, f"{path}/interval", list(interval_strokes(low, high)), [colours.blend(colour, 0.6)], 0.75, 5.0
+        )
+        log_lines(self._log, f"{path}/fit", finite_sections(fitted), [colour], 1.25, 10.0)
         dashes = [stroke for section in finite_sections(model) for stroke in dash_line(section)]
-        self._log_lines(f"{path}/model", dashes, [colours.TEXT], 0.75, 15.0)
+        log_lines(self._log, f"{path}/model", dashes, [colours.TEXT], 0.75, 15.0)
         points = rr.Points2D(deviation, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0)
         self._log(path, points, rr.AnyValues(drop_untyped_nones=True, **curve.si))
-
-    def _log_lines(
-        self, path: str, strips: Sequence[Floats], line_colours: Sequence[Colour], radius: float, order: float
-    ) -> None:
-        """Log lines, given their colours, radius in points and drawing order."""
-        radii = rr.Radius.ui_points(radius)
-        self._log(path, rr.LineStrips2D(strips, colors=line_colours, radii=radii, draw_order=order))
 
 
 @dataclass(frozen=True)
 class _Curve:
-    """Allan curve of one axis at its measured points, in the unit of the field."""
+    """Deviations of one axis at its measured averaging times, in the unit of the plot."""
 
     axis: str
     tau: Floats
@@ -131,17 +117,17 @@ class _Curve:
     lo: Floats
     hi: Floats
     fitted: Floats
-    model: Floats  # deviation of the model in force; NaN if there is none
+    model: Floats  # deviation of the noise model; NaN without a model
     si: dict[str, Floats]
 
     @property
     def curves_for_height(self) -> tuple[Floats, ...]:
-        """Curves that determine the height of the plot; intervals may extend beyond it."""
+        """Curves that determine the range of the y axis. Intervals may extend beyond this range."""
         return self.deviation, self.fitted, self.model
 
     @classmethod
     def of(cls, estimate: Estimate, axis: str, gap: ModelGap | None) -> "_Curve | None":
-        """Return the curve of an axis; None if it has fewer than two points."""
+        """Return the deviations of an axis, or None if there are fewer than two points."""
         curve, i = estimate.curve, AXES.index(axis)
         rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)
         if int(rows.sum()) < 2:
@@ -153,6 +139,67 @@ class _Curve:
             model = gap.axes[axis].model[rows]
         f = DEVIATION_UNITS[sensor_kind(axis)].factor
         return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, model * f, si)
+
+
+def log_grid(log: Log, path: str, scale: Scale, labels_path: str, labels: Sequence[tuple[float, float, str]]) -> None:
+    """Log frame, decade lines, tick labels and further labels of a plot.
+
+    Parameters
+    ----------
+    log
+        Function that logs an entity.
+    path
+        Path of the lines.
+    scale
+        Range of the plot.
+    labels_path
+        Path of the labels.
+    labels
+        Further labels, each given by x, y and text.
+    """
+    lines = grid_lines(scale)
+    log_lines(log, f"{path}/minor", lines.minor, [colours.MINOR], 0.5, -30.0)
+    log_lines(log, f"{path}/major", lines.major, [colours.MAJOR], 0.5, -29.0)
+    log_lines(log, f"{path}/frame", lines.frame, [colours.FRAME], 0.5, -10.0)
+    log(labels_path, label_points([*lines.ticks, *labels]))
+
+
+def log_lines(
+    log: Log, path: str, strips: Sequence[Floats], line_colours: Sequence[Colour], radius: float, order: float
+) -> None:
+    """Log lines.
+
+    Parameters
+    ----------
+    log
+        Function that logs an entity.
+    path
+        Path of the entity.
+    strips
+        Points of each line, shape [n, 2].
+    line_colours
+        One colour for each line, or one for all lines.
+    radius
+        Half of the line width [points of the screen].
+    order
+        Drawing order; higher values are in front.
+    """
+    radii = rr.Radius.ui_points(radius)
+    log(path, rr.LineStrips2D(strips, colors=line_colours, radii=radii, draw_order=order))
+
+
+def fill_band(low: Floats, high: Floats, colour: Colour) -> rr.LineStrips2D:
+    """Return vertical strokes that fill the area between two curves.
+
+    Parameters
+    ----------
+    low, high
+        Curves in chart units, shape [n, 2].
+    colour
+        Colour of the area.
+    """
+    width = WIDTH / FILL_STEPS
+    return rr.LineStrips2D(list(band_strokes(low, high)), colors=[colour], radii=[width / 2], draw_order=-20.0)
 
 
 def label_points(labels: Sequence[tuple[float, float, str]]) -> rr.Points2D:

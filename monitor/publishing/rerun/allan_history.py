@@ -1,8 +1,8 @@
-"""History of a device's Allan deviations in a table of limited size, for a live view over time.
+"""History of the Allan deviations of a device, in a table of limited size for the live view.
 
-Estimates are aggregated into columns, oldest first. Each column is the mean of the logarithms of the estimates in a
-time span. When the table holds COLUMNS columns, neighbouring columns are averaged, and each column then covers twice
-the time. The table therefore covers the whole history at constant memory. The module does no I/O.
+Estimates are aggregated into columns, oldest first. Each column is the mean of the logarithms of the estimates in one
+time interval. When the table has COLUMNS columns, pairs of neighbouring columns are averaged, and each column then
+covers twice the time. The table therefore covers the whole history with constant memory. The module does no I/O.
 """
 
 import numpy as np
@@ -11,16 +11,16 @@ from drivers.sample import AXES, Floats, Ints
 from monitor.estimation.estimate import Estimate
 
 COLUMNS = 300
-"""Largest number of columns; it must be even, because columns are merged in pairs."""
+"""Largest number of columns. The number must be even, because columns are merged in pairs."""
 INITIAL_COLUMN_S = 2.0
-"""Initial time span of a column [s], in sample time."""
+"""Initial duration of a column [s], in the time of the samples."""
 
 
 class AllanHistory:
     """Allan deviations of one device over time. An estimate with other τ or an earlier time starts a new history."""
 
     def __init__(self, column_s: float = INITIAL_COLUMN_S) -> None:
-        """Create an empty history; ``column_s`` is the initial time span of a column [s]."""
+        """Create an empty history with columns of ``column_s`` seconds."""
         self._first_s = column_s
         self._reset(np.empty(0), 0.0)
 
@@ -50,7 +50,7 @@ class AllanHistory:
         """
         if wall_s < self._newest_s or not np.array_equal(self.tau_s, estimate.curve.tau_s):
             self._reset(estimate.curve.tau_s, wall_s)
-        # The recent curve uses a separate time span for each τ, so a change appears at once and at the correct time.
+        # The recent deviations use a short time for each τ, so that a change appears at once and at the correct time.
         avar = (estimate.display_curve or estimate.curve).avar
         there = np.isfinite(avar) & (avar > 0.0)
         self._sums[there] += 0.5 * np.log(avar[there])
@@ -75,7 +75,7 @@ class AllanHistory:
         self.column_s *= 2.0
 
     def log_ratio_to_median(self) -> Floats:
-        """Return ln(deviation / median over time), shape [columns, m, 6]; NaN if there is no deviation."""
+        """Return ln(deviation / median over time), shape [columns, m, 6]. NaN if there is no deviation."""
         whole = np.stack(self._columns) if self._columns else np.empty((0, self.tau_s.size, len(AXES)))
         there = np.isfinite(whole).any(axis=0)
         median = np.full(there.shape, np.nan)

@@ -1,29 +1,34 @@
 """Layout of the Rerun viewer: health, current noise, and changes.
 
-A single device fills the window. Several devices have an overview and one tab each. A second tab of a device shows
-its noise over time. Panels may add a tab of their own. The time panel follows the newest sample. This module defines
-only the layout and handles no data. Importing it imports Rerun.
+A single device fills the window. Several devices have an overview and one tab each. A second tab of a device shows its
+noise over time. Panels may add separate tabs. The time panel follows the newest sample. This module defines only the
+layout and handles no data. Importing it imports Rerun.
 """
 
 from collections.abc import Sequence
 from typing import Final
 
-import rerun as rr
 import rerun.blueprint as rrb
 from rerun.blueprint.encodings import TimelineColumn
 
 from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, KIND_NAMES, KINDS, SAMPLE_UNITS, Kind, axes_of
-from monitor.publishing.plots import colours
 from monitor.publishing.rerun import dynamic_heat_map
 from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH
 from monitor.publishing.rerun.scene import PANELS
 from monitor.publishing.rerun.viewer_settings import DeviceInfo
-from monitor.publishing.rerun.views import RAW_SAMPLES_S, TIMELINE, temperature_view, time_series_view
+from monitor.publishing.rerun.views import (
+    RAW_SAMPLES_S,
+    TIMELINE,
+    collapsed_blueprint,
+    drawing_view,
+    temperature_view,
+    time_series_view,
+)
 
 NOW_COEFFICIENTS: Final = ("N", "B")
 DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")
 TYPICAL_TAU_COUNT: Final = 17
-"""Octaves of one hour at 100 Hz. A surface with another number of τ has a slightly different height."""
+"""Number of averaging times of one hour at 100 Hz. A heat map with another number has a slightly different height."""
 MAX_DEVICES_WITH_ACCEL: Final = 4
 """Largest number of devices for which the overview also shows accelerometers."""
 MAX_GRID_COLUMNS: Final = 4
@@ -38,21 +43,14 @@ def blueprint(devices: Sequence[DeviceInfo], fleet: bool = False) -> rrb.Bluepri
     devices
         The devices.
     fleet
-        True if there are many more devices; the overview is then a table of all devices.
+        True if the overview is a table of further devices.
     """
     pages, names = [_device(one) for one in devices], [one.name for one in devices]
     if fleet:
         root: rrb.Container = rrb.Tabs(_fleet(names), *pages, active_tab=0)
     else:
         root = pages[0] if len(pages) == 1 else rrb.Tabs(_overview(names), *pages, active_tab=0)
-    return rrb.Blueprint(
-        root,
-        rrb.BlueprintPanel(state="collapsed"),
-        rrb.SelectionPanel(state="collapsed"),
-        rrb.TimePanel(state="collapsed", timeline=TIMELINE, play_state="following"),
-        auto_views=False,
-        auto_layout=False,
-    )
+    return collapsed_blueprint(root, TIMELINE)
 
 
 def _device(device: DeviceInfo) -> rrb.Container:
@@ -83,10 +81,10 @@ def _now(device: DeviceInfo) -> rrb.Container:
 
 
 def _dynamic(device: str) -> rrb.Container:
-    """Return the tab with the Allan surfaces of all axes and, below them, coefficients over time."""
+    """Return the tab with the heat maps of all axes and the coefficients over time."""
     columns = [
         rrb.Vertical(
-            *(_surface(device, axis) for axis in axes_of(kind)),
+            *(_heat_map(device, axis) for axis in axes_of(kind)),
             rrb.Horizontal(*(_coefficient(device, kind, symbol) for symbol in DYNAMIC_COEFFICIENTS)),
             row_shares=[3, 3, 3, 2.6],
         )
@@ -124,35 +122,24 @@ def _overview_texts() -> tuple[rrb.View, rrb.View]:
 
 
 def _event_log(origin: str) -> rrb.View:
-    """Return the view of events; the time of day is part of their text, as its column would be cut off."""
+    """Return the view of events. The time of day is part of the text, because the time column is too narrow."""
     hidden = TimelineColumn(timeline=TIMELINE, visible=False)
     columns = rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["LogLevel", "Body"])
     return rrb.TextLogView(origin=origin, name="Has it changed?", columns=columns)
 
 
-def _surface(device: str, axis: str) -> rrb.View:
-    """Return the view of the Allan surface of one axis."""
+def _heat_map(device: str, axis: str) -> rrb.View:
+    """Return the view of the heat map of one axis."""
     x, y = dynamic_heat_map.view_bounds(TYPICAL_TAU_COUNT)
-    return rrb.Spatial2DView(
-        origin=f"/{device}/dynamic/{axis}",
-        contents="$origin/**",
-        name=f"{axis}: Allan deviation over time, against its median",
-        background=rrb.Background(color=colours.BACKGROUND),
-        visual_bounds=rrb.VisualBounds2D(x_range=list(x), y_range=list(y)),
-    )
+    name = f"{axis}: Allan deviation over time, divided by its median"
+    return drawing_view(f"/{device}/dynamic/{axis}", name, "$origin/**", x, y)
 
 
 def _allan(device: str, kind: Kind, prefix: str = "") -> rrb.View:
     """Return the view of the Allan plot of one kind of sensor."""
     paths = [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
-    bounds = rrb.VisualBounds2D(x_range=[-1.6, WIDTH + 0.6], y_range=[-1.3, HEIGHT + 1.7])
-    return rrb.Spatial2DView(
-        origin=f"/{device}/allan",
-        contents=paths,
-        name=f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {DEVIATION_UNITS[kind].name}",
-        background=rrb.Background(color=colours.BACKGROUND),
-        visual_bounds=bounds,
-    )
+    name = f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {DEVIATION_UNITS[kind].name}"
+    return drawing_view(f"/{device}/allan", name, paths, (-1.6, WIDTH + 0.6), (-1.3, HEIGHT + 1.7))
 
 
 def _coefficient(device: str, kind: Kind, symbol: str) -> rrb.View:
@@ -173,16 +160,3 @@ def _gap(device: str, kind: Kind) -> rrb.View:
     name = f"{KIND_NAMES[kind]}: gap to the model, σ, and its threshold"
     contents = ["$origin/threshold", *(f"$origin/{axis}" for axis in axes_of(kind))]
     return time_series_view(f"/{device}/gap", name, contents)
-
-
-def send_layout(stream: rr.RecordingStream, devices: Sequence[DeviceInfo], fleet: bool = False) -> None:
-    """Send the layout to the viewer of a stream and activate it.
-
-    Parameters
-    ----------
-    stream
-        Stream of the viewer.
-    devices, fleet
-        See ``blueprint``.
-    """
-    stream.send_blueprint(blueprint(devices, fleet), make_active=True, make_default=True)

@@ -12,12 +12,12 @@ import numpy as np
 from drivers.sample import Floats, Ints
 
 ROWS_PER_S: Final = 200.0
-BUCKETS_PER_S: Final = 95.0  # two rows per bucket; the remainder allows for the bucket that each flush divides
+BUCKETS_PER_S: Final = 95.0  # two rows per bucket, and some rows for the buckets that a flush divides
 ROWS_PER_FLUSH: Final = 4000  # limits the rows of a replay at full speed, which delivers hours at once
 
 
 def decimate_extremes(wall_s: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Return the times and values of one axis to draw: finite samples, reduced to bucket extremes if there are many.
+    """Return the times and values of the samples of one axis to draw, which are the extremes of buckets at high rates.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def decimate_extremes(wall_s: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def average_buckets(wall_s: Floats, values: Floats, per_s: float) -> tuple[Floats, Floats]:
-    """Return the mean time and mean value of each time bucket. Temperature, a slow quantity, is reduced this way.
+    """Return the mean time and mean value of each time bucket. This method suits slow quantities such as temperature.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def average_buckets(wall_s: Floats, values: Floats, per_s: float) -> tuple[Float
 
 
 def _bucket_width_s(wall_s: Floats) -> float | None:
-    """Return the bucket width [s]; None if the sample rate is low enough without decimation."""
+    """Return the width of a bucket [s], or None if the sample rate is low enough without decimation."""
     span_s = float(wall_s.max() - wall_s.min())
     rate_hz = (wall_s.size - 1) / span_s if span_s > 0 else np.inf
     if rate_hz <= ROWS_PER_S and wall_s.size <= ROWS_PER_FLUSH:

@@ -1,9 +1,9 @@
 """Allan deviation of a device over time as a heat map, shown by the viewer under ``/<device>/dynamic/<axis>``.
 
-Each axis has an image and labels: time to the right, τ upwards, coloured by the deviation relative to its median over
-time. Rerun draws an image with one unit per pixel and has no axes. Each τ is therefore several pixels high, and labels
-are points. An image is a PNG with a palette of a few kilobytes. The scene draws one when a column is complete, which
-happens less often the longer the service runs. Importing this module imports Rerun.
+Each axis has an image and labels. Time increases to the right and τ upwards. The colour is the deviation divided by its
+median over time. Rerun draws an image with one unit per pixel and without axes. Each τ is therefore several pixels
+high, and labels are drawn as points with text. An image is a PNG file of a few kilobytes with a palette. A new image is
+drawn when a column is complete. Columns become longer as the history grows. Importing this module imports Rerun.
 """
 
 import io
@@ -20,7 +20,7 @@ from monitor.publishing.plots import colours
 from monitor.publishing.rerun.allan_drawing import Log, label_points
 from monitor.publishing.rerun.allan_history import COLUMNS, AllanHistory
 
-HEIGHT: Final = 60  # approximate height of an image [pixels]; with COLUMNS the shape of a third of a tab
+HEIGHT: Final = 60  # approximate height of an image [pixels]; three images fit into a tab
 COLOUR_SCALE_RATIO: Final = 2.0  # ends of the colour scale: half and twice the median
 SHADES: Final = 127  # shades on either side of the median
 NO_VALUE_INDEX: Final = 2 * SHADES + 1  # palette index of a missing deviation
@@ -31,7 +31,7 @@ LABEL_MARGINS_PX: Final = (24.0, 7.0, 32.0, 13.0)  # left, above, right and belo
 
 
 def view_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the bounds in x and y of a view for this number of τ."""
+    """Return the limits in x and y of a view with the given number of averaging times."""
     left, above, right, below = LABEL_MARGINS_PX
     return (-left, COLUMNS + right), (-above, _rows(tau_count) * tau_count + below)
 
@@ -44,7 +44,7 @@ def draw_heat_maps(log: Log, path: str, surface: AllanHistory) -> None:
     log
         Function that logs an entity.
     path
-        Path of the surfaces.
+        Path of the heat maps.
     surface
         Deviations over time.
     """
@@ -65,7 +65,7 @@ def draw_heat_maps(log: Log, path: str, surface: AllanHistory) -> None:
 
 
 def encode_heat_map(log_ratio: Floats) -> bytes:
-    """Return a PNG of ln(deviation / median), shape [columns, m]: COLUMNS pixels wide, the longest τ at the top."""
+    """Return ln(deviation / median), shape [columns, m], as a PNG of COLUMNS pixels width with the longest τ on top."""
     share = np.clip(np.nan_to_num(log_ratio) / np.log(COLOUR_SCALE_RATIO), -1.0, 1.0)
     shade = np.where(np.isfinite(log_ratio), np.rint(SHADES * (1.0 + share)), NO_VALUE_INDEX).astype(np.uint8)
     wide = shade[np.arange(COLUMNS) * len(log_ratio) // COLUMNS]
@@ -77,7 +77,7 @@ def encode_heat_map(log_ratio: Floats) -> bytes:
 
 
 def _palette() -> tuple[colours.Colour, ...]:
-    """Return the palette: blue below the median, dark at it, vermilion above, and the colour of missing values."""
+    """Return the palette: blue below the median, dark at the median, vermilion above, black for missing values."""
     below = [colours.blend(colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, colours.MINOR) for i in range(SHADES)]
     above = [colours.blend(colours.AXIS_COLOURS["gx"], i / SHADES, colours.MINOR) for i in range(SHADES + 1)]
     return (*below, *above, colours.BACKGROUND)

@@ -1,9 +1,9 @@
 """Viewer for the devices of many daemons: ``imu-monitor view``.
 
-Messages from zenoh are drawn as a table of all devices, those with problems first, and a list of all events. Devices
-selected for detail also have samples, Allan plots and coefficients over time, as in the viewer of a daemon. Samples and
-curves are subscribed to only for these, so the other devices cost only their status and coefficients. ``DeviceStates``
-holds the state of the devices, ``decoding`` converts messages into results, and ``RerunView`` draws in its own thread.
+Messages from zenoh are drawn as a table of all devices and a list of all events. Devices with problems are at the top
+of the table. Selected devices also have samples, Allan plots and coefficients over time, as in the viewer of a daemon.
+Only for these devices, samples and Allan deviations are received. ``DeviceStates`` holds the state of the devices, and
+``RerunView`` draws in a separate thread.
 """
 
 import threading
@@ -26,11 +26,11 @@ from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
 RECEIVE_TIMEOUT_S: Final = 0.1
 TABLE_PERIOD_S: Final = 1.0
 MAX_ROWS: Final = 40
-"""Largest number of rows of the table, about one screen; the devices left out have the fewest problems."""
+"""Largest number of rows of the table, about one screen. Devices with the fewest problems are omitted."""
 
 
 def full_device_key(device: str, keyexpr: str) -> str:
-    """Return the key of a device that is given in full or relative to the fixed start of a key expression.
+    """Return the full key of a device, whose key may be relative to the part of a key expression before any wildcard.
 
     >>> full_device_key("nose", "imu/**"), full_device_key("fleet/a7/nose", "fleet/**")
     ('imu/nose', 'fleet/a7/nose')
@@ -59,7 +59,7 @@ class FleetView:
     subscriber
         Subscriber, including the topics of devices shown in detail.
     viewer
-        Viewer whose devices are those shown in detail, named by their keys.
+        Viewer of the devices shown in detail, which are named by their keys.
     detail
         Keys of the devices shown in detail.
     """
@@ -69,7 +69,7 @@ class FleetView:
         self._viewer = viewer
         self._detail = frozenset(detail)
         self.board = DeviceStates()
-        self.malformed = 0  # number of samples and curves that could not be decoded
+        self.malformed = 0  # number of messages of devices in detail that could not be decoded
 
     def run(self, stop: threading.Event, tell: Callable[[str], None], seconds: float | None = None) -> None:
         """Process messages until ``stop`` is set.
@@ -79,7 +79,7 @@ class FleetView:
         stop
             Event that ends the method.
         tell
-            Function called with the address of the page and any problem, whenever one of them changes.
+            Function that is called with the address of the page and a description of problems when one of them changes.
         seconds
             Longest duration [s]; None: no limit.
         """
@@ -100,7 +100,7 @@ class FleetView:
                 tell(report)
 
     def process_message(self, message: Message) -> None:
-        """Process a message: update the table, and the viewer if the device is shown in detail."""
+        """Update the table with a message, and the viewer if the device is shown in detail."""
         if message.payload is None:
             self.board.set_token(message.key, message.there)
             return
@@ -134,7 +134,7 @@ class FleetView:
         self._viewer.put("", wall_s, DeviceTableText(fleet_text(devices, now_s, MAX_ROWS, note)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
-        """Pass samples or a curve of a device shown in detail to the viewer."""
+        """Pass samples or Allan deviations to the viewer."""
         if topic is topics.SAMPLES:
             rows = decode_samples(payload).block
             unix_s = rows.t_ns / 1e9

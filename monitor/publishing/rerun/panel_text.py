@@ -1,7 +1,6 @@
-"""Text of the viewer's panels as Markdown: health and current noise.
+"""Text of the panels of the viewer as Markdown: health, current noise, and tables of devices.
 
-Functions convert a ``Health`` or an ``Estimate`` into text with the units of the field. They do no I/O, so the text
-can be tested without a viewer.
+The functions do no I/O, so the text can be tested without a viewer.
 """
 
 import math
@@ -33,12 +32,12 @@ from monitor.publishing.messages.results import measured_axes
 from monitor.publishing.remote_devices import RemoteDevice
 
 FLEET_AXES: Final = ("gx", "gy", "gz")
-"""Axes whose white noise is shown in the table of all devices [°/√h]."""
+"""Axes whose white noise N is shown in the table of all devices."""
 STATE_TEXTS: Final = {
     "running": "RUNNING",
     "waiting": "WAITING for the device",
-    "lost": "LOST: the device is gone, trying again",
-    "ended": "ENDED: the recording is at its end",
+    "lost": "LOST: no connection to the device, trying again",
+    "ended": "ENDED: the end of the recording was reached",
 }
 
 
@@ -58,7 +57,7 @@ def health_text(device: str, health: Health, about: str = "") -> str:
     if health.text:
         lines.append(f"**{health.text}**")
     if health.crossed:
-        lines.append(f"beyond its limit: **{', '.join(health.crossed)}**")
+        lines.append(f"limits exceeded: **{', '.join(health.crossed)}**")
     rate = "rate not known yet" if health.rate_hz is None else f"{health.rate_hz:.2f} Hz"
     lines.append(f"**{device}** {about}".rstrip() + f", **{rate}**")
     lines.append(
@@ -75,10 +74,10 @@ def health_text(device: str, health: Health, about: str = "") -> str:
 
 
 def overview_text(healths: Mapping[str, Health]) -> str:
-    """Return a table of several devices, one line each."""
+    """Return a table of several devices with one line for each device."""
     rows = [
         f"| **{name}** | {h.state} | {format_sample_rate(h.rate_hz)} | {h.received:,} | {h.lost:,} | {h.bad:,} "
-        f"| {h.text or 'all well'} |"
+        f"| {h.text or 'no problem'} |"
         for name, h in healths.items()
     ]
     head = "| device | state | rate | received | lost | bad | |\n|:--|:--|--:|--:|--:|--:|:--|"
@@ -108,12 +107,12 @@ def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: s
     if table:
         columns = [*("device", "state", "rate", "received", "lost", "bad"), *(f"N {axis}" for axis in FLEET_AXES), ""]
         table = [f"| {' | '.join(columns)} |", "|:--|:--|" + "--:|" * (len(columns) - 3) + ":--|", *table]
-    left = [f"… and {len(devices) - rows:,} more with less trouble"] if len(devices) > rows else []
+    left = [f"… and {len(devices) - rows:,} more with fewer problems"] if len(devices) > rows else []
     return "\n\n".join([*head, *(["\n".join(table)] if table else []), *left])
 
 
 def _fleet_row(one: RemoteDevice, now_s: float) -> str:
-    """Return the row of one device."""
+    """Return the row of one device in the table of many devices."""
     state, status = one.state(now_s), one.status
     name = _escape_cell(one.key)
     state_text = f"**{state.upper()}**" if one.rank(now_s) == 0 else _escape_cell(state)
@@ -122,7 +121,7 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
         for axis in FLEET_AXES
     ]
     if status is None:
-        return f"| **{name}** | {state_text} | | | | | {' | '.join(noise)} | nothing known yet |"
+        return f"| **{name}** | {state_text} | | | | | {' | '.join(noise)} | no data yet |"
     rate = format_sample_rate(status.rate_hz)
     problems = _escape_cell(one.problems()) or (
         f"no data for {now_s - one.last_message_s:.1f} s" if state in ("gone", "silent") else ""
@@ -132,7 +131,7 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
 
 
 def _escape_cell(text: str) -> str:
-    """Escape text of another process for a table cell, so that it cannot end the cell or form a link or an image."""
+    """Escape text of another process, so that the text cannot end a table cell or form a link or an image."""
     return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remove_control_characters(text))
 
 
@@ -154,7 +153,7 @@ def drift_text(update: DriftUpdate) -> str:
     for at, axis in enumerate(axes_of("gyro")):
         expected, model = float(update.expected[at]), update.models[at]
         if not math.isfinite(expected):
-            rows.append(f"| {axis} | not known yet | | | | |")
+            rows.append(f"| {axis} | no estimate yet | | | | |")
             continue
         error = format_number(1.96 * unit.factor * float(update.error[at]), 2)
         now = f"{format_number(unit.factor * expected)} ± {error} {unit.name}"
@@ -167,7 +166,7 @@ def drift_text(update: DriftUpdate) -> str:
         ]
         rows.append(f"| {axis} | {now} | {model.name} | {' | '.join(parts)} |")
     interval = format_duration(update.interval_s)
-    head = f"Learned at rest, from means of {interval}; what each of them brought anew is the innovation."
+    head = f"Learned at rest from means of {interval}. The innovation is the part of a mean that was not predicted."
     return "\n".join([head, "", *rows])
 
 

@@ -1,6 +1,6 @@
-"""Panels of the Rerun viewer: each draws one kind of result of one device, see ``monitor.publishing.result_kinds``.
+"""Panels of the Rerun viewer. Each panel draws one kind of result of one device.
 
-Numbers are shown in the units of the field. Importing this module imports Rerun.
+The kinds of results are listed in ``monitor.publishing.result_kinds``. Importing this module imports Rerun.
 """
 
 from collections.abc import Sequence
@@ -31,12 +31,13 @@ from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.history.reading import HistoryTable
 from monitor.publishing.plots import colours
 from monitor.publishing.plots.colours import Colour
+from monitor.publishing.plots.style import omit_wide_intervals
 from monitor.publishing.rerun import allan_drawing, dynamic_heat_map, past_points
 from monitor.publishing.rerun.allan_history import AllanHistory
 from monitor.publishing.rerun.decimation import average_buckets, decimate_extremes
 from monitor.publishing.rerun.panel_text import drift_text, health_text, noise_text, overview_text
 from monitor.publishing.rerun.viewer_settings import DeviceInfo
-from monitor.publishing.rerun.views import RAW_SAMPLES_S, temperature_view, time_series_view
+from monitor.publishing.rerun.views import RAW_SAMPLES_S, markdown, temperature_view, time_series_view
 
 if TYPE_CHECKING:
     from monitor.publishing.rerun.scene import Scene
@@ -44,13 +45,10 @@ if TYPE_CHECKING:
 
 TEMPERATURES_PER_S: Final = 5.0
 MAX_INTERMEDIATE_POINTS: Final = 20
-"""Number of coefficient points between two estimates, if the estimator provides values for every sample. More could not
+"""Number of points between two estimates if the estimator provides coefficients for every sample. More points could not
 be distinguished and would overload the viewer."""
 MAX_PAST_EVENTS: Final = 200
 """Largest number of stored events that are shown."""
-MAX_INTERVAL_RATIO: Final = 1.5
-"""Intervals whose ends differ from the value by more than this factor are not drawn. They occur in the first seconds of
-a device and would determine the scale of the plot."""
 WARNING_EVENTS: Final = frozenset({
     "samples_lost",
     "noise_changed",
@@ -80,7 +78,7 @@ class Panel:
         self.device = device
 
     def log_styles(self) -> None:
-        """Log the names, colours and widths of the lines, which do not change."""
+        """Log the constant names, colours and widths of the lines."""
 
     def draw(self, unix_s: Floats, results: Sequence[Any]) -> None:
         """Draw results.
@@ -99,7 +97,7 @@ class Panel:
 
     @classmethod
     def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
-        """Return the layout of a tab of its own; None if the panel is part of the tab Now or Dynamic."""
+        """Return the layout of a separate tab, or None if the panel is part of another tab."""
         return None
 
     def entity_path(self, name: str) -> str:
@@ -113,28 +111,38 @@ class Panel:
             self.entity_path(name), rr.SeriesLines(colors=line_colours, widths=widths, names=names), static=True
         )
 
+    def _style_samples(self, name: str, axes: Sequence[str]) -> None:
+        """Log the styles of the time series of samples."""
+        for axis in axes:
+            line = (f"{axis}, {SAMPLE_UNITS[sensor_kind(axis)].name}", colours.AXIS_COLOURS[axis], 1.0)
+            self._style_lines(f"{name}/{axis}", [line])
+
+    def _log_samples(self, name: str, axes: Sequence[str], results: "Sequence[SampleRows | CompensatedRows]") -> Floats:
+        """Log decimated time series of samples, and return the times of all samples."""
+        times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
+        for i, axis in enumerate(axes):
+            t, y = decimate_extremes(times, values[:, i])
+            factor = SAMPLE_UNITS[sensor_kind(axis)].factor
+            self.scene.log_scalars(self.entity_path(f"{name}/{axis}"), t, y * factor)
+        return times
+
     def _log_text(self, name: str, unix_s: float, text: str) -> None:
         """Log a Markdown text at a Unix time [s]."""
         self.scene.set_time(unix_s)
-        self.scene.log(self.entity_path(name), rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        self.scene.log(self.entity_path(name), markdown(text))
 
 
 class SamplesPanel(Panel):
-    """Time series of the samples, at most 200 rows per second and axis, and of the temperature."""
+    """Time series of the temperature and of the samples, with at most 200 rows per second and axis."""
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
-        for axis in AXES:
-            unit = SAMPLE_UNITS[sensor_kind(axis)].name
-            self._style_lines(f"samples/{axis}", [(f"{axis}, {unit}", colours.AXIS_COLOURS[axis], 1.0)])
+        self._style_samples("samples", AXES)
         self._style_lines("temperature", [("temperature, °C", colours.TEMPERATURE, 1.5)])
 
     def draw(self, unix_s: Floats, results: "Sequence[SampleRows]") -> None:
         """Draw the results."""
-        times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
-        for i, axis in enumerate(AXES):
-            t, y = decimate_extremes(times, values[:, i])
-            self.scene.log_scalars(self.entity_path(f"samples/{axis}"), t, y * SAMPLE_UNITS[sensor_kind(axis)].factor)
+        times = self._log_samples("samples", AXES, results)
         temperature_c = np.concatenate([one.temperature_c for one in results])
         self.scene.log_scalars(
             self.entity_path("temperature"), *average_buckets(times, temperature_c, TEMPERATURES_PER_S)
@@ -149,24 +157,19 @@ class SamplesPanel(Panel):
 
 
 class CompensatedPanel(Panel):
-    """Time series of the angular rates without their drift, thinned like the samples."""
+    """Time series of the angular rates without drift, decimated like the samples."""
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
-        for axis in axes_of("gyro"):
-            line = (f"{axis}, {SAMPLE_UNITS['gyro'].name}", colours.AXIS_COLOURS[axis], 1.0)
-            self._style_lines(f"compensated/{axis}", [line])
+        self._style_samples("compensated", axes_of("gyro"))
 
     def draw(self, unix_s: Floats, results: "Sequence[CompensatedRows]") -> None:
         """Draw the results."""
-        times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
-        for i, axis in enumerate(axes_of("gyro")):
-            t, y = decimate_extremes(times, values[:, i])
-            self.scene.log_scalars(self.entity_path(f"compensated/{axis}"), t, y * SAMPLE_UNITS["gyro"].factor)
+        self._log_samples("compensated", axes_of("gyro"), results)
 
 
 class DriftPanel(Panel):
-    """Means at rest, predicted drift, innovations, and the table of the drift models."""
+    """Means at rest, predicted drift, innovations, and a table of the drift models."""
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
@@ -193,17 +196,17 @@ class DriftPanel(Panel):
 
     @classmethod
     def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
-        """Return the tab, if the device has results of this kind."""
+        """Return the tab if the device has results of this kind."""
         if not device.compensated:
             return None
         name = device.name
         rows = []
         for axis in axes_of("gyro"):
-            title = f"{axis}: rate as measured, and without drift, {SAMPLE_UNITS['gyro'].name}"
+            title = f"{axis}: measured rate, and rate without drift, {SAMPLE_UNITS['gyro'].name}"
             contents = (f"$origin/samples/{axis}", f"$origin/compensated/{axis}")
             dimmed = {f"/{name}/samples/{axis}": rr.SeriesLines(colors=[colours.FRAME], widths=[0.75])}
             rates = time_series_view(f"/{name}", title, contents, RAW_SAMPLES_S, styles=dimmed)
-            title = f"{axis}: means at rest, and the drift expected, {DEVIATION_UNITS['gyro'].name}"
+            title = f"{axis}: means at rest, and predicted drift, {DEVIATION_UNITS['gyro'].name}"
             drift = time_series_view(f"/{name}/drift/{axis}", title)
             innovation = time_series_view(f"/{name}/innovation/{axis}", f"{axis}: innovation, σ")
             rows.append(rrb.Horizontal(rates, drift, innovation, column_shares=[3, 3, 2]))
@@ -241,12 +244,12 @@ class ThermalPanel(Panel):
 
     @classmethod
     def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
-        """Return the tab, if the device has results of this kind."""
+        """Return the tab if the device has results of this kind."""
         if not device.has_thermal:
             return None
         columns = []
         for kind in KINDS:
-            title = f"bias, and what its temperature lets expect, {DEVIATION_UNITS[kind].name}"
+            title = f"bias, and prediction from temperature, {DEVIATION_UNITS[kind].name}"
             views = [time_series_view(f"/{device.name}/thermal/{axis}", f"{axis}: {title}") for axis in axes_of(kind)]
             columns.append(rrb.Vertical(*views))
         temperature = temperature_view(device.name)
@@ -254,7 +257,7 @@ class ThermalPanel(Panel):
 
 
 class GapPanel(Panel):
-    """Gap to the model in force over time. The curve of the model is drawn with the next estimate."""
+    """Gap between measurement and noise model over time. The next Allan plot also draws the model."""
 
     newest: ModelGap | None = None
 
@@ -276,24 +279,24 @@ class GapPanel(Panel):
 
 
 class AllanPanel(Panel):
-    """Allan plots and table of an estimate, and the Allan surface over time when it has a new column."""
+    """Allan plots, the table of coefficients, and the heat map of the Allan deviation over time."""
 
     def __init__(self, scene: "Scene", device: str) -> None:
         super().__init__(scene, device)
         self._plot = allan_drawing.AllanPlot(scene.log, self.entity_path("allan"))
-        self._surface = AllanHistory()
+        self._history = AllanHistory()
 
     def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
         """Draw the results."""
         at_s, estimate = float(unix_s[-1]), results[-1]
         self._log_text("coefficients", at_s, noise_text(estimate))
         self._plot.draw(estimate, self.scene.panel(self.device, GapPanel).newest)
-        if self._surface.add_estimate(at_s, estimate):
-            dynamic_heat_map.draw_heat_maps(self.scene.log, self.entity_path("dynamic"), self._surface)
+        if self._history.add_estimate(at_s, estimate):
+            dynamic_heat_map.draw_heat_maps(self.scene.log, self.entity_path("dynamic"), self._history)
 
 
 class CoefficientsPanel(Panel):
-    """Time series of the coefficients: a point with interval per estimate, and the values between the estimates."""
+    """Time series of the coefficients. Only the points of an estimate have intervals."""
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
@@ -347,13 +350,13 @@ class CoefficientsPanel(Panel):
 
 
 class EventsPanel(Panel):
-    """Log of the events, of the device and of all devices; changed coefficients are marked at their new value."""
+    """Log of the events of a device and of all devices. A diamond marks the new value of a changed coefficient."""
 
     def draw(self, unix_s: Floats, results: Sequence[Event]) -> None:
         """Draw the results."""
         for at_s, event in zip(unix_s.tolist(), results, strict=True):
             level = "ERROR" if event.kind == "link_lost" else "WARN" if event.kind in WARNING_EVENTS else "INFO"
-            clock_time = format_utc(at_s)[-8:]  # the date column of the viewer is too narrow to show the time
+            clock_time = format_utc(at_s)[-8:]  # the date column of the viewer is too narrow for the time
             self.scene.set_time(at_s)
             if self.scene.fleet or len(self.scene.devices) > 1:
                 line = rr.TextLog(f"{clock_time}  {self.device}: {event.text}", level=level)
@@ -365,11 +368,11 @@ class EventsPanel(Panel):
     def draw_history(self, history: HistoryTable) -> None:
         """Draw the stored history."""
         for one in history.events[-MAX_PAST_EVENTS:]:
-            text = f"{format_utc(one.t_s)[:10]}: {one.text}"  # the log line shows only the time of day
+            text = f"{format_utc(one.t_s)[:10]}: {one.text}"  # a log line otherwise shows only the time of day
             self.draw(np.array([one.t_s]), [Event(one.kind, round(one.t_s * 1e9), text, one.axis, one.what)])
 
     def _mark_changes(self, unix_s: float, event: Event) -> None:
-        """Mark changed coefficients with a diamond at their new value."""
+        """Mark the new values of changed coefficients."""
         if event.axis is None:
             return
         coefficients = self.scene.panel(self.device, CoefficientsPanel)
@@ -380,7 +383,7 @@ class EventsPanel(Panel):
 
 
 class HealthPanel(Panel):
-    """Health of the device, and the overview of the devices."""
+    """Health of the device, and the table of all devices."""
 
     def draw(self, unix_s: Floats, results: Sequence[Health]) -> None:
         """Draw the results."""
@@ -411,14 +414,16 @@ class DeviceTablePanel(Panel):
             Table as Markdown.
         """
         self.scene.set_time(unix_s)
-        self.scene.log("overview", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        self.scene.log("overview", markdown(text))
 
 
 def _points_until(unix_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
-    """Return times [n] and coefficients [n, 5, 6, 3] since the previous estimate; only the last has intervals."""
+    """Return times [n] and coefficients with interval ends [n, 5, 6, 3] since the previous estimate.
+
+    Only the newest coefficients have intervals.
+    """
     c, history = estimate.coefficients, estimate.history
-    near = (c.lo * MAX_INTERVAL_RATIO > c.value) & (c.hi < c.value * MAX_INTERVAL_RATIO)
-    newest = np.stack([c.value, np.where(near, c.lo, np.nan), np.where(near, c.hi, np.nan)], axis=-1)
+    newest = np.stack([c.value, *omit_wide_intervals(c.value, c.lo, c.hi)], axis=-1)
     newest[c.status != Status.ESTIMATED] = np.nan
     if history is None:
         return np.array([unix_s]), newest[None]

@@ -1,37 +1,33 @@
-"""Points that the viewer draws for stored history: a few per bucket, including its extremes. The module does no I/O.
+"""Points that the viewer draws for stored history. The module does no I/O.
 
-Each bucket yields its last value with its interval, at the end of the bucket. An extreme outside this interval is more
-than chance explains and yields an additional point. The minimum is drawn at one third of the bucket, the maximum at
-two thirds.
+Each bucket has a point for its last value with the interval, at the end of the bucket. An extreme outside this interval
+has an additional point. A minimum is drawn after one third of the bucket, a maximum after two thirds.
 """
-
-from typing import Final
 
 import numpy as np
 
 from drivers.sample import Floats
 from monitor.history.reading import ColumnStatistics, HistoryTable
-
-MAX_INTERVAL_RATIO: Final = 1.5
-"""Intervals whose ends differ from the value by more than this factor are not drawn: they would determine the scale."""
+from monitor.publishing.plots.style import omit_wide_intervals
 
 
 def history_points(past: HistoryTable, course: ColumnStatistics, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
-    """Return Unix times [m] and value, lo and hi [m, 3]; a NaN row separates gaps and follows the last bucket.
+    """Return the Unix times [m] of the points, and their value, lo and hi [m, 3].
+
+    A row of NaN marks each gap and the end, so that the line is interrupted there.
 
     Parameters
     ----------
     past
         History that contains the p buckets.
     course
-        Number over the buckets.
+        Statistics of a number in each bucket.
     lo, hi
         Ends of the interval of each last value, shape [p]; NaN if there is none.
     """
     start_s, width_s = past.start_s.astype(np.float64), past.width_s.astype(np.float64)
     newest_s = start_s + width_s
-    near = (lo * MAX_INTERVAL_RATIO > course.last) & (hi < course.last * MAX_INTERVAL_RATIO)
-    lo, hi = np.where(near, lo, np.nan), np.where(near, hi, np.nan)
+    lo, hi = omit_wide_intervals(course.last, lo, hi)
     ends = [np.fmin(lo, course.last), np.fmax(hi, course.last)]
     parts = [_rows(newest_s, course.last, lo, hi, np.isfinite(course.last))]
     parts.append(_rows(start_s + width_s / 3.0, course.low, lo, hi, course.low < ends[0]))

@@ -1,8 +1,8 @@
 """Content of the Rerun viewer: the panels of all devices, which log their results as entities of one stream.
 
-Results in SI are logged as columns and drawings under the paths listed in the README, on the timeline ``sample_time``.
-Every call may block in Rerun for as long as the viewer does not read, so only the viewer's own thread may call this
-module. Importing this module imports Rerun (half a second).
+Results are logged as columns and drawings under the paths listed in the README, on the timeline ``sample_time``. A call
+may block in Rerun while the viewer does not read. Only the thread of the viewer may therefore call this module.
+Importing this module imports Rerun, which takes half a second.
 """
 
 from collections.abc import Sequence
@@ -28,14 +28,14 @@ PANELS: tuple[type[Panel], ...] = tuple(
 
 
 class Scene:
-    """Panels of all devices in one Rerun stream. Not thread-safe; calls may block, see the module.
+    """Panels of all devices in one Rerun stream. The class is not thread-safe, and its methods may block.
 
     Parameters
     ----------
     stream
         Stream of the viewer.
     fleet
-        True if there are many more devices, which have only a row in the overview.
+        True if further devices have only a row in the table of all devices.
     """
 
     def __init__(self, stream: rr.RecordingStream, fleet: bool = False) -> None:
@@ -46,7 +46,7 @@ class Scene:
         self._panels: dict[tuple[str, type[Panel]], Panel] = {}
 
     def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
-        """Set the devices to show. Data of a removed device that still arrive are drawn."""
+        """Set the devices to show. Later data of a removed device are still drawn."""
         self.devices = {one.name: one for one in devices}
         self.healths = {name: health for name, health in self.healths.items() if name in self.devices}
         for name in self.devices:
@@ -54,7 +54,7 @@ class Scene:
                 self.panel(name, kind).log_styles()
 
     def panel(self, device: str, kind: type[P]) -> P:
-        """Return a panel of a device, which is created if it does not exist.
+        """Return a panel of a device. Create the panel if it does not exist.
 
         Parameters
         ----------
@@ -86,7 +86,7 @@ class Scene:
     def draw_history(self, device: str, history: HistoryTable) -> None:
         """Draw the stored history of a device.
 
-        Lines have a gap where buckets are missing and after the last bucket, so that live data form a separate line.
+        A line has a gap where buckets are missing. After the last bucket, live data form a separate line.
 
         Parameters
         ----------

@@ -1,13 +1,13 @@
-"""Output of the Rerun stream: a viewer window, a page in the browser, or a file.
+"""Outputs of a Rerun stream: a viewer window, a page in the browser, or a file.
 
-``open_output`` returns an ``Output``: a Rerun stream and the child process that belongs to it. ``ViewerError``
-states in one line what is wrong, and the caller repeats the attempt later. The viewer program is started directly,
-because its Python wrapper would leave it running when killed. It listens on the loopback interface only, and its usage
-statistics are off. For the daemon, a window and a page are both a Rerun server in a separate process. The data of the
-viewer therefore do not use the memory of the daemon. Importing this module imports Rerun.
+``open_output`` returns an ``Output``: a Rerun stream and the child process that belongs to it. The message of a
+``ViewerError`` states the problem in one line, and the caller repeats the attempt later. The viewer program is started
+directly, because its Python wrapper would leave the program running when killed. The program listens on the loopback
+interface only, and usage statistics are off. For the daemon, a window and a page are both a Rerun server in a separate
+process. The data of the viewer therefore do not use the memory of the daemon. Importing this module imports Rerun.
 
-Rerun raises no error for a port that is in use, so ports are checked first. If a Rerun server listens on the port, it
-is used instead of a new window. Any other listener is an error. For the page, the next free port is used.
+Rerun raises no error for a port that is in use, so ports are checked first. If a Rerun server listens on the port, this
+server is used instead of a new window. Any other listener is an error. The web page uses the next free port.
 """
 
 import contextlib
@@ -38,11 +38,11 @@ from monitor.publishing.rerun.viewer_settings import ViewerClosed, ViewerError, 
 
 LOOPBACK: Final = "127.0.0.1"
 APPLICATION: Final = "imu-monitor"
-START_TIMEOUT_S: Final = 20.0  # timeout for the viewer to listen: the first start of a 300 MB program from a slow disk
+START_TIMEOUT_S: Final = 20.0  # a 300 MB program may start from a slow disk
 PORTS_TRIED: Final = 20
-CLOSED: Final = "viewer was closed: start `rerun` to look again"
+CLOSED: Final = "viewer was closed: start `rerun` to open it again"
 PROGRAM_MIB: Final = 256  # memory of the program itself; an empty viewer window uses 125 to 170 MB
-LIVE_FLUSH_PERIOD_S: Final = 0.2  # appears continuous; Rerun keeps about 1 kB per chunk in addition to the data
+LIVE_FLUSH_PERIOD_S: Final = 0.2  # appears continuous; each chunk costs about 1 kB in addition to the data
 PROBE_METHOD: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
 
 
@@ -71,7 +71,7 @@ class ViewerProcess:
         return self._process.pid
 
     def exit_reason(self) -> str | None:
-        """Return why the process has ended; None if it is running."""
+        """Return why the process has ended, or None if the process is running."""
         status = self._process.poll()
         return None if status is None else f"viewer ended ({status}): {self._last_log_line()}"
 
@@ -80,7 +80,7 @@ class ViewerProcess:
         return self._process.poll() == 0
 
     def end(self, patience_s: float = 0.5) -> None:
-        """Terminate the process; kill it after ``patience_s`` seconds, because a stopped process needs SIGKILL."""
+        """Terminate the process. Kill it after ``patience_s`` seconds, because a stopped process ignores SIGTERM."""
         with contextlib.suppress(OSError):
             self._process.terminate()
         try:
@@ -90,12 +90,8 @@ class ViewerProcess:
             self._process.wait(5.0)
         self._log.close()
 
-    def signal(self, number: int) -> None:
-        """Send a signal to the process."""
-        self._process.send_signal(number)
-
     def kill(self) -> None:
-        """Kill the process; may be called from any thread."""
+        """Kill the process. Any thread may call this method."""
         self._process.kill()
 
     def _last_log_line(self) -> str:
@@ -115,7 +111,7 @@ class Output:
     child: ViewerProcess | None = None
     port: int | None = None  # port of the Rerun server; None for a file
     note: str = ""  # configured ports that were in use, and their replacements
-    lock: IO[bytes] | None = None  # open while a file is written, so that no other process writes it
+    lock: IO[bytes] | None = None  # lock against other processes that write the file
 
     def check_viewer(self) -> None:
         """Check that the viewer is still open.
@@ -138,16 +134,16 @@ class Output:
     def confirm_delivery(self, patience_s: float) -> bool:
         """Return True if all logged data were sent within ``patience_s`` seconds and the viewer answers.
 
-        Sending alone is not sufficient: sockets accept two more megabytes for a viewer that is stopped.
+        Sending alone is not sufficient, because the sockets of a stopped viewer accept two more megabytes.
         """
         try:
             self.stream.flush(timeout_sec=patience_s)
-        except RuntimeError:  # Rerun raises it for "timed out" and for "connection lost"
+        except RuntimeError:  # raised by Rerun after a timeout and for a lost connection
             return False
         return self.port is None or _grpc_call(self.port, "/imu.monitor/Ping", patience_s) is not None
 
     def close(self) -> None:
-        """End the viewer if it was started here; a file is complete afterwards."""
+        """Complete the file, or end the viewer process that belongs to this output."""
         try:
             if self.child is not None:
                 self.child.end()
@@ -160,18 +156,18 @@ class Output:
 
 def viewer_program() -> Path:
     """Return the path of the viewer program in the package ``rerun_cli``."""
-    room = Path(rerun_cli.__file__).parent
+    folder = Path(rerun_cli.__file__).parent
     names = ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun")
-    found = next((room / name for name in names if (room / name).is_file()), None)
+    found = next((folder / name for name in names if (folder / name).is_file()), None)
     if found is None:
-        raise ViewerError(f"rerun-sdk came without its viewer: no program in {room}")
+        raise ViewerError(f"the package rerun-sdk contains no viewer program in {folder}; reinstall it")
     return found
 
 
 def _death_signal_prefix() -> list[str]:
     """Return a command prefix that ends a program when the thread that started it ends (Linux only).
 
-    ``setpriv`` (util-linux) sets this and then runs the program. Without it, the viewer outlives a killed daemon.
+    Without the program ``setpriv`` (util-linux), a viewer outlives a killed daemon.
     """
     setpriv = shutil.which("setpriv") if sys.platform == "linux" else None
     return [] if setpriv is None else [setpriv, "--pdeathsig", "TERM", "--"]
@@ -185,16 +181,16 @@ def is_listening(port: int) -> bool:
 
 
 def is_rerun(port: int) -> bool:
-    """Return True if a Rerun server answers on this port, because it knows the service of Rerun's protocol.
+    """Return True if a Rerun server answers on the port.
 
-    Other gRPC servers answer "unimplemented" (status 12), and other servers do not answer with gRPC.
+    Other gRPC servers answer a call of the Rerun service with "unimplemented" (status 12).
     """
     reply = _grpc_call(port, PROBE_METHOD, 1.0)
     return reply is not None and "grpc" in reply.get("content-type", "") and reply.get("grpc-status") != "12"
 
 
 def _grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
-    """Return the headers of the reply to an empty gRPC call on the loopback interface; None without a reply in time."""
+    """Return the headers of the reply to an empty gRPC call on the loopback interface, or None without a reply."""
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=timeout_s)
     headers = {"content-type": "application/grpc-web+proto", "x-grpc-web": "1"}
     try:
@@ -256,7 +252,7 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
     ViewerError
         If the output cannot be opened.
     ViewerClosed
-        If only an open viewer may be joined, and there is none.
+        If the mode is ``join`` and no viewer is open.
     """
     if settings.mode.endswith(".rrd"):
         return _open_file(Path(settings.mode), recording_id)
@@ -266,10 +262,10 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
 
 
 def _open_file(path: Path, recording_id: str) -> Output:
-    """Open a file and lock it."""
+    """Open and lock a file."""
     try:
         if path.exists():
-            check_regular(path)  # opening a FIFO would wait for a reader
+            check_regular(path)  # opening a FIFO would block until a reader opens it
         lock = path.open("ab")
     except OSError as error:
         raise ViewerError(f"cannot write {path}: {error.strerror}") from error
@@ -277,7 +273,7 @@ def _open_file(path: Path, recording_id: str) -> Output:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # released by the system when this process ends
     except BlockingIOError:
         lock.close()
-        raise ViewerError(f"{path}: another process writes this file; name another one") from None
+        raise ViewerError(f"{path}: another process writes this file; choose another file") from None
     except OSError as error:  # a file system without locks
         if error.errno not in LOCKS_UNSUPPORTED_ERRNOS:
             lock.close()
@@ -305,7 +301,7 @@ def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable
         raise ViewerError('no desktop here (DISPLAY and WAYLAND_DISPLAY are not set): use viewer mode "web"')
     child = ViewerProcess([
         *("--bind", LOOPBACK, "--port", str(port)),
-        *("--memory-limit", add_program_memory(settings.memory), "--server-memory-limit", "64MiB"),
+        *("--memory-limit", _add_program_memory(settings.memory), "--server-memory-limit", "64MiB"),
         *("--hide-welcome-screen", "--expect-data-soon"),
     ])  # fmt: skip
     _wait_for(port, child, given_up)
@@ -330,10 +326,10 @@ def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[]
     return output
 
 
-def add_program_memory(memory: str) -> str:
-    """Return the memory limit of a window, increased by the memory of the program; a percentage is not changed.
+def _add_program_memory(memory: str) -> str:
+    """Return the memory limit of a viewer window: the limit for data plus PROGRAM_MIB. A percentage is not changed.
 
-    >>> add_program_memory("256MiB"), add_program_memory("1GiB"), add_program_memory("25%")
+    >>> _add_program_memory("256MiB"), _add_program_memory("1GiB"), _add_program_memory("25%")
     ('512MiB', '1280MiB', '25%')
     """
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(MiB|GiB)", memory.strip())
@@ -348,9 +344,7 @@ def server_url(port: int) -> str:
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
-def _connected(
-    port: int, recording_id: str, child: ViewerProcess | None = None, joined_port: int | None = None
-) -> Output:
+def _connected(port: int, recording_id: str, child: ViewerProcess | None = None) -> Output:
     """Return an output that is connected to a Rerun server."""
     stream = _stream(recording_id)
     stream.set_sinks(rr.GrpcSink(server_url(port)))
@@ -360,9 +354,9 @@ def _connected(
 def _stream(recording_id: str) -> rr.RecordingStream:
     """Create a stream whose only timeline is ``sample_time`` and which is never freed.
 
-    Freeing a stream waits for its viewer and holds a lock that all streams of the process need. A viewer that ends at
-    that moment would block the next one and the exit of the process. The additional reference made here prevents this
-    and costs a few kilobytes for each viewer that is opened.
+    Freeing a stream waits for its viewer and holds a lock that all streams of the process need. If the viewer ended
+    meanwhile, the next viewer and the exit of the process would be blocked. The additional reference costs a few
+    kilobytes for each opened viewer.
     """
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
@@ -372,7 +366,7 @@ def _stream(recording_id: str) -> rr.RecordingStream:
 
 
 def _wait_for(port: int, child: ViewerProcess, given_up: Callable[[], bool]) -> None:
-    """Wait until the viewer listens; end it and raise ViewerError if it does not."""
+    """Wait until the viewer listens. If the viewer does not listen in time, end it and raise ViewerError."""
     end = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < end and not given_up():
         trouble = child.exit_reason()
@@ -383,4 +377,4 @@ def _wait_for(port: int, child: ViewerProcess, given_up: Callable[[], bool]) -> 
             return
         time.sleep(0.05)
     child.end()
-    raise ViewerError(f"the viewer did not listen on {port} within {START_TIMEOUT_S:.0f} s")
+    raise ViewerError(f"the viewer did not listen on port {port} within {START_TIMEOUT_S:.0f} s")

@@ -1,14 +1,14 @@
-"""Live view in Rerun: accepts results from the main loop of the service and draws them in a separate thread.
+"""Live view in Rerun. Results from the main loop of the service are drawn in a separate thread.
 
-Every call adds samples, estimates, events or health reports to a bounded queue and returns at once. The thread opens
-the viewer, draws new data five times a second, and checks once a second that the data have reached the viewer. If the
-viewer does not answer (stopped or hung), the state is ``stalled``: drawing waits, the queue drops its oldest entries,
-and ``state`` reports their number. If the viewer is missing, cannot start or was closed, ``state`` says so and the
-attempt is repeated. No exception reaches the main loop.
+``put`` adds a result to a bounded queue and returns at once. The thread opens the viewer, draws new data five times a
+second, and checks once a second that the data have reached the viewer. If the viewer does not answer, the state is
+``stalled``: drawing waits, the queue drops its oldest entries, and ``state`` reports their number. If the viewer is
+missing, cannot start or was closed, ``state`` gives the reason and the attempt is repeated. No exception reaches the
+main loop.
 
-Properties of Rerun that determine this design: a logging call blocks without limit if the viewer does not read. So
-does the exit handler, which is therefore removed. So does freeing a stream, which is therefore never done (see
-``sinks``). The first import takes half a second, so it is done in the thread, and not at all with mode ``none``.
+Three properties of Rerun determine this design. A logging call blocks without limit if the viewer does not read. The
+exit handler of Rerun may block in the same way and is therefore removed. Freeing a stream may also block, so streams
+are never freed (see ``sinks``). The import of Rerun takes half a second and is done in the thread.
 """
 
 import importlib
@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 BACKLOG_BYTES: Final = 16_000_000  # about 25 s of 16 devices at 1 kHz with six axes
 CONFIRM_PERIOD_S: Final = 1.0  # interval between checks that drawn data have reached the viewer
 PATIENCE_S: Final = 1.0  # timeout of this check
-STALL_TIMEOUT_S: Final = 2.0  # duration of one Rerun call above which the viewer counts as stalled
+STALL_TIMEOUT_S: Final = 2.0  # a viewer is stalled if one Rerun call takes longer
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
 PLOTS_PER_S: Final = 8.0  # rate of Allan plots, shared by all devices; at most one per second and device
-MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes sooner is taken as not working
+MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes sooner does not work on this host
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
 HistorySource = Callable[[str], HistoryTable | None]
@@ -43,7 +43,7 @@ HistorySource = Callable[[str], HistoryTable | None]
 
 
 class RerunView:
-    """Viewer of all devices. It must be used by one thread; every call returns at once.
+    """Viewer of all devices. Only one thread may use it. Every call returns at once.
 
     Parameters
     ----------
@@ -52,21 +52,20 @@ class RerunView:
     devices
         Devices to show in detail.
     history_source
-        Function that returns the stored history of a device. It is called in the viewer's thread when the viewer opens.
+        Function that returns the stored history of a device. The thread of the viewer calls this function.
     fleet
-        True if there are many more devices, which are shown in the table given to ``overview``.
+        True if further devices are shown only in a ``DeviceTableText``.
     """
 
     def __init__(
         self,
         settings: ViewerSettings,
         devices: Sequence[DeviceInfo],
-        history_source: HistorySource | None = None,
+        history_source: HistorySource = lambda _device: None,
         fleet: bool = False,
     ) -> None:
-        """Store the settings; the viewer is opened by ``start``."""
         self._settings = settings
-        self._history_source = history_source or _no_history
+        self._history_source = history_source
         self._fleet = fleet
         self._devices = tuple(devices)
         self._backlog: BoundedQueue[tuple[str, float, Any]] = BoundedQueue(BACKLOG_BYTES)
@@ -76,7 +75,7 @@ class RerunView:
         self._stalled = False
         self._inside_since: float | None = None  # monotonic time at which the current Rerun call began [s]
         self._child: ViewerProcess | None = None
-        self._url = ""
+        self.url = ""  # address of the web page or of the Rerun server
         self._recording_id = str(uuid.uuid4())
 
     @property
@@ -87,13 +86,8 @@ class RerunView:
             return f"stalled ({self._backlog.dropped} dropped)"
         return self._phase
 
-    @property
-    def url(self) -> str:
-        """Address of the web page or of the Rerun server; "" if there is none."""
-        return self._url
-
     def start(self) -> None:
-        """Start the thread; errors are reported in ``state`` and the attempt is repeated."""
+        """Start the thread. Errors are reported in ``state`` and the attempt is repeated."""
         if self._settings.mode == "none" or self._thread is not None:
             return
         self._phase = "starting"
@@ -101,13 +95,7 @@ class RerunView:
         self._thread.start()
 
     def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
-        """Set the devices to show; this must be called before data of a new device are passed.
-
-        Parameters
-        ----------
-        devices
-            Devices to show in detail.
-        """
+        """Set the devices to show in detail. A device must be set before its first result is passed."""
         self._devices = tuple(devices)
 
     def put(self, device: str, unix_s: float, result: Any) -> None:
@@ -126,7 +114,7 @@ class RerunView:
             self._backlog.push((device, unix_s, result), kind_of(result).size_bytes(result))
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Draw the remaining data for at most ``timeout_s`` seconds, then end the viewer if it was started here."""
+        """Draw the remaining data for at most ``timeout_s`` seconds, and close the output."""
         thread, self._thread = self._thread, None
         if thread is None:
             return
@@ -135,14 +123,14 @@ class RerunView:
         thread.join(0.75 * timeout_s)
         child = self._child
         if thread.is_alive() and child is not None:
-            child.kill()  # releases the thread from a viewer that does not respond
+            child.kill()  # ends the wait of the thread for a viewer that does not respond
         thread.join(0.25 * timeout_s)
         self._phase = "closed"
 
     # ---- methods of the thread ----
 
     def _run(self) -> None:
-        """Open the viewer and draw; reopen it after failures, until closed."""
+        """Open the viewer and draw until closed. Reopen the viewer after a failure."""
         settings, attempt = self._settings, 0
         while not self._closing.is_set():
             started = time.monotonic()
@@ -156,15 +144,15 @@ class RerunView:
                 self._phase = str(trouble)
             except ImportError as missing:
                 self._phase = MISSING if missing.name in ("rerun", "rerun_cli", "rerun_bindings") else str(missing)
-            except Exception as error:  # noqa: BLE001 - a drawing error must not end the view; it is reported in state
+            except Exception as error:  # noqa: BLE001 - reported in state; a drawing error must not end the view
                 self._phase = f"{type(error).__name__}: {error}"
             settings, attempt = self._wait_and_select_mode(settings, started, attempt)
 
     def _wait_and_select_mode(
         self, settings: ViewerSettings, started: float, attempt: int
     ) -> tuple[ViewerSettings, int]:
-        """Wait before the next attempt; if a window does not work on this host, use the web page instead."""
-        self._stalled, self._inside_since, self._url = False, None, ""
+        """Wait before the next attempt. If a window does not work on this host, use the web page instead."""
+        self._stalled, self._inside_since, self.url = False, None, ""
         lived_s = time.monotonic() - started
         if self._closing.is_set():
             return settings, attempt
@@ -175,12 +163,12 @@ class RerunView:
         return settings, attempt
 
     def _show(self, settings: ViewerSettings) -> None:
-        """Open a viewer and draw until it ends."""
+        """Open a viewer and draw until the viewer ends."""
         from monitor.publishing.rerun import scene as rerun_scene
         from monitor.publishing.rerun import sinks
 
         output = sinks.open_output(settings, self._recording_id, self._closing.is_set)
-        self._child, self._url = output.child, output.url
+        self._child, self.url = output.child, output.url
         try:
             scene = rerun_scene.Scene(output.stream, self._fleet)
             self._draw(output, scene)
@@ -192,7 +180,8 @@ class RerunView:
         """Send the layout for the devices and create their entities."""
         from monitor.publishing.rerun import blueprint
 
-        blueprint.send_layout(output.stream, devices, self._fleet)
+        layout = blueprint.blueprint(devices, self._fleet)
+        output.stream.send_blueprint(layout, make_active=True, make_default=True)
         scene.set_devices(devices)
         self._phase = f"ok, but {output.note}" if output.note else "ok"
 
@@ -205,14 +194,16 @@ class RerunView:
             scene.draw_history(device, past)
 
     def _draw(self, output: "Output", scene: "Scene") -> None:
-        """Draw new data until closed; raise ViewerError if the viewer has ended."""
+        """Draw new data until closed. Raise ViewerError if the viewer has ended."""
         waiting = _WaitingResults()
         shown: tuple[DeviceInfo, ...] | None = None
         begun: set[str] = set()
         checked = time.monotonic()
         while True:
             closing = self._closing.is_set()
-            waiting.add(self._backlog.take(0.0))  # before the devices are read, so that each message has a known device
+            waiting.add(
+                self._backlog.take(0.0)
+            )  # before the devices are read, so that the device of each result is known
             self._inside_since = time.monotonic()
             if self._devices is not shown:
                 shown = self._devices
@@ -233,7 +224,7 @@ class RerunView:
             self._closing.wait(output.flush_every_s)
 
     def _confirm(self, output: "Output") -> None:
-        """Wait until all drawn data have reached the viewer, which limits the data held by Rerun to one second."""
+        """Wait until all drawn data have reached the viewer. This limits the data held by Rerun to one second."""
         while not output.confirm_delivery(PATIENCE_S):
             self._stalled = not self._closing.is_set()
             output.check_viewer()
@@ -242,16 +233,11 @@ class RerunView:
         self._stalled = False
 
 
-def _no_history(_device: str) -> HistoryTable | None:
-    """Return None: no history is stored."""
-    return None
-
-
 class _WaitingResults:
     """Results that wait for their next drawing."""
 
     def __init__(self) -> None:
-        self.period_factor = 1.0  # factor of the periods of drawings whose rate the devices share
+        self.period_factor = 1.0  # factor for the periods of drawings whose rate the devices share
         self._waiting: dict[Drawing, dict[str, list[TimedResult]]] = {
             drawing: {} for kind in RESULT_KINDS for drawing in kind.drawings
         }
@@ -264,7 +250,7 @@ class _WaitingResults:
                 drawing.merge(self._waiting[drawing].setdefault(device, []), (unix_s, result))
 
     def draw(self, scene: "Scene", everything: bool) -> None:
-        """Draw the results that are due, or all results if ``everything``."""
+        """Draw the results whose period has passed, or all results if ``everything`` is True."""
         for drawing, devices in self._waiting.items():
             period_s = drawing.period_s * (self.period_factor if drawing.shares_rate else 1.0)
             for device in list(devices):

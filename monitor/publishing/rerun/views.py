@@ -1,4 +1,4 @@
-"""Views of the Rerun viewer that several panels use. Importing this module imports Rerun."""
+"""Parts of a Rerun layout that several panels and reports use. Importing this module imports Rerun."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -6,9 +6,11 @@ from typing import Any, Final
 import rerun as rr
 import rerun.blueprint as rrb
 
+from monitor.publishing.plots import colours
+
 TIMELINE: Final = "sample_time"
 RAW_SAMPLES_S: Final = 30.0
-"""Time range of raw samples in view, up to the cursor [s]."""
+"""Duration of the raw samples that a view shows [s]."""
 HALF_LABEL_SHARE: Final = 0.08
 """Width of half a tick label, as a share of the width of the plot."""
 
@@ -30,13 +32,13 @@ def time_series_view(
     name
         Title of the view.
     contents
-        Entities to show, without the sign of inclusion.
+        Entities to show.
     last_s
-        Time range before the cursor [s]; None shows everything from the beginning.
+        Time range before the cursor [s]. By default, the view begins with the first sample.
     legend
         True to show a legend.
     styles
-        Styles of entities that differ from those of other views, by path.
+        Styles for this view only, by path of the entity.
     """
     return rrb.TimeSeriesView(
         origin=origin,
@@ -46,6 +48,46 @@ def time_series_view(
         overrides=styles,
         axis_x=_until_cursor() if last_s is None else _before_cursor(last_s),
     )
+
+
+def drawing_view(origin: str, name: str, contents: Any, x_range: Sequence[float], y_range: Sequence[float]) -> rrb.View:
+    """Return a view of a drawing in chart units.
+
+    Parameters
+    ----------
+    origin
+        Path of the entity.
+    name
+        Title of the view.
+    contents
+        Entities to show.
+    x_range, y_range
+        Limits of the view.
+    """
+    return rrb.Spatial2DView(
+        origin=origin,
+        contents=contents,
+        name=name,
+        background=rrb.Background(color=colours.BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=list(x_range), y_range=list(y_range)),
+    )
+
+
+def collapsed_blueprint(root: rrb.Container, timeline: str) -> rrb.Blueprint:
+    """Return a layout with collapsed panels around ``root``, which follows a timeline."""
+    return rrb.Blueprint(
+        root,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def markdown(text: str) -> rr.TextDocument:
+    """Return a Markdown document."""
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
 
 
 def temperature_view(device: str) -> rrb.TimeSeriesView:

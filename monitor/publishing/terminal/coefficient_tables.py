@@ -20,7 +20,7 @@ from monitor.publishing.remote_devices import DeviceCoefficients
 from monitor.publishing.terminal.tables import WidthDependentTable, plain_table
 
 K_OR_R: Final = "K or R"
-"""Mark of K and R if the data do not show which of the two is present."""
+"""Text for K and R if the data do not show which of the two is present."""
 
 
 def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()) -> RenderableType:
@@ -59,7 +59,7 @@ def coefficient_tables(known: DeviceCoefficients, axes_of_temperature: Collectio
 
 
 def _kind_table(known: DeviceCoefficients, kind: Kind, stacked: bool, axes_of_temperature: Collection[str]) -> Table:
-    """Return the table of one kind of sensor; intervals are below the values if ``stacked``, else beside them."""
+    """Return the table of one kind of sensor. Intervals are below the values if ``stacked``, else beside the values."""
     table = plain_table(kind if stacked else KIND_NAMES[kind])
     for symbol in SYMBOLS:
         table.add_column(f"{symbol} {COEFFICIENT_UNITS[kind][symbol].name}", justify="right", no_wrap=True)
@@ -71,7 +71,7 @@ def _kind_table(known: DeviceCoefficients, kind: Kind, stacked: bool, axes_of_te
 
 
 def _cell(known: DeviceCoefficients, symbol: str, axis: str, separator: str) -> Text:
-    """Return the cell of one coefficient: value, interval and the mark K_OR_R."""
+    """Return value and interval of one coefficient, with K_OR_R if the coefficient is ambiguous."""
     one = format_coefficient(known.coefficients, symbol, axis)
     small = [f"[{one.interval}]"] if one.interval else []
     if axis in known.k_or_r and symbol in ("K", "R"):

@@ -11,7 +11,7 @@ from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.compensation_score import SPANS_S, RestScore
 from monitor.publishing.messages.message import encode_json
-from monitor.publishing.terminal.tables import plain_table
+from monitor.publishing.terminal.tables import plain_table, print_notes
 
 SCHEMA: Final = "imu-monitor/compensate/1"
 UNIT: Final = DEVIATION_UNITS["gyro"]
@@ -29,9 +29,10 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
     console : Console
         Terminal or file.
     """
+    learning, evaluated = (format_duration(one) for one in (result.learning_rest_s, result.evaluated_rest_s))
     console.print(
-        f"{result.recording}: {result.samples} samples at {result.rate_hz:g} Hz, method {result.method}; evaluated "
-        f"on {format_duration(result.evaluated_rest_s)} at rest, after {format_duration(result.learning_rest_s)}",
+        f"{result.recording}: {result.samples} samples at {result.rate_hz:g} Hz, method {result.method}; evaluated on "
+        f"{evaluated} at rest, after {learning} of learning",
         highlight=False,
     )
     rows = plain_table(
@@ -52,8 +53,7 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
     for axis, one in result.axes.items():
         if one.steps or one.rejected_intervals:
             console.print(f"{axis}: {_describe_exceptions(one, result.interval_s)}", highlight=False, soft_wrap=True)
-    for note in result.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    print_notes(result.notes, console)
     console.print(f"{result.out} written", highlight=False, soft_wrap=True)
 
 

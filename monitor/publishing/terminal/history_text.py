@@ -1,7 +1,7 @@
 """History of a device as text for the terminal: tables of coefficients, sparklines and events.
 
-Tables have the units of the field. A sparkline shows bucket means with eight heights and a gap where the device gave no
-data; the extremes are printed beside it. The only side effect is printing on the given console.
+A sparkline shows bucket means as characters of eight heights, and a dot where the device sent no data. The extremes are
+printed beside the sparkline. The only side effect is printing on the given console.
 """
 
 import math
@@ -30,7 +30,7 @@ from monitor.history.reading import ColumnStatistics, HistoryTable
 from monitor.publishing.terminal.tables import plain_table
 
 LETTERS: Final = ("N", "B", "K")
-"""Coefficients shown for all axes; for a single axis all five are shown."""
+"""Coefficients that are shown for all axes. For a single axis, all five are shown."""
 SPARKLINE_HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 GAP: Final = "·"
 SPARKLINE_WIDTH: Final = 32
@@ -40,7 +40,7 @@ MAX_EVENTS: Final = 20
 
 
 def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str, ...], console: Console) -> None:
-    """Print the summary of a history: one line per axis and symbol, then status and events.
+    """Print a summary with one line for each axis and coefficient, then the status and the events.
 
     Parameters
     ----------
@@ -58,13 +58,13 @@ def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str,
         shown = [axis for axis in axes_of(kind) if axis in axes and axis in past.axes()]
         if shown:
             console.print(Padding(_summary(past, kind, shown, symbols), (1, 0, 0, 0)))
-    for line in temperature_and_loss_lines(past):
+    for line in _temperature_and_loss_lines(past):
         console.print(line, highlight=False)
     _print_events(past, console)
 
 
 def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], console: Console) -> None:
-    """Print one axis over time: one line per bucket, with the extremes of each coefficient.
+    """Print one axis over time, with one line for each bucket and the extremes of each coefficient.
 
     Parameters
     ----------
@@ -125,7 +125,7 @@ def summary_line(past: HistoryTable) -> str:
     )
 
 
-def temperature_and_loss_lines(past: HistoryTable) -> list[str]:
+def _temperature_and_loss_lines(past: HistoryTable) -> list[str]:
     """Return lines with temperature range, lost samples, and the time during which the device was not running."""
     lines = []
     temperature = past.column("temperature")
@@ -144,7 +144,7 @@ def temperature_and_loss_lines(past: HistoryTable) -> list[str]:
 
 
 def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int = SPARKLINE_WIDTH) -> str:
-    """Draw values between two times as text; each character shows the mean of its time interval.
+    """Return values between two times as text. Each character shows the mean of a time interval.
 
     >>> steps = np.arange(8.0)
     >>> sparkline(steps, 60.0 * steps, (0.0, 480.0), 8)
@@ -195,7 +195,7 @@ def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str
 
 
 def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
-    """Return the cells of a coefficient that was never estimated: its last upper bound and two dashes."""
+    """Return the cells of a coefficient without estimates: the last upper bound and two dashes."""
     bound, unit = past.column(f"{axis}.{symbol}.bound"), unit_of(symbol, axis)
     there = bound.last[np.isfinite(bound.last)]
     if not there.size:
@@ -204,7 +204,7 @@ def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
 
 
 def _cell(past: HistoryTable, axis: str, symbol: str, p: int) -> str:
-    """Format a coefficient in one bucket: its last value, and its extremes if they differ, or its upper bound."""
+    """Format a coefficient in one bucket: the last value with the extremes if they differ, or the upper bound."""
     column, unit = past.column(f"{axis}.{symbol}"), unit_of(symbol, axis)
     low, high, last = (float(part[p]) * unit.factor for part in (column.low, column.high, column.last))
     if math.isfinite(last):

@@ -1,9 +1,9 @@
 """Live table in the terminal: one row per device, devices with problems first.
 
-The input is the state of the devices, from zenoh (``watch``) or from this process (``run``, ``demo``). The output are
-rich renderables for any width. The most detailed layout that fits is used. At 160 columns a device has one line with
-three digits, at 100 columns one line with two digits, and below that three lines, one per axis. Each state has a word
-and a symbol in addition to its colour.
+The input is the state of the devices, from zenoh (``watch``) or from this process (``run``, ``demo``). The functions
+return objects of the package rich, which adapt to the width of the terminal. The most detailed layout that fits is
+used. At 160 columns, a device has one line with three digits. At 100 columns, it has one line with two digits. Below
+that, it has three lines, one per axis. Each state has a word and a symbol in addition to its colour.
 """
 
 import time
@@ -37,7 +37,7 @@ from monitor.publishing.terminal.tables import plain_table, table_width
 
 MAX_PROBLEM_LINES: Final = 6
 HEADER_LINES: Final = 6
-"""Lines of the screen without a table row: summary, note, table head and blank lines."""
+"""Number of lines for the summary, the note, the head of the table and blank lines."""
 MIN_ROWS: Final = 3
 TABLE_COEFFICIENTS: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
 STATES: Final = {
@@ -68,17 +68,16 @@ NARROW_LAYOUT: Final = Layout(3, False, True, 1)
 
 
 class LiveTable:
-    """Renderer of the table as text for a ``QueuedWriter``: repeatedly on a terminal, otherwise once.
+    """Renderer of the table for a ``QueuedWriter``. The table is redrawn on a terminal, and otherwise printed once.
 
-    ``render`` is called by the thread of the writer only. The rich console is used to format text; it writes nothing
-    itself.
+    Only the thread of the writer may call ``render``. The rich console formats text and writes nothing.
 
     Parameters
     ----------
     console : Console
         Width, height and colours of the destination.
     states : DeviceStates or None
-        State of the devices. While it is None, only lines are written.
+        State of the devices. If None, only log lines are written.
     """
 
     def __init__(self, console: Console, states: DeviceStates | None = None) -> None:
@@ -88,14 +87,14 @@ class LiveTable:
         self._ended = False
 
     def render(self, log_lines: Sequence[str], last: bool) -> str:
-        """Return the text and control codes that print the lines above the table and redraw the table.
+        """Return the text and control codes that print log lines above the table and redraw the table.
 
         Parameters
         ----------
         log_lines : sequence of str
             Lines of the log, with colours as ANSI codes.
         last : bool
-            True to show the cursor again and leave the final table.
+            True to show the cursor again and print the final table.
         """
         with self._console.capture() as captured:
             if self.states is not None and self._live is None and self._console.is_terminal and not last:
@@ -122,7 +121,7 @@ class LiveTable:
 
 
 def device_table(states: DeviceStates, now_s: float) -> RenderableType:
-    """Return the complete table: summary, devices, problems, coefficients of a single device, and events.
+    """Return summary, table of devices, problems, coefficients of a single device, and events.
 
     Parameters
     ----------
@@ -132,10 +131,10 @@ def device_table(states: DeviceStates, now_s: float) -> RenderableType:
         Current time on the clock of the messages [s].
     """
     devices, events = states.devices(now_s), states.newest_events()
-    names = display_names([*(one.key for one in devices), *(key for key, _ in events)])
+    names = _display_names([*(one.key for one in devices), *(key for key, _ in events)])
     parts: list[RenderableType] = [_summary(states, devices, now_s)]
     if devices:
-        parts.append(FittedDeviceRows(devices, now_s))
+        parts.append(_FittedDeviceRows(devices, now_s))
     parts += _with_blank_line(_problem_lines(devices, now_s))
     if len(devices) == 1 and devices[0].coefficients is not None:
         parts += _with_blank_line(coefficient_tables(devices[0].coefficients))
@@ -143,8 +142,8 @@ def device_table(states: DeviceStates, now_s: float) -> RenderableType:
     return Group(*parts)
 
 
-class FittedDeviceRows:
-    """Renderable of the rows in the most detailed layout that fits, limited to the height of the terminal."""
+class _FittedDeviceRows:
+    """Table of devices in the most detailed layout that fits the terminal."""
 
     def __init__(self, devices: list[RemoteDevice], now_s: float) -> None:
         self._devices = devices
@@ -159,7 +158,7 @@ class FittedDeviceRows:
                 break
         yield table
         if len(self._devices) > count:
-            yield Text(f"… and {len(self._devices) - count} more with less trouble", style="dim")
+            yield Text(f"… and {len(self._devices) - count} more with fewer problems", style="dim")
 
     def _visible_rows(self, layout: Layout, console: Console) -> int:
         """Return the number of rows that are shown; all rows if the output is not a terminal."""
@@ -170,7 +169,7 @@ class FittedDeviceRows:
 
 
 def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) -> Table:
-    """Return the table of devices, one row per device, in a level of detail."""
+    """Return the table of devices in the given layout."""
     table = plain_table("device", "state", gap=layout.gap)
     shown = [pair for pair in TABLE_COEFFICIENTS if any(_measures(one, pair[0]) for one in devices)]
     columns = [_coefficient_column(devices, kind, symbol, layout) for kind, symbol in shown]
@@ -179,7 +178,7 @@ def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) 
     heads: list[str | Text] = ["Hz", "received", "lost", "bad", *(title for title, _ in columns), "p99 ms", "age"]
     for head in heads:
         table.add_column(head, justify="right", no_wrap=True)
-    names = display_names([one.key for one in devices])
+    names = _display_names([one.key for one in devices])
     for i, one in enumerate(devices):
         cells = [Text(names[one.key], style="bold"), _state_cell(one.state(now_s)), *_count_cells(one, layout)]
         cells += [column[i] for _, column in columns]
@@ -187,14 +186,14 @@ def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) 
     return table
 
 
-def display_names(keys: Sequence[str]) -> dict[str, str]:
-    """Return the display name of each key: its last part if all keys share one prefix, else the whole key."""
+def _display_names(keys: Sequence[str]) -> dict[str, str]:
+    """Return the displayed name of each key: the last part if all keys share one prefix, else the whole key."""
     short = len({key.rpartition("/")[0] for key in keys}) == 1
     return {key: remove_control_characters(key.rpartition("/")[2] if short else key) for key in keys}
 
 
 def _summary(states: DeviceStates, devices: list[RemoteDevice], now_s: float) -> Text:
-    """Return the line above the table: number of devices by state, and the note."""
+    """Return the number of devices in each state, and the note."""
     line = Text("imu-monitor", style="bold")
     line.append(f"  {format_count(len(devices), 'device')}", style="not bold")
     for state, count in Counter(one.state(now_s) for one in devices).items():
@@ -203,7 +202,9 @@ def _summary(states: DeviceStates, devices: list[RemoteDevice], now_s: float) ->
     if states.malformed:
         line.append(f"  {format_count(states.malformed, 'malformed message')}", style="not bold yellow")
     if states.ignored:
-        line.append(f"  {states.ignored:,} of devices beyond {MAX_DEVICES:,}", style="not bold yellow")
+        line.append(
+            f"  {states.ignored:,} messages of more than {MAX_DEVICES:,} devices ignored", style="not bold yellow"
+        )
     if states.note:
         line.append(f"\n{states.note}", style="not bold yellow")
     return line
@@ -239,7 +240,7 @@ def _measures(one: RemoteDevice, kind: Kind) -> bool:
 def _coefficient_column(
     devices: Sequence[RemoteDevice], kind: Kind, symbol: str, layout: Layout
 ) -> tuple[Text, list[Text]]:
-    """Return the header and cells of one coefficient on three axes; values are aligned between rows."""
+    """Return the header and cells of one coefficient on three axes. Values are aligned between rows."""
     axes = axes_of(kind)
     rows = [[_value(one, symbol, axis, layout.digits) for axis in axes] for one in devices]
     head = f"{symbol} {COEFFICIENT_UNITS[kind][symbol].name}"
@@ -253,20 +254,20 @@ def _coefficient_column(
 
 
 def _value(one: RemoteDevice, symbol: str, axis: str, digits: int) -> str:
-    """Format a coefficient: value, upper bound, a dash if there are too few data, or blank if it is not measured."""
+    """Format a coefficient as a value, as an upper bound, as a dash without estimate, or blank if not measured."""
     if one.coefficients is None or axis not in one.coefficients.axes:
         return ""
     return format_coefficient(one.coefficients.coefficients, symbol, axis, digits).value.replace("≤ ", "≤")
 
 
 def _with_blank_line(lines: Sequence[RenderableType]) -> list[RenderableType]:
-    """Return the lines with an empty line above them; nothing if there are no lines."""
+    """Return the lines with an empty line above, or nothing if there are no lines."""
     return [Text(), *lines] if lines else []
 
 
 def _problem_lines(devices: Sequence[RemoteDevice], now_s: float) -> list[Text]:
-    """Return one line per device with problems."""
-    names = display_names([one.key for one in devices])
+    """Return one line for each device with problems."""
+    names = _display_names([one.key for one in devices])
     lines = []
     for one in devices:
         if problems := one.problems():
@@ -275,7 +276,7 @@ def _problem_lines(devices: Sequence[RemoteDevice], now_s: float) -> list[Text]:
             lines.append(Text.assemble((f"{symbol} {names[one.key]}  ", colour), problems))
     if len(lines) > MAX_PROBLEM_LINES:
         more = len(lines) - MAX_PROBLEM_LINES + 1
-        lines = [*lines[: MAX_PROBLEM_LINES - 1], Text(f"… and {more} more with trouble", style="dim")]
+        lines = [*lines[: MAX_PROBLEM_LINES - 1], Text(f"… and {more} more with problems", style="dim")]
     return lines
 
 
@@ -285,7 +286,7 @@ def _event_line(name: str, event: EventMessage) -> Text:
 
 
 def _local_time(unix_s: float) -> str:
-    """Format the local time of day; the time of a recording may not be a valid date and is then shown in seconds."""
+    """Format the local time of day, or seconds if the time of a recording is not a valid date."""
     try:
         return f"{datetime.fromtimestamp(unix_s).astimezone():%H:%M:%S}"
     except (ValueError, OverflowError, OSError):

@@ -1,12 +1,12 @@
-"""Text output to a terminal, a pipe or a file by a thread of its own, so that no other thread waits for the reader.
+"""Text output to a terminal, a pipe or a file by a separate thread, so that no other thread waits for the reader.
 
-A write blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) and while nobody reads a pipe, and it
+A write blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) and while no program reads a pipe. A write
 fails while a disk is full. ``QueuedWriter`` accepts lines on a bounded queue that drops its oldest lines, and can
-redraw a frame (a table) periodically. It counts what is lost and reports it in ``state``. ``QueuedWriter.close`` gives
-up after a deadline.
+redraw a frame (a table) periodically. Lost lines and frames are counted and reported in ``state``.
+``QueuedWriter.close`` returns after a deadline.
 
 The thread writes to the file descriptor and not to the Python stream. A blocked write to ``sys.stdout`` would hold the
-lock of the stream, and the interpreter aborts at exit when it cannot take this lock.
+lock of the stream, and the interpreter aborts at exit if it cannot take this lock.
 """
 
 import contextlib
@@ -24,18 +24,18 @@ from monitor.common.units import format_count
 from monitor.publishing.bounded_queue import BoundedQueue
 
 MAX_QUEUED_CHARACTERS: Final = 256 * 1024
-"""Length of the queued text at most; some 2000 log lines."""
+"""Maximum length of the queued text, about 2000 log lines."""
 CHUNK_BYTES: Final = 1024
-"""A single write call; small, so that a slow terminal can be distinguished from a blocked one."""
+"""Length of one write call. It is small, so that a slow terminal can be distinguished from a blocked terminal."""
 BLOCKED_S: Final = 2.0
-"""A write that takes longer counts as blocked."""
+"""Duration above which a write is considered blocked."""
 FRAME_DELAY_S: Final = 0.05
 """Delay before a frame is drawn, so that results published together appear in one frame."""
 IDLE_WAIT_S: Final = 1.0
 CLOSE_S: Final = 2.0
 
 Render = Callable[[Sequence[str], bool], str]
-"""Return the text to write, given the queued lines and whether this is the last call."""
+"""Function that returns the text to write, given the queued lines and True for the last call."""
 
 
 class QueuedWriter:
@@ -44,17 +44,18 @@ class QueuedWriter:
     Parameters
     ----------
     stream : TextIO or None
-        Destination. A stream without a file descriptor is written directly. None discards the text.
+        Destination. Text for a stream without a file descriptor is written directly. None discards the text.
     place : str
         Name of the destination in messages, such as "standard error".
     render : callable, optional
         Converts the queued lines to the text that is written. It runs in the thread. By default, lines are joined.
     period_s : float, optional
-        Interval in seconds at which ``render`` is called even if no lines are queued. None: only when there are lines.
+        Interval in seconds at which ``render`` is called without queued lines. By default, ``render`` is called only
+        for lines.
     limit : int
-        Number of queued characters above which the oldest entries are dropped. One entry is always kept.
+        Number of queued characters above which the oldest entries are dropped. The newest entry is always kept.
     tell : callable, optional
-        Called in the thread with a sentence after lines were dropped, as soon as text can be written again.
+        Function that receives a sentence about dropped lines as soon as text can be written again.
     """
 
     def __init__(
@@ -66,7 +67,7 @@ class QueuedWriter:
         limit: int = MAX_QUEUED_CHARACTERS,
         tell: Callable[[str], None] | None = None,
     ) -> None:
-        self.error: Exception | None = None  # of the last write or rendering; None after a successful one
+        self.error: Exception | None = None  # error of the last write or rendering; None after success
         self._stream = stream
         self._descriptor = descriptor_of(stream)
         self._place = place
@@ -74,8 +75,8 @@ class QueuedWriter:
         self._period_s = period_s
         self._tell = tell
         self._queue: BoundedQueue[str] = BoundedQueue(limit)
-        self._lost_lines = 0  # taken from the queue but not written
-        self._told_lines = 0  # dropped lines that were reported through tell
+        self._lost_lines = 0  # number of lines taken from the queue but not written
+        self._told_lines = 0  # number of dropped lines that were reported through tell
         self._lost_frames = 0
         self._reason = ""  # why the newest lines were lost
         self._write_since_s: float | None = None  # monotonic time at which the current write call began
@@ -114,7 +115,7 @@ class QueuedWriter:
         self._thread.start()
 
     def put(self, text: str) -> None:
-        """Queue whole lines; return at once."""
+        """Queue whole lines and return at once."""
         self._queue.push(text, len(text))
 
     def redraw(self) -> None:
@@ -122,26 +123,17 @@ class QueuedWriter:
         self._queue.wake()
 
     def finish(self, stop: threading.Event) -> None:
-        """Write all that is queued; wait until it is written or ``stop`` is set."""
+        """Write all queued text. Wait until the text is written or ``stop`` is set."""
         self._begin_closing()
         while self._thread.is_alive() and not stop.is_set():
             self._thread.join(0.1)
 
     def close(self, timeout_s: float = CLOSE_S) -> bool:
-        """Write all that is queued, and end the thread.
+        """Write all queued text and end the thread.
 
         If the destination is still blocked after the deadline, its descriptor is replaced with the null device, so that
-        the interpreter cannot block on it at exit.
-
-        Parameters
-        ----------
-        timeout_s : float
-            Seconds to wait for the reader.
-
-        Returns
-        -------
-        bool
-            True if everything was written or has failed; False if the destination was still blocked.
+        the interpreter cannot block on it at exit. Return False if the destination was still blocked after
+        ``timeout_s`` seconds.
         """
         self._begin_closing()
         if self._thread.is_alive() and not self._given_up:
@@ -156,7 +148,7 @@ class QueuedWriter:
     def _run(self) -> None:
         """Write queued lines and frames until the writer is closed."""
         while True:
-            closing = self._closing.is_set()  # read first, so that lines queued before close() are written
+            closing = self._closing.is_set()  # read before the queue, so that lines queued before close() are written
             lines = self._queue.take(0.0 if closing else self._period_s or IDLE_WAIT_S)
             if self._period_s is not None and not closing:
                 self._closing.wait(FRAME_DELAY_S)
@@ -187,7 +179,7 @@ class QueuedWriter:
             self._write_since_s = None
 
     def _rendered(self, lines: list[str], last: bool) -> tuple[str, Exception | None]:
-        """Return the text, or the plain lines and the error if they cannot be rendered."""
+        """Return the rendered text, or the plain lines and the error of the rendering."""
         try:
             return self._render(lines, last), None
         except Exception as error:  # noqa: BLE001 - a frame that cannot be drawn must not end the log; shown in state
@@ -216,7 +208,7 @@ class QueuedWriter:
             self._write_since_s = time.monotonic()
 
     def _tell_dropped(self, dropped: int) -> None:
-        """Report lines dropped before the newest batch; the queue was emptied since, so it has space for the report."""
+        """Report dropped lines. The queue has space for the report, because it has just been emptied."""
         count = dropped - self._told_lines
         if count and self._tell is not None:
             self._told_lines = dropped
@@ -228,13 +220,13 @@ class QueuedWriter:
     # --- counting
 
     def _blocked_s(self) -> float:
-        """Return the duration of the current write call in seconds, or 0 if it is short."""
+        """Return the duration of a blocked write call [s], or 0 if no call is blocked."""
         since_s = self._write_since_s
         blocked_s = 0.0 if since_s is None else time.monotonic() - since_s
         return blocked_s if blocked_s >= BLOCKED_S else 0.0
 
     def _frames_in(self, blocked_s: float) -> int:
-        """Return the number of frames that would have been drawn in this time."""
+        """Return the number of frames that are lost in this time."""
         return 0 if self._period_s is None else int(blocked_s / self._period_s)
 
     def _dropped_lines(self) -> int:
@@ -242,22 +234,22 @@ class QueuedWriter:
         return self._queue.dropped + self._lost_lines
 
     def _begin_closing(self) -> None:
-        """Tell the thread to write the remaining lines and stop."""
+        """Make the thread write the remaining lines and end."""
         self._closing.set()
-        self._queue.push("", 0)  # unlike wake(), this is not lost if the thread is not waiting yet
+        self._queue.push("", 0)  # unlike wake(), an entry is not lost if the thread does not wait yet
 
 
 class QueuedLines(io.TextIOBase):
-    """Text stream that passes whole lines to a ``QueuedWriter``; it replaces ``sys.stderr``."""
+    """Text stream that passes whole lines to a ``QueuedWriter``. It replaces ``sys.stderr``."""
 
     def __init__(self, writer: QueuedWriter, terminal: bool) -> None:
         self._writer = writer
         self._terminal = terminal
         self._partial = ""
-        self._lock = threading.RLock()  # a warning from the garbage collector may enter again
+        self._lock = threading.RLock()  # a warning during garbage collection may call write() again
 
     def write(self, text: str) -> int:
-        """Queue the lines that are complete; return at once."""
+        """Queue the complete lines and return at once."""
         with self._lock:
             *lines, self._partial = (self._partial + text).split("\n")
             if len(self._partial) > MAX_QUEUED_CHARACTERS:
@@ -267,12 +259,12 @@ class QueuedLines(io.TextIOBase):
         return len(text)
 
     def isatty(self) -> bool:
-        """Return True if the lines end on a terminal."""
+        """Return True if the destination of the lines is a terminal."""
         return self._terminal
 
 
 def descriptor_of(stream: TextIO | None) -> int | None:
-    """Return the file descriptor of a stream, or None if it has none."""
+    """Return the file descriptor of a stream, or None for a stream without descriptor."""
     try:
         descriptor = -1 if stream is None else stream.fileno()
     except (OSError, ValueError):
@@ -281,10 +273,13 @@ def descriptor_of(stream: TextIO | None) -> int | None:
 
 
 def redirect_to_null_device(stream: TextIO | None) -> None:
-    """Point the descriptor of a stream to the null device, so that no later write to it can block."""
+    """Redirect the descriptor of a stream to the null device, so that no later write can block."""
     descriptor = descriptor_of(stream)
     if descriptor is not None:
-        with contextlib.suppress(OSError), open(os.devnull, "wb") as null:  # no free descriptor: it stays as it is
+        with (
+            contextlib.suppress(OSError),
+            open(os.devnull, "wb") as null,
+        ):  # without a free descriptor, nothing is changed
             os.dup2(null.fileno(), descriptor)
 
 
@@ -296,7 +291,7 @@ def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
     descriptor : int or None
         File descriptor; None counts as writable.
     timeout_s : float
-        Longest time to wait until it is writable [s].
+        Longest time to wait until a write does not block [s].
     """
     if descriptor is None:
         return True

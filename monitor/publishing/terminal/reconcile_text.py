@@ -1,9 +1,10 @@
-"""Result of a reconciliation as text for the terminal: summary, table of axes and steps, and unexplained remainder.
+"""Result of a reconciliation as text for the terminal: summary, table of axes and steps, and unexplained differences.
 
-Lines are rich text for any width; long lines wrap inside their column. Each result has a symbol and a word in
+Lines are rich text for any width, and long lines wrap inside their column. Each result has a symbol and a word in
 addition to its colour. Sentences and units come from ``reconcile_sentences``.
 
-For several recordings, the output is a table of axes and recordings, and a line for each common or single effect.
+For several recordings, the text is a table of axes and recordings, followed by a list of the effects that all
+recordings show and a list of the effects that only some recordings show.
 """
 
 from typing import Final
@@ -17,9 +18,9 @@ from drivers.sample import AXES
 from monitor.common.units import format_duration
 from monitor.publishing.reports import comparison_sentences
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.publishing.terminal.tables import plain_table
+from monitor.publishing.terminal.tables import plain_table, print_notes
 from monitor.reconcile.result import AddedOrResizedEffect, AxisResult, Reconciliation
-from monitor.reconcile.several_recordings.comparison import AxisComparison, Comparison, MatchedEffect
+from monitor.reconcile.several_recordings.comparison import Comparison, MatchedEffect
 
 RESULT_STYLES: Final = {
     "agrees": ("●", "green"),
@@ -43,12 +44,11 @@ def print_report(r: Reconciliation, console: Console) -> None:
     console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
     console.print(_verdict(r.verdict), Text(words.summarize(r)))
     console.print(_axes_table(r))
-    for note in r.notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    print_notes(r.notes, console)
 
 
 def _axes_table(r: Reconciliation) -> RenderableType:
-    """Return a table with a row per axis, followed by its steps and its unexplained remainder."""
+    """Return a table with the result, the steps and the unexplained differences of each axis."""
     rows = plain_table("axis", "verdict")
     for head in ("gap", "conf."):
         rows.add_column(head, justify="right", no_wrap=True)
@@ -59,7 +59,7 @@ def _axes_table(r: Reconciliation) -> RenderableType:
 
 
 def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
-    """Add an axis to the table: its first line with the name of the axis, then its other lines."""
+    """Add the lines of an axis to the table. The first line has the name of the axis."""
     lines = [_step(r, result.axis, step) for step in result.steps]
     lines += [
         ("", "", Text(f"left over: {words.describe_gap(one, result.axis)}", style="yellow")) for one in result.left_over
@@ -81,7 +81,7 @@ def _step(r: Reconciliation, axis: str, step: AddedOrResizedEffect) -> tuple[str
 
 
 def _verdict(verdict: str) -> Text:
-    """Return the symbol and word of a result in its colour."""
+    """Return the symbol and the word for a result, in the colour of the result."""
     sign, style = RESULT_STYLES[verdict]
     return Text(f"{sign} {words.RESULT_TEXTS[verdict]}", style=style)
 
@@ -102,8 +102,7 @@ def print_comparison(c: Comparison, console: Console) -> None:
         if found:
             console.print(Text(title, style="bold"))
             console.print(Padding(_lines(found), (0, 0, 1, 2)))
-    for name, why in c.without_result.items():
-        console.print(f"note: {name} is left out: {why}", markup=False, highlight=False, soft_wrap=True)
+    print_notes([f"{name} is left out: {why}" for name, why in c.without_result.items()], console)
 
 
 def _axes_by_runs(c: Comparison) -> Table:
@@ -139,7 +138,7 @@ def _lines(found: list[tuple[str, Text]]) -> Table:
 
 
 def _common(c: Comparison) -> list[tuple[str, Text]]:
-    """Return a line for each effect that all recordings show."""
+    """Return axis and text of each effect that all recordings show."""
     found = []
     for axis, one in c.axes.items():
         for seen in one.common:
@@ -152,14 +151,9 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
 
 
 def _single(c: Comparison) -> list[tuple[str, Text]]:
-    """Return the lines of effects that only some recordings show."""
-    return [line for axis, one in c.axes.items() for line in _single_on(c, axis, one)]
-
-
-def _single_on(c: Comparison, axis: str, one: AxisComparison) -> list[tuple[str, Text]]:
-    """Return the lines of effects on one axis that only some recordings show, with reasons for their absence."""
+    """Return the effects that only some recordings show, with reasons for their absence in the others."""
     found = []
-    for seen in one.single:
+    for axis, seen in [(axis, seen) for axis, one in c.axes.items() for seen in one.single]:
         said = _effect(c, axis, seen)
         said.append(f"; in {', '.join(seen.steps)}")
         found.append((axis, said))

@@ -1,6 +1,6 @@
 """Helpers for tables in the terminal."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from rich.console import Console, ConsoleOptions, RenderResult
 from rich.table import Table
@@ -14,9 +14,9 @@ def plain_table(*heads: str, wrapped: Sequence[str] = (), gap: int = 2, show_hea
     Parameters
     ----------
     *heads
-        Headers of the first columns, whose cells are not wrapped.
+        Headers of the first columns. Their cells are not wrapped.
     wrapped
-        Headers of the next columns, whose cells may be wrapped.
+        Headers of the next columns. Their cells may be wrapped.
     gap
         Number of blanks between columns.
     show_header
@@ -28,6 +28,12 @@ def plain_table(*heads: str, wrapped: Sequence[str] = (), gap: int = 2, show_hea
     for head in wrapped:
         table.add_column(head)
     return table
+
+
+def print_notes(notes: Iterable[str], console: Console) -> None:
+    """Print each note on a separate line."""
+    for note in notes:
+        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 
 
 def table_width(table: Table, console: Console, options: ConsoleOptions) -> int:
@@ -44,7 +50,7 @@ def table_width(table: Table, console: Console, options: ConsoleOptions) -> int:
 
 
 class WidthDependentTable:
-    """Renderable that shows the wide table if it fits, and the narrow one otherwise."""
+    """Pair of tables. The wide table is shown if it fits the terminal, and the narrow table otherwise."""
 
     def __init__(self, wide: Table, narrow: Table) -> None:
         self._wide = wide

@@ -11,19 +11,16 @@ from monitor.common.units import DEVIATION_UNITS, format_duration, format_rate, 
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemoval
 from monitor.drift.thermal.thermal_fit import ThermalFit
-from monitor.drift.thermal.thermal_model import Prediction
 from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_study import ComparisonWithMeans, ThermalFitReport, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import encode_json
-from monitor.publishing.terminal.tables import plain_table
+from monitor.publishing.terminal.tables import plain_table, print_notes
 
 FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
 PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
-ONE_WAY: Final = (
-    "temperature only rose, or only fell: how late its effect is, and whether there is hysteresis, cannot be told"
-)
-DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time by itself can look the same"
+ONE_WAY: Final = "temperature only rose or only fell, so neither a time lag nor hysteresis can be determined"
+DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time would look the same"
 
 
 def print_thermal_fit(study: ThermalFitReport, console: Console) -> None:
@@ -43,9 +40,9 @@ def print_thermal_fit(study: ThermalFitReport, console: Console) -> None:
             rows.add_row(axis, *_fit_row(axis, one))
         console.print(Padding(rows, (1, 0)))
         console.print(
-            "loop: largest difference between heating and cooling, where noise does not explain it. leaves: rms of the "
-            "means less the model. validated: the same on parts of the record predicted from the others (over that of "
-            "a cubic).",
+            "loop: largest difference between heating and cooling, if noise does not explain it. leaves: rms of the "
+            "means minus the model. validated: rms on parts of the record that are predicted from the other parts "
+            "(and its ratio to that of a cubic).",
             style="dim",
         )
     one_way = [axis for axis, one in study.fits.items() if not one.temperature_rose_and_fell]
@@ -76,7 +73,7 @@ def print_thermal_prediction(outlook: ThermalPredictionReport, console: Console)
 
 
 def temperature_notes(found: TemperatureRemoval) -> list[str]:
-    """Return a sentence for each axis whose slow variance, or whose K or R, is largely due to temperature."""
+    """Return a sentence for each axis on which temperature explains most of the slow variance, or much of K or R."""
     notes = []
     for axis, one in found.dependences.items():
         fallen = [
@@ -103,7 +100,7 @@ def temperature_notes(found: TemperatureRemoval) -> list[str]:
 
 
 def notes_on_hysteresis(study: ThermalFitReport) -> list[str]:
-    """Return a sentence for each axis on which heating and cooling differ by more than noise explains."""
+    """Return a sentence for each axis on which the bias differs significantly between heating and cooling."""
     return [
         f"{axis}: at one temperature the bias differs between heating and cooling by up to "
         f"{format_rate(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
@@ -157,14 +154,9 @@ def _prediction_of_axis(means: IntervalMeans, one: ComparisonWithMeans) -> dict[
         "within": one.coverage,
         "temperature": means.temperature_c,
         "bias": means.bias,
-        "multi_step": _prediction(one.multi_step),
-        "one_step": _prediction(one.one_step),
+        "multi_step": one.multi_step,
+        "one_step": one.one_step,
     }
-
-
-def _prediction(one: Prediction) -> dict[str, Any]:
-    """Return a predicted bias with its interval."""
-    return {"bias": one.bias, "lo": one.lo, "hi": one.hi}
 
 
 def _json(
@@ -183,7 +175,7 @@ def _json(
 
 
 def _summary_line(recording: str, interval_s: float, means: Any) -> str:
-    """Return one line with recording, number and width of intervals, and temperature range."""
+    """Return one line with the recording, the number and length of the intervals, and the temperature range."""
     first: IntervalMeans = next(iter(means.values()))
     count = first.bias.size
     warmth = first.temperature_c
@@ -212,8 +204,7 @@ def _format_deviation(axis: str, si: float) -> str:
 
 
 def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:
-    """Print the axes without a model and the notes."""
-    for axis, why in refused.items():
-        console.print(f"{axis}: {why}", highlight=False, soft_wrap=True)
-    for note in notes:
-        console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
+    """Print the reasons for axes without a model, and the notes."""
+    for axis, reason in refused.items():
+        console.print(f"{axis}: {reason}", highlight=False, soft_wrap=True)
+    print_notes(notes, console)

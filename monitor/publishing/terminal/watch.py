@@ -18,7 +18,7 @@ REFRESH_PERIOD_S: Final = 0.5
 PLAIN_PERIOD_S: Final = 1.0
 """Interval between two tables if the output is not a terminal."""
 SILENCE_NOTE_S: Final = 5.0
-"""Time without any message after which the note says so, because access control refuses silently."""
+"""Time without any message after which a note is shown, because access control refuses silently."""
 STDOUT: Final = "standard output"
 
 
@@ -32,7 +32,7 @@ def watch(
 ) -> None:
     """Show the table until ``stop`` is set or Ctrl-C is pressed.
 
-    The table is written by a separate thread. A terminal or pipe that is not read delays neither messages nor the exit.
+    The table is written by a separate thread. A blocked terminal or pipe delays neither messages nor the exit.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ def watch(
     console
         Console that formats the table.
     once_s
-        Time to collect messages [s], after which the table is printed once. None: show it continuously.
+        Time to collect messages [s], after which the table is printed once. By default, the table is updated.
     file
         Configuration file of zenoh.
 
@@ -93,7 +93,7 @@ def _receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None
 
 
 def connection_note(states: DeviceStates, subscriber: ZenohSubscriber) -> str:
-    """Return a description of the problems of the connection to the daemons; "" if there are none.
+    """Return a description of the problems of the connection to the daemons, or "" if there are none.
 
     Parameters
     ----------
@@ -105,6 +105,6 @@ def connection_note(states: DeviceStates, subscriber: ZenohSubscriber) -> str:
     state, dropped = subscriber.state, subscriber.dropped
     notes = [state] if state != "ok" else []
     if state == "ok" and subscriber.all_connected_s > SILENCE_NOTE_S and not states.devices(time.monotonic()):
-        notes.append("connected, but nothing comes: no daemon there, or no right to listen")
-    notes += [f"{dropped:,} messages dropped: too slow here"] if dropped else []
+        notes.append("connected, but no messages: no daemon is there, or access control refuses them")
+    notes += [f"{dropped:,} messages dropped: this computer is too slow"] if dropped else []
     return "; ".join(notes)

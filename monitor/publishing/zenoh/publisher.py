@@ -1,6 +1,6 @@
 """Publisher of results over zenoh: the topics of ``monitor.common.topics``, liveliness tokens and commands.
 
-By default the session is closed to other hosts: it is a peer without scouting that listens only on the loopback
+By default the session is closed to other hosts: a peer without scouting listens only on the loopback
 interface. If the port is in use, the session listens on a free port and reports it. If the session cannot be opened for
 another reason, the attempt is repeated. Until the session is open, ``state`` reports the reason and messages are
 dropped. The processing of samples continues. ``put`` never waits, because zenoh queues outgoing messages and drops the
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 MAX_QUEUED_QUERIES: Final = 64
 """Capacity of the queue of commands and of each channel of queries."""
 DUPLICATE_REPORT_S: Final = 10.0
-"""Time after the last message of another program that publishes under the same key, during which it is reported."""
+"""Another program that publishes under the same key is reported for this time after its last message [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -352,11 +352,6 @@ class _DuplicatePublishers:
 
     If two programs publish under one key, a subscriber receives a mixture of messages, and both programs execute a
     command.
-
-    Parameters
-    ----------
-    prefix
-        Prefix of the keys.
     """
 
     def __init__(self, prefix: str) -> None:

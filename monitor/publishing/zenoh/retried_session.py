@@ -70,7 +70,7 @@ class RetriedSession:
             self._close_session()
 
     def _close_session(self) -> None:
-        """Close the session, which stops the threads that receive from it."""
+        """Close the session, which also ends the threads that receive messages."""
         session, self._session = self._session, None
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]

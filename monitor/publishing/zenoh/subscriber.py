@@ -139,7 +139,7 @@ class ZenohSubscriber:
         self._backlog.wake()
 
     def _push(self, message: Message, stamp: str) -> None:
-        """Add a message to the queue, unless it is a duplicate."""
+        """Add a message to the queue unless the message is a duplicate."""
         if self._duplicate_filter is None or self._duplicate_filter.is_unseen(message.key, stamp):
             self._backlog.push(message, 100 + len(message.payload or b""))
 

@@ -1307,7 +1307,7 @@ def test_history_of_a_span_and_a_step_by_its_configuration(call: Call, histories
         (("{kept}", "--connect", "tcp/127.0.0.1:1"), 2, "not both"),
         ((".",), 2, "history.sqlite: no such file"),
         (("absent.toml",), 2, "no such file"),
-        (("--connect", "here"), 2, "no endpoint"),
+        (("--connect", "here"), 2, "not a valid endpoint"),
     ],
 )
 def test_what_history_cannot_do_is_one_line(

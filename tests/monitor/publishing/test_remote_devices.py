@@ -138,6 +138,6 @@ def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() 
 def test_a_limit_that_is_passed_is_trouble() -> None:
     one = device(crossed=("gz N",))
     assert one.rank(100.0) == 1
-    assert one.problems() == "beyond its limit: gz N"
+    assert one.problems() == "limits exceeded: gz N"
     many = device(crossed=tuple(f"gz {i}" for i in range(100)))
-    assert many.problems() == "beyond its limit: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"
+    assert many.problems() == "limits exceeded: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"

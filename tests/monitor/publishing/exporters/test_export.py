@@ -100,7 +100,7 @@ def test_kalibr_has_the_worst_axis_in_continuous_time_units() -> None:
         "gyroscope_random_walk": pytest.approx(1.0e-5),
     }
     assert "worst axis ay (ax 0.001, ay 0.00224, az 0.001)" in text
-    assert "N, B and K are 10 times those of the source" in text
+    assert "N, B and K are 10 times the values of the source" in text
     assert "source: bench-1.toml" in text
     assert "not in this file: Q, B, az.bias" in text
     assert text.isascii()
@@ -121,7 +121,7 @@ def test_kalibr_takes_an_estimate_before_a_bound_and_says_a_bound() -> None:
     assert found["gyroscope_random_walk"] == pytest.approx(3e-6)
     assert "# K: worst axis gy (gx <= 9e-06, gy 3e-06)" in text
     assert found["accelerometer_random_walk"] == pytest.approx(5e-5)
-    assert "# K: worst axis ax, an UPPER BOUND: the data show no more (ax <= 5e-05)" in text
+    assert "# K: worst axis ax, UPPER BOUND instead of a value (ax <= 5e-05)" in text
     assert found["gyroscope_noise_density"] == pytest.approx(2e-4)
 
 
@@ -170,7 +170,7 @@ def test_matlab_never_simulates_a_bound() -> None:
     text = exporters.export(analysed(), "gyroparams")
     found = properties(text)
     assert found["gyro=gyroparams"]["RandomWalk"] == pytest.approx([0.0, 3e-6, 0.0])
-    assert "% K, (rad/s)*sqrt(Hz); gx only bounded, <= 9e-06; gz not known" in text
+    assert "% K, (rad/s)*sqrt(Hz); gx only bounded, <= 9e-06; gz unknown" in text
     assert text.isascii()
 
 
@@ -242,7 +242,7 @@ def test_flicker_without_a_middle_needs_a_correlation_time() -> None:
     text = "sample_rate = 10.0\n[gx.bias_instability]\nB = 1e-5"
     without = exporters.export(noise(text), "kalman")
     assert tomllib.loads(without)["gx"]["states"] == ["angle", "bias_walk"]
-    assert "# B is left out" in without
+    assert "# B is omitted" in without
     given = tomllib.loads(exporters.export(noise(text), "kalman", 3.0, dt_s=2.0, correlation_time_s=100.0))
     assert given["inflation"] == 3.0
     assert given["gx"]["correlation_time"] == 100.0
@@ -253,10 +253,10 @@ def test_flicker_without_a_middle_needs_a_correlation_time() -> None:
 def test_kalman_counts_a_bound_and_says_so() -> None:
     text = exporters.export(analysed(), "kalman")
     assert tomllib.loads(text)["gx"]["psd_walk"] == pytest.approx(9e-6**2)
-    assert "# an UPPER BOUND, the data show no more: K" in text
+    assert "# UPPER BOUND instead of a value: K" in text
     unseen = exporters.export(analysed("unestimated"), "kalman")
     assert tomllib.loads(unseen)["gx"]["psd_walk"] == 0.0
-    assert "# not known, counted as 0: B, K" in unseen
+    assert "# unknown, set to 0: B, K" in unseen
 
 
 @pytest.mark.parametrize("form", list(exporters.FORMATS))

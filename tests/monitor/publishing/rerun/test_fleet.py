@@ -144,4 +144,4 @@ def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell
     assert table[2].startswith("| **imu/bad** | **LOST** |")
     assert table[3].startswith("| **imu/well** | running | 99.98 Hz | 360,000 | 3 | 1 | 0.515 |")
     assert r"gone \| \<img src=x\> \[a\](http://b)  \# head" in table[2]
-    assert "… and 1 more with less trouble" in fleet_text(board.devices(10.0), 10.0, 1)
+    assert "… and 1 more with fewer problems" in fleet_text(board.devices(10.0), 10.0, 1)

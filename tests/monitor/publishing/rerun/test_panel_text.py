@@ -47,5 +47,5 @@ def test_the_overview_has_a_line_a_device():
 
 
 def test_a_limit_that_is_passed_stands_in_the_health_panel() -> None:
-    assert "beyond its limit: **gz N, az B**" in health_text("b", made.health(crossed=("gz N", "az B")))
+    assert "limits exceeded: **gz N, az B**" in health_text("b", made.health(crossed=("gz N", "az B")))
     assert "limit" not in health_text("b", made.health())

@@ -1,6 +1,7 @@
 """The live view: what reaches a recording, and that no viewer can harm the service."""
 
 import fcntl
+import os
 import shutil
 import signal
 import socket
@@ -161,12 +162,12 @@ def test_a_frozen_viewer_delays_nobody_and_is_said(server: sinks.ViewerProcess) 
     view = RerunView(ViewerSettings("native", port=server.port), DEVICE)  # type: ignore[attr-defined]
     view.start()
     wait_for(lambda: view.state == "ok")
-    server.signal(signal.SIGSTOP)
+    os.kill(server.pid, signal.SIGSTOP)
     given = count()
     # the server answers nothing from here on: a call that waited for it would not return
     wait_for(lambda: feed(view, next(given)) or view.state.startswith("stalled"), "the view to say that it stalls")
     feed(view, next(given))
-    server.signal(signal.SIGCONT)
+    os.kill(server.pid, signal.SIGCONT)
     wait_for(lambda: view.state == "ok")
     view.close()
 
@@ -176,7 +177,7 @@ def test_a_stalled_view_counts_what_it_drops(server: sinks.ViewerProcess, monkey
     view = RerunView(ViewerSettings("native", port=server.port), DEVICE)  # type: ignore[attr-defined]
     view.start()
     wait_for(lambda: view.state == "ok")
-    server.signal(signal.SIGSTOP)
+    os.kill(server.pid, signal.SIGSTOP)
     wait_for(lambda: view.state.startswith("stalled"))
     for i in range(100):
         feed(view, i)

@@ -317,7 +317,7 @@ def test_more_devices_than_lines(board: DeviceStates) -> None:
     assert len(lines) < 40
     assert lines[2].startswith("zz")
     rows = sum(line.startswith(("device-", "zz")) for line in lines)
-    assert f"… and {101 - rows} more with less trouble" in text
+    assert f"… and {101 - rows} more with fewer problems" in text
     assert shown(board, 120).count("device-") == 100  # a file takes them all
 
 
