@@ -1,14 +1,15 @@
-"""Decision whether a sensor agrees with its noise model, and events when this decision changes.
+"""Decisions whether the axes of a sensor agree with the noise model, and events when a decision changes.
 
-The window is compared with the model ten times per second, and successive results are nearly the same. A second result
-above the threshold is therefore no independent evidence. Some of many windows also exceed the threshold by chance. A
-model is rejected only if the gap exceeded the stricter limit ``AxisGap.alarm`` in every comparison while an eighth of
-the window was replaced, and at least ``MIN_SAMPLES`` samples. Above twice the threshold, where chance is excluded,
-``MIN_SAMPLES`` samples suffice. A rejected model is accepted again if the gap stays below ``null95`` for as long.
-Between these limits, the decision does not change. In a simulation of 1600 windows of six axes with 128 comparisons
-each, a true model was rejected three times.
+The window is compared with the model ten times per second, and successive results are strongly correlated. Several
+results above the threshold are therefore not independent evidence. In addition, some of many windows exceed the
+threshold by chance. A model is rejected only if every comparison exceeds the stricter limit ``AxisGap.alarm`` until an
+eighth of the window and at least ``MIN_SAMPLES`` samples have been replaced. If the gap is above twice the threshold,
+chance is excluded, and ``MIN_SAMPLES`` new samples are sufficient. A rejected model is accepted again if the gap stays
+below ``null95`` until the same share of the window has been replaced. Between the two limits, the decision does not
+change. In a simulation of 1600 windows of six axes with 128 comparisons each, a true model was rejected three times.
 
-Both changes are reported as a ``model_disagrees`` event. The field ``agrees`` of the event is the new decision.
+A rejection and a renewed acceptance are reported as ``model_disagrees`` events. The field ``agrees`` of the event is
+the new decision.
 """
 
 from collections.abc import Mapping
@@ -35,14 +36,14 @@ class _Axis:
 
 
 class ModelAgreement:
-    """Decision for each axis of one device whether it agrees with its model."""
+    """Decisions whether the axes of one device agree with the noise model."""
 
     def __init__(self) -> None:
         self._axes = {axis: _Axis() for axis in AXES}
 
     @property
     def decisions(self) -> Mapping[str, bool]:
-        """Current decision for each axis that has one: True if it agrees with its model."""
+        """Current decision for each decided axis, True if the axis agrees with the model."""
         return {axis: one.agrees for axis, one in self._axes.items() if one.agrees is not None}
 
     def update(self, comparison: ModelGap) -> list[Event]:
