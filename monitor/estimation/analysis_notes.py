@@ -1,8 +1,8 @@
-"""Notes of an analysis for users: sentences about the fit, motion, noise changes, spectral lines and outliers.
+"""Notes of an analysis for users, about the fit, motion, noise changes, spectral lines and outliers.
 
-Each function returns a list of notes, which is empty if there is nothing to report. A list has at most ``MAX_NOTES``
-notes of one kind and the number of omitted notes. Times are in seconds since the first sample. The functions only
-format results and estimate nothing.
+Each function returns a list of notes, which is empty if there is nothing to report. A list contains at most
+``MAX_NOTES`` notes of one kind and a note with the number of omitted notes. Times are in seconds since the first
+sample. The functions only format results and estimate nothing.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -28,15 +28,15 @@ Run = tuple[int, int]
 MAX_NOTES: Final = 10
 """Maximum number of notes of one kind."""
 DEPARTURE_SIGMA: Final = 3.0
-"""Distance from the fit, in standard deviations, beyond which an averaging time departs from it."""
+"""Residual in standard deviations above which an averaging time departs from the fit."""
 LINE_FREQUENCY_TOLERANCE: Final = 0.01
-"""Lines on several axes are reported as one if their frequencies differ by less than this share."""
+"""Relative difference of frequency below which lines on several axes are reported in one note."""
 MIN_OUTLIER_SHARE: Final = 0.001
-"""Shares of outliers up to this value are not reported."""
+"""Smallest share of outliers that is reported."""
 MIN_EXPLAINING_SHARE: Final = 0.05
-"""A line explains a departure of the curve if it contributes at least this share of the Allan variance there."""
+"""Minimum share of the Allan variance that a line must contribute to explain a departure of the curve."""
 MIN_Q_SHARE: Final = 0.2
-"""A line can be mistaken for quantization noise if it contributes at least this share of the Allan variance."""
+"""Minimum share of the Allan variance of a line that can be mistaken for quantization noise."""
 Q_ROWS: Final = 3
 """Number of shortest averaging times that determine Q."""
 BANDWIDTH_OR_VIBRATION: Final = "the sensor's bandwidth or a vibration shows there"
@@ -48,11 +48,11 @@ MOTION_LEFT_IN: Final = "the sensor moved, which may be why; --rest strikes it o
 UNKNOWN_CAUSE: Final = "vibration, motion or temperature may be why"
 ORDINALS: Final = ("", "first", "second", "third", "fourth")
 MIN_DEPARTURE_RATIO: Final = 0.5
-"""Averaging times are reported together with the worst one if they depart to the same side by this share of it."""
+"""Minimum departure of a reported averaging time, relative to the largest departure of the curve."""
 
 
 def of_unexplained_curve(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass | None], rate_hz: float) -> list[str]:
-    """Describe where the sum of the five terms does not explain the curve. Axes with the same note share it.
+    """Describe where the five terms do not explain the curve. Axes with the same description are listed in one note.
 
     Parameters
     ----------
@@ -61,7 +61,7 @@ def of_unexplained_curve(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass 
     fit : Fit
         Fit to the curve.
     filters : sequence of LowPass or None
-        Low-pass of each axis, None where the curve does not show one.
+        Low-pass filter of each axis, or None.
     rate_hz : float
         Sample rate in Hz.
     """
@@ -78,9 +78,9 @@ def of_unexplained_curve(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass 
 
 
 def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bool = False) -> list[str]:
-    """List the axes whose curve no sum of the five terms explains, grouped by cause.
+    """List the axes with a curve that the five terms cannot explain, grouped by cause.
 
-    The cause is a spectral line or motion. Axes without a known cause are grouped only if they depart at the same τ.
+    The cause is a spectral line or motion. Axes without a known cause are grouped if they depart at the same τ.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bo
     found : sequence of Line
         Spectral lines that are reported.
     moved : bool
-        True if the sensor moved and these samples are part of the curve.
+        True if the curve includes samples in motion.
     """
     names, notes = _line_names(found), list[str]()
     out = [i for i in range(len(AXES)) if fit.left_out[i]]
@@ -107,7 +107,7 @@ def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bo
 
 
 def of_quantization(curve: AllanCurve, fit: Fit, found: Sequence[Line]) -> list[str]:
-    """Warn where a spectral line contributes so much at the shortest τ that Q may be this line.
+    """Warn if the estimate of Q may be caused by a spectral line.
 
     Parameters
     ----------
@@ -134,7 +134,7 @@ def replace_guessed_causes(
     Parameters
     ----------
     notes : sequence of str
-        Notes that include those of ``of_unexplained_curve``.
+        Notes of an analysis, including the result of ``of_unexplained_curve``.
     curve : AllanCurve
         Curve from which these notes were made.
     fit : Fit
@@ -142,7 +142,7 @@ def replace_guessed_causes(
     found : sequence of Line
         Spectral lines that are reported.
     moved : bool
-        True if the sensor moved and these samples are part of the curve.
+        True if the curve includes samples in motion.
     """
     known = of_misfit(curve, fit, found, moved)
     guessed = [note for note in of_misfit(curve, fit) if note not in known]
@@ -151,7 +151,7 @@ def replace_guessed_causes(
 
 
 def of_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list[str]:
-    """Report how often and how long the sensor moved, and how these samples were treated.
+    """Report how often and how long the sensor moved, and whether the samples in motion were removed.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def of_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list
 
 
 def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
-    """Report the changes, and the effect on a curve of the whole recording.
+    """Report changes of the noise and the bias.
 
     Parameters
     ----------
@@ -194,7 +194,7 @@ def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
 
 
 def of_lines_and_outliers(found: Sequence[Line], far: Floats) -> list[str]:
-    """Report spectral lines, one note for all axes of one frequency, and the share of outliers.
+    """Report spectral lines and the share of outliers. Axes with a line at the same frequency share a note.
 
     Parameters
     ----------
@@ -220,7 +220,7 @@ def of_lines_and_outliers(found: Sequence[Line], far: Floats) -> list[str]:
 
 
 def _group_by_frequency(found: Sequence[Line]) -> list[list[Line]]:
-    """Group lines of the same frequency; the strongest group comes first."""
+    """Group lines of the same frequency. The group with the strongest line is first."""
     groups: list[list[Line]] = []
     left = sorted(found, key=lambda one: -one.share)
     while left:
@@ -236,7 +236,7 @@ def _line_name(line: Line) -> str:
 
 
 def _line_names(found: Sequence[Line]) -> dict[Line, str]:
-    """Return the name under which each reported line appears in the notes."""
+    """Return the name of each reported line in the notes."""
     return {
         one: _line_name(here[0]).replace("a ", "the ", 1)
         for here in _group_by_frequency(found)[:MAX_NOTES]
@@ -250,11 +250,11 @@ def _count_omitted(count: int, what: str) -> list[str]:
 
 
 def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
-    """Return the first and last τ of the range in which the curve of one axis exceeds the fit by the largest factor.
+    """Return the range of τ in which the curve of one axis departs most from the fit.
 
-    Noise outside the five terms adds to the curve, and the fit is pulled towards it. The largest residuals in σ are
-    therefore elsewhere: where the curve is below the fit, and at the accurately known shortest τ. Only residuals above
-    ``DEPARTURE_SIGMA`` count.
+    The range contains the largest ratio of curve and fit, among residuals above ``DEPARTURE_SIGMA``. The largest
+    residual in σ would not be suitable. Noise outside the five terms pulls the fit upwards, so the largest residuals in
+    σ are often elsewhere, where the curve is below the fit.
     """
     model, edf = fit.fitted[:, axis], fit.edf[:, axis]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -271,14 +271,14 @@ def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
 
 
 def _append_axis(axes: dict[str, list[str]], axis: str, text: str) -> None:
-    """Add an axis to the note with this text."""
+    """Add an axis to the list of axes with the same text."""
     axes.setdefault(text, []).append(axis)
 
 
 def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[int, Run]) -> dict[str, dict[int, Run]]:
-    """Group axes and their ranges of τ by the line that contributes most there.
+    """Group axes by the spectral line that contributes most in the range of τ of the axis.
 
-    The key is an empty string if no line contributes enough.
+    The key is an empty string if no line contributes at least ``MIN_EXPLAINING_SHARE``.
     """
     found: dict[str, dict[int, Run]] = {}
     for i, (first, last) in runs.items():
@@ -294,9 +294,9 @@ def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[i
 
 
 def _left_out_note(tau_s: Floats, axes: Collection[int], why: str) -> str:
-    """Format a note about short averaging times that the fit excludes.
+    """Format a note about the shortest averaging times, which the fit leaves out.
 
-    ``tau_s`` [6] is the longest of them per axis.
+    ``tau_s`` [6] is the longest excluded τ of each axis.
     """
     upto = ", ".join(dict.fromkeys(format_two_digits(float(tau_s[i])) for i in axes))
     return (
@@ -306,7 +306,7 @@ def _left_out_note(tau_s: Floats, axes: Collection[int], why: str) -> str:
 
 
 def _bandwidth_note(low_pass: LowPass, rate_hz: float) -> str:
-    """Format the note on the low-pass of the sensor."""
+    """Format the note on the low-pass filter of the sensor."""
     return (
         f"white noise ends below half the sample rate, as behind a {ORDINALS[low_pass.order]}-order low-pass at about "
         f"{low_pass.cutoff * rate_hz:.2g} Hz; N is the level below it"
@@ -325,7 +325,7 @@ def _group_overlapping(runs: Mapping[int, Run]) -> list[dict[int, Run]]:
 
 
 def _misfit_note(tau_s: Floats, fit: Fit, runs: Mapping[int, Run], why: str, at: bool = True) -> str:
-    """Format the note on the axes of ``runs``; ``at`` adds the range of τ."""
+    """Format the note on a misfit of several axes. If ``at`` is true, the note contains the range of τ."""
     low, high = (f"{f(fit.misfit[i] for i in runs) ** 0.5:.2g}" for f in (min, max))
     times = low if low == high else f"{low} to {high}"
     first, last = min(run[0] for run in runs.values()), max(run[1] for run in runs.values())
@@ -339,9 +339,9 @@ def _misfit_note(tau_s: Floats, fit: Fit, runs: Mapping[int, Run], why: str, at:
 
 
 def _k_or_r_note(no_slope: bool) -> str:
-    """Format the note on a rise that is K or R.
+    """Format the note on a drift that is due to K or R.
 
-    The rise cannot be attributed because no slope was measured (``no_slope``) or because the record is too short.
+    The cause is unknown because no slope was measured (``no_slope``) or because the recording is too short.
     """
     if no_slope:
         return "K or R: samples are missing, so that no slope tells a ramp from rate random walk"
