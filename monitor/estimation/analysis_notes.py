@@ -39,13 +39,13 @@ MIN_Q_SHARE: Final = 0.2
 """Minimum share of the Allan variance of a line that can be mistaken for quantization noise."""
 Q_ROWS: Final = 3
 """Number of shortest averaging times that determine Q."""
-BANDWIDTH_OR_VIBRATION: Final = "the sensor's bandwidth or a vibration shows there"
+BANDWIDTH_OR_VIBRATION: Final = "the likely cause is the bandwidth of the sensor or a vibration"
 BELOW_WHITE_NOISE: Final = (
-    "the shortest averaging times lie below white noise, as behind a filter; N is the level of the longer ones, and Q "
-    "no more than a bound"
+    "the Allan variance at the shortest averaging times is below white noise, as after a low-pass filter; N is the "
+    "level at longer averaging times, and Q is only bounded"
 )
-MOTION_LEFT_IN: Final = "the sensor moved, which may be why; --rest strikes it out"
-UNKNOWN_CAUSE: Final = "vibration, motion or temperature may be why"
+MOTION_LEFT_IN: Final = "motion of the sensor may be the cause; --rest removes the samples in motion"
+UNKNOWN_CAUSE: Final = "vibration, motion or temperature may be the cause"
 ORDINALS: Final = ("", "first", "second", "third", "fourth")
 MIN_DEPARTURE_RATIO: Final = 0.5
 """Minimum departure of a reported averaging time, relative to the largest departure of the curve."""
@@ -166,7 +166,7 @@ def of_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list
         return []
     times = "once" if len(motions) == 1 else f"{len(motions)} times"
     seconds = sum(motion.seconds for motion in motions)
-    done = "struck out" if removed else "left in; --rest strikes it out"
+    done = "removed" if removed else "not removed; --rest removes the samples in motion"
     notes = [f"the sensor moved {times}, {seconds:.3g} s in all: {done}"]
     notes += [f"at {motion.since / rate_hz:.1f} s: {motion.text}" for motion in motions[:MAX_NOTES]]
     return notes + _count_omitted(len(motions), "motions")
@@ -189,7 +189,9 @@ def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
     ]
     notes += _count_omitted(len(changes), "changes")
     if any(change.kind != "outlier_burst" for change in changes):
-        notes.append("one curve of the whole recording mixes before and after; --window S shows them apart")
+        notes.append(
+            "the curve of the whole recording mixes the noise before and after; --window S shows the noise over time"
+        )
     return notes
 
 
@@ -214,7 +216,7 @@ def of_lines_and_outliers(found: Sequence[Line], far: Floats) -> list[str]:
     if shares:
         notes.append(
             f"outliers beyond {OUTLIER_SIGMA:g} σ of the other samples: {', '.join(shares)} of all; "
-            "the noise is not Gaussian, and intervals assume that it is"
+            "the intervals assume Gaussian noise"
         )
     return notes
 
@@ -288,7 +290,7 @@ def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[i
             if one.axis == i
         }
         most = max(shares, key=shares.__getitem__, default="")
-        why = f"{most} shows there" if shares.get(most, 0.0) >= MIN_EXPLAINING_SHARE else ""
+        why = f"the likely cause is {most}" if shares.get(most, 0.0) >= MIN_EXPLAINING_SHARE else ""
         found.setdefault(why, {})[i] = (first, last)
     return found
 
@@ -300,16 +302,16 @@ def _left_out_note(tau_s: Floats, axes: Collection[int], why: str) -> str:
     """
     upto = ", ".join(dict.fromkeys(format_two_digits(float(tau_s[i])) for i in axes))
     return (
-        f"{', '.join(AXES[i] for i in axes)}: the fit leaves out τ up to {upto} s, which no sum of the five terms "
-        f"follows: {why}"
+        f"{', '.join(AXES[i] for i in axes)}: the fit leaves out τ up to {upto} s, which the five terms do not "
+        f"explain: {why}"
     )
 
 
 def _bandwidth_note(low_pass: LowPass, rate_hz: float) -> str:
     """Format the note on the low-pass filter of the sensor."""
     return (
-        f"white noise ends below half the sample rate, as behind a {ORDINALS[low_pass.order]}-order low-pass at about "
-        f"{low_pass.cutoff * rate_hz:.2g} Hz; N is the level below it"
+        f"white noise ends below half the sample rate, as after a {ORDINALS[low_pass.order]}-order low-pass at about "
+        f"{low_pass.cutoff * rate_hz:.2g} Hz; N is the level below this frequency"
     )
 
 
@@ -333,7 +335,7 @@ def _misfit_note(tau_s: Floats, fit: Fit, runs: Mapping[int, Run], why: str, at:
     where = f"τ = {since} s" if first == last else f"τ from {since} to {upto} s"
     axes = ", ".join(AXES[i] for i in sorted(runs))
     return (
-        f"{axes}: the curve departs from every sum of the five terms (scatter {times} "
+        f"{axes}: the five terms do not explain the curve (scatter {times} "
         f"times wider){f', most at {where}' if at else ''}: {why}; intervals are widened accordingly"
     )
 
@@ -344,7 +346,8 @@ def _k_or_r_note(no_slope: bool) -> str:
     The cause is unknown because no slope was measured (``no_slope``) or because the recording is too short.
     """
     if no_slope:
-        return "K or R: samples are missing, so that no slope tells a ramp from rate random walk"
+        return "K or R: too many samples are missing to distinguish a ramp from rate random walk"
     return (
-        "K or R: the record drifts by more than Q, N and B make, and is too short to tell a ramp from rate random walk"
+        "K or R: the recording drifts by more than Q, N and B explain, and is too short to distinguish a ramp from "
+        "rate random walk"
     )

@@ -191,11 +191,13 @@ def _address(array: Floats) -> int:
 def _missing_notes(lost: Ints, rate_hz: float) -> list[str]:
     """Format the notes on long pauses and on missing samples."""
     long, short = lost[lost > MAX_GAP_SAMPLES], lost[(lost > 0) & (lost <= MAX_GAP_SAMPLES)]
-    notes = [f"a pause of {n / rate_hz:.6g} s is too long to keep in place; no term reaches across" for n in long]
+    notes = [
+        f"a pause of {n / rate_hz:.6g} s is too long to be kept and is replaced by one missing sample" for n in long
+    ]
     if short.size:
         samples = "1 sample is" if short.sum() == 1 else f"{short.sum()} samples are"
         places = "1 place" if short.size == 1 else f"{short.size} places"
-        notes.append(f"{samples} missing in {places}; terms that touch them are left out")
+        notes.append(f"{samples} missing in {places}; differences that contain them are left out")
     return notes
 
 
@@ -204,9 +206,7 @@ def _late_notes(late: int) -> list[str]:
     if not late:
         return []
     times = "once" if late == 1 else f"{late} times"
-    return [
-        f"a sample came late by a period or more {times}; later ones made good for it, so that none is missing there"
-    ]
+    return [f"a sample was late by a period or more {times}; later times show that no sample is missing there"]
 
 
 def _repeated_notes(values: Floats) -> list[str]:
@@ -215,7 +215,10 @@ def _repeated_notes(values: Floats) -> list[str]:
     if share < MIN_REPEATED_SHARE:
         return []
     percent = 100.0 * share
-    return [f"{percent:.2g} % of rows repeat the one before: the sensor updates slower than it is read; they are kept"]
+    return [
+        f"{percent:.2g} % of rows repeat the previous row, because the sensor updates more slowly than it is read; "
+        "these rows are kept"
+    ]
 
 
 def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
@@ -229,8 +232,8 @@ def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
         low, high = (format_two_digits(f(one.step / one.noise for one in those)) for f in (min, max))
         times = low if low == high else f"{low} to {high}"
         notes.append(
-            f"values come in steps of {size} ({axes}), {times} times the noise from sample to sample: quantization "
-            "shapes the shortest τ"
+            f"values have steps of {size} ({axes}), {times} times the noise from sample to sample; quantization "
+            "affects the shortest τ"
         )
     return notes
 
@@ -240,15 +243,17 @@ def _step_notes(steps: Ints, progress: tuple[Floats, Floats] | None, rate_hz: fl
     if not steps.size:
         return []
     if progress is None:
-        return [f"the rate used is {rate_hz:g} Hz; the times do not go on and say none"]
+        return [f"the rate used is {rate_hz:g} Hz; the times do not increase and give no rate"]
     uneven = _uneven_notes(steps, rate_hz)
     mean_hz, known = _rate(*progress)
     if abs(mean_hz / rate_hz - 1.0) < min(max(MIN_RATE_DEVIATION, RATE_SIGMA * known), LARGE_RATE_DEVIATION):
         return uneven
     if _is_even(steps):
         step_s = float(steps.mean()) / NS_PER_S
-        return [f"the rate used is {rate_hz:g} Hz, but the times step by {step_s:.6g} s, {1.0 / step_s:.6g} Hz"]
-    return [*uneven, f"the rate used is {rate_hz:g} Hz, but by the times {mean_hz:.5g} samples came a second"]
+        return [
+            f"the rate used is {rate_hz:g} Hz, but the times increase in steps of {step_s:.6g} s, {1.0 / step_s:.6g} Hz"
+        ]
+    return [*uneven, f"the rate used is {rate_hz:g} Hz, but the times give a mean of {mean_hz:.5g} Hz"]
 
 
 def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
@@ -261,11 +266,11 @@ def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
         return []
     unit_s = _unit_s(steps)
     if unit_s > UNEVEN_STEP_SHARE / rate_hz:
-        return [f"times have a resolution of {unit_s:.3g} s; samples are taken to be even"]
+        return [f"times have a resolution of {unit_s:.3g} s; equal time steps are assumed"]
     worst_s = float(steps[steps < FORWARD_JUMP_S * NS_PER_S].max()) / NS_PER_S
     return [
-        f"times step unevenly: by {middle:.3g} s in the median, {high:.3g} s at 90 %, {worst_s:.3g} s at worst; "
-        "samples are taken to be even"
+        f"time steps are uneven: median {middle:.3g} s, 90 % quantile {high:.3g} s, maximum {worst_s:.3g} s; "
+        "equal time steps are assumed"
     ]
 
 
@@ -323,12 +328,14 @@ def _rate(came: Floats, passed_s: Floats) -> tuple[float, float]:
 def _mean_rate(progress: tuple[Floats, Floats] | None) -> float:
     """Return the rate of a recording without a stated rate."""
     if progress is None:
-        raise NotReady("the times of the recording do not go on, so that its rate is unknown; state it with --rate HZ")
+        raise NotReady(
+            "the times of the recording do not increase, so the rate is unknown; state the rate with --rate HZ"
+        )
     rate_hz = snap_to_standard_rate(_rate(*progress)[0])
     try:
         return RATE_HZ.check(rate_hz)
     except ConfigError as error:
         raise RecordingError(
-            f"the times of the recording give a sample rate that is not supported: {error}; t must be in seconds, or "
-            "state the rate with --rate HZ"
+            f"the times of the recording give a sample rate that is not supported: {error}; check that t is in "
+            "seconds, or state the rate with --rate HZ"
         ) from None

@@ -81,12 +81,12 @@ def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
         "tau_hi": hi,
     }
     if agrees:
-        text = f"{gap.axis} agrees with its model again: {gap.gap:.1f} σ apart at most"
+        text = f"{gap.axis} agrees with its model again: the largest gap is {gap.gap:.1f} σ"
     else:
         text = (
             f"{gap.axis} disagrees with its model at τ {format_tau_range(gap)}: "
-            f"deviation {gap.ratio:.3g} times the model's, "
-            f"{gap.gap:.3g} σ apart where chance stays below {gap.threshold:.1f}"
+            f"the deviation is {gap.ratio:.3g} times the deviation of the model, "
+            f"a gap of {gap.gap:.3g} σ with a threshold of {gap.threshold:.1f} σ"
         )
     return Event(KIND, t_ns, text, gap.axis, {"model": what}, since_ns, gap.gap)
 
