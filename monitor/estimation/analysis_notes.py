@@ -26,7 +26,6 @@ Run = tuple[int, int]
 """Row numbers of the first and the last τ of a range."""
 
 MAX_NOTES: Final = 10
-"""Maximum number of notes of one kind."""
 DEPARTURE_SIGMA: Final = 3.0
 """Residual in standard deviations above which an averaging time departs from the fit."""
 LINE_FREQUENCY_TOLERANCE: Final = 0.01
@@ -65,16 +64,16 @@ def of_unexplained_curve(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass 
     rate_hz : float
         Sample rate in Hz.
     """
-    axes: dict[str, list[str]] = {}
+    found = []
     for i, axis in enumerate(AXES):
         low_pass = filters[i]
         if low_pass is not None:
-            _append_axis(axes, axis, _bandwidth_note(low_pass, rate_hz))
+            found.append((axis, _bandwidth_note(low_pass, rate_hz)))
         elif fit.theta[Q, i] < 0.0 and not fit.left_out[i]:
-            _append_axis(axes, axis, BELOW_WHITE_NOISE)
+            found.append((axis, BELOW_WHITE_NOISE))
         if fit.k_or_r[i]:
-            _append_axis(axes, axis, _k_or_r_note(fit.coefficients.status[K, i] == Status.ESTIMATED))
-    return [f"{', '.join(those)}: {text}" for text, those in axes.items()] + of_misfit(curve, fit)
+            found.append((axis, _k_or_r_note(fit.coefficients.status[K, i] == Status.ESTIMATED)))
+    return _group_axes(found) + of_misfit(curve, fit)
 
 
 def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bool = False) -> list[str]:
@@ -106,24 +105,14 @@ def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bo
     return notes
 
 
-def of_quantization(curve: AllanCurve, fit: Fit, found: Sequence[Line]) -> list[str]:
-    """Warn if the estimate of Q may be caused by a spectral line.
-
-    Parameters
-    ----------
-    curve : AllanCurve
-        Measured curve.
-    fit : Fit
-        Fit to the curve.
-    found : sequence of Line
-        Spectral lines of all axes.
-    """
-    axes: dict[str, list[str]] = {}
+def _quantization_notes(curve: AllanCurve, fit: Fit, found: Sequence[Line]) -> list[str]:
+    """Warn if the estimate of Q may be caused by a spectral line."""
+    causes = []
     for one, name in _line_names(found).items():
         estimated = fit.coefficients.status[Q, one.axis] == Status.ESTIMATED
         if estimated and float(np.nanmax(line_share(one, curve)[:Q_ROWS], initial=0.0)) >= MIN_Q_SHARE:
-            _append_axis(axes, AXES[one.axis], f"quantization noise may be {name}")
-    return [f"{', '.join(those)}: {text}" for text, those in axes.items()]
+            causes.append((AXES[one.axis], f"quantization noise may be {name}"))
+    return _group_axes(causes)
 
 
 def replace_guessed_causes(
@@ -147,7 +136,7 @@ def replace_guessed_causes(
     known = of_misfit(curve, fit, found, moved)
     guessed = [note for note in of_misfit(curve, fit) if note not in known]
     kept = [note for note in notes if note not in guessed]
-    return kept + [note for note in known if note not in kept] + of_quantization(curve, fit, found)
+    return kept + [note for note in known if note not in kept] + _quantization_notes(curve, fit, found)
 
 
 def of_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list[str]:
@@ -272,9 +261,12 @@ def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
     return worst, worst
 
 
-def _append_axis(axes: dict[str, list[str]], axis: str, text: str) -> None:
-    """Add an axis to the list of axes with the same text."""
-    axes.setdefault(text, []).append(axis)
+def _group_axes(found: Sequence[tuple[str, str]]) -> list[str]:
+    """Return one note for all axes with the same text."""
+    axes: dict[str, list[str]] = {}
+    for axis, text in found:
+        axes.setdefault(text, []).append(axis)
+    return [f"{', '.join(those)}: {text}" for text, those in axes.items()]
 
 
 def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[int, Run]) -> dict[str, dict[int, Run]]:

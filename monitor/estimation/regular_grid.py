@@ -71,9 +71,8 @@ def resample_to_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tu
     notes : list of str
         Irregularities of the time stamps and the values.
     """
-    stamped, lost, rate, notes = _stamp(blocks, rate_hz)
-    values = _place_on_grid(stamped, lost)
-    return values, rate, [*notes, *_value_notes(values), *_missing_notes(lost, rate)]
+    _, _, values, rate, notes = _resample(blocks, rate_hz)
+    return values, rate, notes
 
 
 def resample_with_temperature(
@@ -83,32 +82,34 @@ def resample_with_temperature(
 
     Parameters
     ----------
-    blocks : sequence of SampleBlock
-        Recording with time stamps.
-    rate_hz : float or None
-        Stated sample rate in Hz. If None, the rate is estimated from the time stamps.
+    blocks, rate_hz
+        As for ``resample_to_grid``.
 
     Returns
     -------
-    values : ndarray of float64, shape (n, 6)
-        Samples in rad/s and m/s². The array may share memory with ``blocks`` and must not be modified.
+    values, rate_hz, notes
+        As for ``resample_to_grid``.
     temperature_c : ndarray of float64, shape (n,)
-        Temperature in °C; NaN where not measured and for missing samples.
-    rate_hz : float
-        Sample rate in Hz.
-    notes : list of str
-        Irregularities of the time stamps and the values.
+        Second result. Temperature in °C; NaN where not measured and for missing samples.
     """
-    stamped, lost, rate, notes = _stamp(blocks, rate_hz)
-    values = _place_on_grid(stamped, lost)
+    stamped, lost, values, rate, notes = _resample(blocks, rate_hz)
     missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost).tolist()
     parts = [
         part
         for samples, hole in zip(stamped, missing, strict=True)
         for part in (np.full(hole, np.nan), samples.temperature_c)
     ]
-    notes = [*notes, *_value_notes(values), *_missing_notes(lost, rate)]
     return values, np.concatenate(parts), rate, notes
+
+
+def _resample(
+    blocks: Sequence[SampleBlock], rate_hz: float | None
+) -> tuple[list[SampleBlock], Ints, Floats, float, list[str]]:
+    """Return the stamped blocks, the missing samples before each block, the samples, the rate, and all notes."""
+    stamped, lost, rate, notes = _stamp(blocks, rate_hz)
+    values = _place_on_grid(stamped, lost)
+    notes += _repeated_notes(values) + _resolution_notes(find_coarse_axes(values)) + _missing_notes(lost, rate)
+    return stamped, lost, values, rate, notes
 
 
 def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[SampleBlock], Ints, float, list[str]]:
@@ -127,11 +128,6 @@ def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[S
         else []
     )
     return stamped, lost, rate, notes + _step_notes(steps, progress, rate) + _late_notes(late)
-
-
-def _value_notes(values: Floats) -> list[str]:
-    """Format the notes on repeated rows and on coarse resolution."""
-    return _repeated_notes(values) + _resolution_notes(find_coarse_axes(values))
 
 
 def _count_missing(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, int]:

@@ -28,7 +28,6 @@ from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_desi
 STEPS_PER_WINDOW: Final = 20
 """Default number of steps per window length."""
 MAX_STEPS: Final = 500
-"""Maximum number of steps."""
 
 Progress = Callable[[float], None]
 """Callback that receives the completed share, 0 to 1."""

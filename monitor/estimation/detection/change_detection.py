@@ -191,17 +191,8 @@ class ChangeDetector:
         """True for octaves [J, 6] (clusters of 2^j samples) whose reference is long enough for an alarm."""
         band = self._state.band
         known = (band[:, :, N] >= MIN_REFERENCE_TERMS * band[:, :, F] ** 2) & (band[:, :, S] > 0.0)
-        return np.asarray((known & self._is_old_enough[:, None]).T)
-
-    @property
-    def learned_axes(self) -> NDArray[np.bool_]:
-        """True for axes [6] on which at least the shortest octave can raise an alarm."""
-        return np.asarray(self.watched_octaves[0])
-
-    @property
-    def _is_old_enough(self) -> NDArray[np.bool_]:
-        """True for axes whose reference is at least ``LEARN_S`` old."""
-        return np.asarray(self.samples - self._state.born >= LEARN_S * self.rate_hz)
+        old_enough = self.samples - self._state.born >= LEARN_S * self.rate_hz
+        return np.asarray((known & old_enough[:, None]).T)
 
     def update(self, values: Floats) -> None:
         """Process samples.

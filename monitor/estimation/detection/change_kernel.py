@@ -92,7 +92,7 @@ HELD, FULL, SQUARES, COUNT, SPREAD = range(5)
 """Columns of ``ChangeState.spread``."""
 NOISE, BURST, STEP = 1.0, 2.0, 3.0
 """Kinds of alarms."""
-KIND, WHERE, START, FOUND, EVIDENCE, DUE = range(6)
+KIND, START, FOUND, EVIDENCE, DUE = range(5)
 """Columns of ``ChangeState.alarm``."""
 BEFORE, AFTER, PLACE, SIGMA, LEFT = range(1, 6)
 """Columns of ``ChangeState.step``; column 0 is the octave."""
@@ -121,7 +121,7 @@ class ChangeState(NamedTuple):
     cusum: Floats  # [A, J, 6, 4] n1, S1, sample of the suspected onset, evidence g
     spread: Floats  # [A, J, L, 5] sums of z²: stored sum, 1 if stored, squared differences, pairs, spread F
     burst: Floats  # [A, 2] CUSUM of extremes, and the last sample at which the CUSUM was zero
-    alarm: Floats  # [A, 6] pending alarm, see KIND; kind 0 means none
+    alarm: Floats  # [A, 5] pending alarm, see KIND; kind 0 means none
     step: Floats  # [A, 6] octave (−1 means none), mean before and after, position, sigma, pairs left to confirm
     snap: Floats  # [levels, SLOTS, A, J, 5] snapshots of ``cum``, with a spacing proportional to their age
     snap_at: Ints  # [levels, SLOTS] sample numbers of the snapshots
@@ -135,7 +135,7 @@ def make_state(octaves: int) -> ChangeState:
         np.zeros((a, TICK_SAMPLES)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 2)),
         np.zeros((a, j, SEED)),
         np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, RATIOS.size, 4)),
-        np.zeros((a, j, 12, 5)), np.zeros((a, 2)), np.zeros((a, 6)), np.zeros((a, 6)),
+        np.zeros((a, j, 12, 5)), np.zeros((a, 2)), np.zeros((a, 5)), np.zeros((a, 6)),
         np.zeros((40, SLOTS, a, j, 5)), np.full((40, SLOTS), -1, np.int64),
     )  # fmt: skip
     state.step[:, 0] = -1.0
@@ -182,8 +182,9 @@ def _tick(s: ChangeState, axis: int, now: int) -> None:
             count += 1.0
         else:
             sums[i] = np.nan
-    if _count_extremes(sums, s.band, s.cum, s.burst, axis, now) > s.levels[H_BURST]:
-        _suspect_burst(s, axis, now)
+    evidence = _count_extremes(sums, s.band, s.cum, s.burst, axis, now)
+    if evidence > s.levels[H_BURST] and s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_TIME]:
+        _alarm(s, axis, BURST, s.burst[axis, 1], evidence, now)
     h = s.levels[H_NOISE]
     for j in range(SHORT):
         _differences(sums, s.band, s.unit, s.seeds, axis, j)
@@ -391,7 +392,7 @@ def _suspect(s: ChangeState, axis: int, j: int, i: int, now: int) -> None:
     since = s.cusum[axis, j, i, SINCE]
     enough = s.band[axis, j, N] - s.cusum[axis, j, i, N1] >= MIN_REFERENCE_TERMS * s.band[axis, j, F] ** 2
     if enough and since - s.born[axis] >= s.levels[LEARN_TIME]:
-        _alarm(s, axis, NOISE, j, since, s.cusum[axis, j, i, G], now)
+        _alarm(s, axis, NOISE, since, s.cusum[axis, j, i, G], now)
     elif s.alarm[axis, KIND] == 0.0:
         _relearn(s, axis, j)
 
@@ -432,14 +433,7 @@ def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis
 
 
 @compiled
-def _suspect_burst(s: ChangeState, axis: int, now: int) -> None:
-    """Raise an alarm for a burst of outliers if the reference is long enough."""
-    if s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_TIME]:
-        _alarm(s, axis, BURST, 0, s.burst[axis, 1], s.burst[axis, 0], now)
-
-
-@compiled
-def _alarm(s: ChangeState, axis: int, kind: float, j: int, since: float, evidence: float, now: int) -> None:
+def _alarm(s: ChangeState, axis: int, kind: float, since: float, evidence: float, now: int) -> None:
     """Record an alarm of an axis that has none.
 
     The waiting time before the decision is the time from the onset to the alarm, within limits.
@@ -448,8 +442,7 @@ def _alarm(s: ChangeState, axis: int, kind: float, j: int, since: float, evidenc
     if alarm[KIND] != 0.0 and not (alarm[FOUND] == now and evidence > alarm[EVIDENCE]):
         return
     wait = np.ceil(min(max(now - since, s.levels[DWELL]), s.levels[LONGEST_DWELL]) / TICK_SAMPLES) * TICK_SAMPLES
-    alarm[KIND], alarm[WHERE], alarm[START], alarm[FOUND] = kind, j, since, now
-    alarm[EVIDENCE], alarm[DUE] = evidence, now + wait
+    alarm[KIND], alarm[START], alarm[FOUND], alarm[EVIDENCE], alarm[DUE] = kind, since, now, evidence, now + wait
     s.step[axis, 0] = -1.0
     set_due(s)
 
@@ -509,8 +502,8 @@ def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
     step[LEFT] -= 1.0
     if step[LEFT] == 0.0 and s.alarm[axis, KIND] == 0.0:
         alarm = s.alarm[axis]
-        alarm[KIND], alarm[WHERE], alarm[START] = STEP, step[0], step[PLACE]
-        alarm[FOUND], alarm[EVIDENCE], alarm[DUE] = now, 0.5 * step[SIGMA] ** 2, now
+        alarm[KIND], alarm[START], alarm[FOUND] = STEP, step[PLACE], now
+        alarm[EVIDENCE], alarm[DUE] = 0.5 * step[SIGMA] ** 2, now
         set_due(s)
 
 

@@ -20,7 +20,6 @@ from drivers.sample import AXES, Event
 from monitor.estimation.detection.model_gap import MIN_SAMPLES, AxisGap, ModelGap
 
 KIND: Final = "model_disagrees"
-"""Kind of the events."""
 RENEWED_SHARE: Final = 0.125
 """Share of the window that must be replaced while a gap persists."""
 CLEAR_FACTOR: Final = 2.0
@@ -72,6 +71,7 @@ class ModelAgreement:
 def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
     """Build the event for a changed decision."""
     lo, hi = gap.tau_s
+    tau = f"{lo:.3g} s" if lo == hi else f"{lo:.3g} to {hi:.3g} s"
     what = {
         "agrees": agrees,
         "gap": gap.gap,
@@ -84,20 +84,8 @@ def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
         text = f"{gap.axis} agrees with its model again: the largest gap is {gap.gap:.1f} σ"
     else:
         text = (
-            f"{gap.axis} disagrees with its model at τ {format_tau_range(gap)}: "
+            f"{gap.axis} disagrees with its model at τ {tau}: "
             f"the deviation is {gap.ratio:.3g} times the deviation of the model, "
             f"a gap of {gap.gap:.3g} σ with a threshold of {gap.threshold:.1f} σ"
         )
     return Event(KIND, t_ns, text, gap.axis, {"model": what}, since_ns, gap.gap)
-
-
-def format_tau_range(gap: AxisGap) -> str:
-    """Format the range of τ with the largest gap.
-
-    >>> import numpy as np
-    >>> one = np.ones(1)
-    >>> format_tau_range(AxisGap("gz", one, one, one, 9.0, (0.04, 1.28), 0, 2.0, 3.0, 3.5, 1000))
-    '0.04 to 1.28 s'
-    """
-    lo, hi = gap.tau_s
-    return f"{lo:.3g} s" if lo == hi else f"{lo:.3g} to {hi:.3g} s"

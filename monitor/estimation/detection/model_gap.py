@@ -65,11 +65,6 @@ class AxisGap:
     samples: int  # samples of this axis in the window
 
     @property
-    def exceeds_threshold(self) -> bool:
-        """True if the gap exceeds the threshold, so that chance does not explain it."""
-        return self.gap > self.threshold
-
-    @property
     def ratio(self) -> float:
         """Ratio of the measured deviation to the deviation of the model at the largest gap."""
         return float(self.measured[self.row] / self.model[self.row])

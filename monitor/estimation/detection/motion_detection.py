@@ -42,7 +42,6 @@ MAX_KNOCK_BLOCKS: Final = 2
 """Largest number of moving blocks of a knock, if the orientation of the sensor did not change."""
 
 Kind = Literal["knock", "motion", "handling/orientation"]
-"""Kinds of motion."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,9 +20,7 @@ from monitor.common.compiled import compiled
 ROWS: Final = 1000
 """Number of rows in a stretch. The noise is assumed to be constant within a stretch."""
 MAX_STRETCHES: Final = 500
-"""Maximum number of stretches."""
 BISECTIONS: Final = 40
-"""Number of bisection steps."""
 
 
 def estimate_repeated_share(values: Floats) -> float:

@@ -21,7 +21,6 @@ MIN_STEP_TO_NOISE: Final = 0.5
 ROWS: Final = 4096
 """Maximum number of samples in a stretch."""
 MAX_STRETCHES: Final = 16
-"""Maximum number of stretches."""
 GRID_TOLERANCE: Final = 0.1
 """Deviation from a whole number of steps, as a share of the step, within which a value is on the grid.
 

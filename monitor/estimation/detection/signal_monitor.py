@@ -124,11 +124,7 @@ class SignalMonitor:
         self._began = self._received
         self._rest = MotionDetector(self._rate_hz)
         self._first = 0  # index of the first sample that the change detector received, counted from ``_began``
-        self._changes = self._detector() if self._alarms_per_day > 0.0 else None
-
-    def _detector(self) -> ChangeDetector:
-        """Return a new change detector."""
-        return ChangeDetector(self._rate_hz, self._alarms_per_day)
+        self._changes = ChangeDetector(self._rate_hz, self._alarms_per_day) if self._alarms_per_day > 0.0 else None
 
     def _with_pending(self, still: list[SampleBlock]) -> list[SampleBlock]:
         """Return the pending blocks of the previous rate, followed by the given blocks."""
@@ -147,7 +143,8 @@ class SignalMonitor:
         for samples in still:
             if samples.lost > MAX_SKIPPED_SAMPLES:
                 self._report_changes(self._changes)
-                self._changes, self._first = self._detector(), self._first + self._changes.samples + samples.lost
+                self._first += self._changes.samples + samples.lost
+                self._changes = ChangeDetector(self._rate_hz, self._alarms_per_day)
             elif samples.lost:
                 self._changes.skip(samples.lost)
             self._changes.update(samples.values)

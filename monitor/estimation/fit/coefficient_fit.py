@@ -51,14 +51,11 @@ from monitor.noise.standard_terms import unit_allan_variances
 TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 """Powers of the sample rate that convert Q N B K R from τ0 = 1 to SI."""
 
-ENTER_ONCE: Final = 2.33  # σ, for a single fit of one curve: 1 % of absent terms are added
-ENTER_WATCHED: Final = 3.0  # σ, for repeated fits of a live window
-LEAVE_WATCHED: Final = 1.5  # σ, for repeated fits of a live window
 PER_AXIS_FIELDS: Final = ("theta", "fitted", "edf", "entered", "left_out", "scatter", "misfit", "k_or_r")
 """Fields of ``Fit`` that have one column per axis, besides the coefficients."""
-THRESHOLDS_ONCE: Final = (ENTER_ONCE, ENTER_ONCE)
-"""Thresholds in σ to add and to drop a term in a single fit."""
-THRESHOLDS_WATCHED: Final = (ENTER_WATCHED, LEAVE_WATCHED)
+THRESHOLDS_ONCE: Final = (2.33, 2.33)
+"""Thresholds in σ to add and to drop a term in a single fit. They add 1 % of absent terms."""
+THRESHOLDS_WATCHED: Final = (3.0, 1.5)
 """Thresholds in σ to add and to drop a term in repeated fits. The difference is a hysteresis."""
 
 
@@ -269,10 +266,7 @@ def _white_edf(design: Design, table: CovarianceTable, terms: Ints) -> Floats:
 
     In the first seconds, the noise of a sensor is mostly white.
     """
-    own = table.covariance[:, :, WHITE].diagonal()[:, None] * _present_ratio(table.terms[:, None], terms)
+    whole = table.terms[:, None]
+    ratio = np.where((whole > 0) & (terms > 0), whole / np.maximum(terms, 1), np.nan)  # of all terms to present terms
+    own = table.covariance[:, :, WHITE].diagonal()[:, None] * ratio
     return np.asarray(2.0 * design.columns[:, N, None] ** 2 / own)
-
-
-def _present_ratio(whole: Ints, terms: Ints) -> Floats:
-    """Return the number of terms without gaps divided by the number of present terms; NaN without terms."""
-    return np.where((whole > 0) & (terms > 0), whole / np.maximum(terms, 1), np.nan)

@@ -23,19 +23,8 @@ Q, N, B, K, R = range(5)
 
 
 @compiled
-def allan_covariance(theta: Floats, c: Floats) -> float:
-    """Return the covariance of two Allan variances under a model.
-
-    The covariance is the quadratic form Σ_ab θ_a θ_b C^ab. A negative Q², which represents a band limit, counts as
-    zero.
-
-    Parameters
-    ----------
-    theta : ndarray of float64, shape (5,)
-        Squared coefficients in units of one sample.
-    c : ndarray of float64, shape (10,)
-        Entry C of ``CovarianceTable.covariance``.
-    """
+def _allan_covariance(theta: Floats, c: Floats) -> float:
+    """Return the covariance Σ_ab θ_a θ_b C^ab of two Allan variances. A negative Q², a band limit, counts as zero."""
     q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
     return float(
         q * (q * c[0] + 2.0 * (n * c[1] + b * c[2] + k * c[3]))
@@ -60,7 +49,7 @@ def compute_observation_variances(problem: LeastSquares, rows: Ints, theta: Floa
     """
     for i in rows:
         stretch = problem.stretch[i]
-        problem.variance[i] = allan_covariance(theta, problem.covariance[i, i]) * stretch * stretch
+        problem.variance[i] = _allan_covariance(theta, problem.covariance[i, i]) * stretch * stretch
 
 
 @compiled
@@ -97,7 +86,7 @@ def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
     for k in range(m):
         for j in range(k + 1):
             i, h = rows[k], rows[j]
-            x = allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
+            x = _allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
             factor[k, j] = x / np.sqrt(variance[i] * variance[h])
     if not _factorize(factor, m, SINGULAR_COVARIANCE):
         return False

@@ -248,18 +248,7 @@ def search_low_pass(
 ) -> Generator[None, None, LowPass | None]:
     """Do the search of ``find_low_pass`` in steps of a few milliseconds, for callers that must not block.
 
-    The generator yields after each step and returns the filter or None.
-
-    Parameters
-    ----------
-    design : Design
-        Columns for the cluster sizes of the curve.
-    table : CovarianceTable
-        Covariances for the window length.
-    measured : MeasuredCurve
-        Measured curve of a single axis.
-    power : ndarray of float64
-        Spectrum of the axis, from ``power_spectrum``.
+    The parameters are those of ``find_low_pass``. The generator yields after each step and returns the filter or None.
     """
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     grids: list[list[float]] = []

@@ -146,7 +146,7 @@ def test_stale_rows_are_told_and_kept(fraction, step):
         values[row] = values[row - 1]
     grid, _, notes = resample_to_grid(recorded_blocks(np.arange(20000) / 100, values), None)
     assert np.array_equal(grid, values)
-    (note,) = [one for one in notes if "in steps of" not in one]
+    (note,) = [one for one in notes if "have steps of" not in one]
     assert note.endswith("the sensor updates more slowly than it is read; these rows are kept")
     assert float(note.split()[0]) == pytest.approx(100 * fraction, rel=0.1)
 
