@@ -15,10 +15,10 @@ from typing import Final, Literal
 
 import numpy as np
 
-from drivers.decoders.base import Decoder, LateFrameCounter
+from drivers.decoders.base import Decoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import Link
-from drivers.sample import AXES, Chunk, Event, SampleBlock, SenderTiming, make_block
+from drivers.sample import AXES, Chunk, Event, SampleBlock, SenderTimedFormat, make_block
 from drivers.timing.sample_clock import SampleClock
 
 READ_TIMEOUT_S: Final = 0.2
@@ -49,7 +49,7 @@ class AxisMap:
     source: tuple[int, ...] = (0, 1, 2, 3, 4, 5)
     sign: tuple[float, ...] = (1.0,) * 6
 
-    def apply(self, samples: SampleBlock) -> SampleBlock:
+    def map_axes(self, samples: SampleBlock) -> SampleBlock:
         """Return the samples on the axes of the configuration."""
         if self == AxisMap():
             return samples
@@ -109,7 +109,7 @@ class Driver:
         self.state: State = "waiting"
         self.text = f"waiting for {link.name}"
         self.iterations = 0  # number of reads and attempts to open; it does not increase while the driver is blocked
-        self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, SenderTiming)
+        self.times_are_unix = link.epoch == "unix" or isinstance(decoder.timing, SenderTimedFormat)
         self.first_t_ns: int | None = None
         """Time of the first sample since the start; None before the first sample."""
         self._push = push
@@ -119,7 +119,7 @@ class Driver:
         self._events: deque[Event] = deque(maxlen=MAX_QUEUED_EVENTS)
         self._stop = threading.Event()
         self._undecoded_bytes = 0
-        self._counts_late = decoder if isinstance(decoder, LateFrameCounter) else None
+        self._counts_late = decoder if isinstance(decoder, LateFrameCountingDecoder) else None
         self._left_out_reported = 0  # samples left out by the decoder that have been reported as gaps
         self._last_data_s = 0.0
         self._last_sample_s = 0.0
@@ -128,9 +128,9 @@ class Driver:
         self._last_report_s = -LOSS_REPORT_INTERVAL_S
 
     @property
-    def late_hint(self) -> str:
+    def late_frames_hint(self) -> str:
         """Delay of the late frames of a sample and how to correct it; "" if no frame has been late for a while."""
-        return self._counts_late.late_hint if self._counts_late else ""
+        return self._counts_late.late_frames_hint if self._counts_late else ""
 
     def take_events(self) -> list[Event]:
         """Return the events since the last call, oldest first."""
@@ -160,7 +160,7 @@ class Driver:
                 opening_ns = time.monotonic_ns()
                 self.link.open()
                 if not self.times_are_unix:
-                    self.clock.link_idle(opening_ns)
+                    self.clock.note_no_unread_data(opening_ns)
                 self._last_data_s = time.monotonic()
                 while not self._stop.is_set():
                     self.step()
@@ -181,11 +181,11 @@ class Driver:
         """Read once, and decode, time-stamp and pass on the samples."""
         self.iterations += 1
         asked_ns = time.monotonic_ns()
-        chunks = self.link.read(READ_TIMEOUT_S)
+        chunks = self.link.poll_chunks(READ_TIMEOUT_S)
         self._report_lost()
         if chunks is None:
             if not self.times_are_unix:
-                self.clock.link_idle(asked_ns)
+                self.clock.note_no_unread_data(asked_ns)
             self._check_silence()
             return
         self._last_data_s = time.monotonic()
@@ -202,7 +202,7 @@ class Driver:
             self._left_out_reported += left_out
             for stamped in self.clock.assign_times(one):
                 self._count(stamped, left_out)
-                self._push(self._axes.apply(stamped))
+                self._push(self._axes.map_axes(stamped))
                 left_out = 0  # they are missing before the first row
         self._count_left_out()
         self._report_lost()
@@ -212,14 +212,14 @@ class Driver:
 
     def _left_out(self) -> int:
         """Return the number of samples that the decoder has left out because they were bad or late."""
-        return self.decoder.bad + (self._counts_late.late if self._counts_late else 0)
+        return self.decoder.bad + (self._counts_late.dropped_late_samples if self._counts_late else 0)
 
     def _count_left_out(self) -> None:
         """Update the counts of bad and late samples."""
         self.counts.bad = self.decoder.bad
         if self._counts_late:
-            self.counts.lost += self._counts_late.late - self.counts.late
-            self.counts.late = self._counts_late.late
+            self.counts.lost += self._counts_late.dropped_late_samples - self.counts.late
+            self.counts.late = self._counts_late.dropped_late_samples
 
     def _count(self, stamped: SampleBlock, left_out: int) -> None:
         """Count the samples of a block and those missing before it, apart from samples that the decoder left out."""
@@ -255,12 +255,12 @@ class Driver:
         patience_s = max(MIN_UNDECODED_S, 10.0 / (self.clock.rate_hz or 10.0))
         if self._undecoded_bytes < MAX_UNDECODED_BYTES or (self.state == "running" and mute_s < patience_s):
             return
-        why = self.decoder.hint or "wrong baud rate, or another protocol than the configured one"
+        why = self.decoder.recent_problem or "wrong baud rate, or another protocol than the configured one"
         self.text = f"{self.link.name}: {self._undecoded_bytes} bytes and no sample in them; {why}"
         if self.state == "running":
             self._event("link_lost", self.text)
             self.state = "lost"
-            self.clock.pause()
+            self.clock.note_link_closed()
 
     def _handle_recovery(self) -> None:
         """Report that samples arrive again."""
@@ -277,7 +277,7 @@ class Driver:
         self.link.close()
         self.decoder.reset()
         self._left_out_reported = self._left_out()
-        self.clock.pause()
+        self.clock.note_link_closed()
 
     def _event(self, kind: str, text: str) -> None:
         """Queue an event."""

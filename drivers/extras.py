@@ -13,19 +13,19 @@ EXTRAS: Final[Mapping[str, Mapping[str, str]]] = {
 """Map from an extra to its modules, and from each module to the name of its package."""
 
 
-def missing_packages(extra: str) -> tuple[str, ...]:
+def find_missing_packages(extra: str) -> tuple[str, ...]:
     """Return the names of the packages of an extra that are not installed."""
     return tuple(package for module, package in EXTRAS[extra].items() if importlib.util.find_spec(module) is None)
 
 
-def check_extra(extra: str, user: str) -> None:
+def check_extra(extra: str, feature: str) -> None:
     """Check that all packages of an extra are installed.
 
     Parameters
     ----------
     extra
         Key of EXTRAS.
-    user
+    feature
         Feature that needs the packages, as the subject of the message.
 
     Raises
@@ -33,5 +33,5 @@ def check_extra(extra: str, user: str) -> None:
     ConfigError
         If a package is missing. The text says how to install the package.
     """
-    if missing := missing_packages(extra):
-        raise ConfigError(f'{user} needs {" and ".join(missing)}: pip install "imu-monitor[{extra}]"')
+    if missing := find_missing_packages(extra):
+        raise ConfigError(f'{feature} needs {" and ".join(missing)}: pip install "imu-monitor[{extra}]"')

@@ -87,7 +87,7 @@ def check_regular(path: Path) -> None:
     _check_mode(path, mode)
 
 
-def check_folder(path: Path) -> None:
+def check_folder_or_absent(path: Path) -> None:
     """Raise OSError if a path is neither a folder nor absent. ``strerror`` names the kind of file."""
     try:
         mode = os.stat(path).st_mode

@@ -97,12 +97,12 @@ def make_block(
 
 
 @dataclass(frozen=True, slots=True)
-class ArrivalTiming:
+class ArrivalTimedFormat:
     """Timing of a wire format without a counter: sample times are estimated from arrival times by regression."""
 
 
 @dataclass(frozen=True, slots=True)
-class CounterTiming:
+class CounterTimedFormat:
     """Timing of a wire format whose frames carry a counter.
 
     ``modulus`` is the number of counts after which the counter starts again at 0. ``tick_s`` is the length of one count
@@ -114,11 +114,11 @@ class CounterTiming:
 
 
 @dataclass(frozen=True, slots=True)
-class SenderTiming:
+class SenderTimedFormat:
     """Timing of a wire format whose payload carries Unix times. ``Chunk.t_ns`` is not used."""
 
 
-Timing = ArrivalTiming | CounterTiming | SenderTiming
+Timing = ArrivalTimedFormat | CounterTimedFormat | SenderTimedFormat
 
 EVENT_KINDS: Final = (
     "link_lost",

@@ -30,7 +30,7 @@ from pydantic_core import CoreSchema, ErrorDetails, core_schema
 from drivers import file_access
 from drivers.discovery import format_choices, format_suggestion
 from drivers.errors import ConfigError
-from drivers.quantities import format_value
+from drivers.number_ranges import format_value
 
 MAX_PASSES: Final = 4
 """Maximum number of validations of a table. Each pass replaces the wrong values that the previous pass has found."""
@@ -71,13 +71,13 @@ class SettingsModel(BaseModel):
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", validate_by_name=True)
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         """Yield the mistakes that a single field does not show."""
         return iter(())
 
     @model_validator(mode="after")
     def _refuse_conflicts(self, info: ValidationInfo) -> Self:
-        if info.context is None and (found := list(self.conflicts())):  # check_table collects them itself
+        if info.context is None and (found := list(self.find_conflicts())):  # check_table collects them itself
             raise ConfigError(*(f"{one.key}: {one.text}" for one in found))
         return self
 
@@ -88,7 +88,7 @@ class Problem(NamedTuple):
     place: str  # path of the key, such as "signals.gx" or "tau[1]"; "" for the whole table
     text: str
 
-    def below(self, place: str) -> "Problem":
+    def nest_under(self, place: str) -> "Problem":
         """Return the same problem for a table at ``place`` of a larger table."""
         dot = "." if place and self.place and not self.place.startswith("[") else ""
         return Problem(f"{place}{dot}{self.place}", self.text)
@@ -115,7 +115,7 @@ class TableError(ConfigError):
 
 
 @dataclass
-class CheckedTable(Generic[Model]):
+class TableCheckResult(Generic[Model]):
     """Result of ``check_table``."""
 
     value: Model | None  # settings, with defaults or examples in place of wrong values; None if that is impossible
@@ -126,7 +126,7 @@ class CheckedTable(Generic[Model]):
         """Return True if no problem was found in these keys, in their tables or in their subkeys."""
         return not any(_nested(place, wrong.place) for place in places for wrong in self.problems)
 
-    def add(self, place: str, text: str) -> None:
+    def add_problem(self, place: str, text: str) -> None:
         """Add a problem, unless the value at its place is wrong by itself.
 
         Parameters
@@ -163,7 +163,7 @@ def read_settings(kind: type[Model], table: Mapping[str, Any], folder: Path | No
     return checked.value
 
 
-def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> CheckedTable[Model]:
+def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> TableCheckResult[Model]:
     """Find all mistakes of a table.
 
     Wrong values are replaced by defaults or examples, so that they do not hide other mistakes.
@@ -177,7 +177,7 @@ def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None
     folder
         Folder at which relative paths begin. If it is None, files are not looked for.
     """
-    checked: CheckedTable[Model] = CheckedTable(None)
+    checked: TableCheckResult[Model] = TableCheckResult(None)
     repaired = copy.deepcopy(dict(table))
     for _ in range(MAX_PASSES):
         try:
@@ -194,7 +194,7 @@ def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None
     return checked
 
 
-def describe_keys(kind: type[SettingsModel]) -> dict[str, FieldInfo]:
+def fields_by_key(kind: type[SettingsModel]) -> dict[str, FieldInfo]:
     """Return the fields of a model by the names of their keys in the file."""
     return {found.alias or name: found for name, found in kind.model_fields.items()}
 
@@ -206,18 +206,18 @@ def find_model(annotation: Any) -> type[SettingsModel] | None:
     return next((found for one in get_args(annotation) if (found := find_model(one))), None)
 
 
-def _problems(kind: type[SettingsModel], error: ErrorDetails, checked: CheckedTable[Any]) -> Iterator[Problem]:
+def _problems(kind: type[SettingsModel], error: ErrorDetails, checked: TableCheckResult[Any]) -> Iterator[Problem]:
     """Yield the problems that an error of pydantic stands for."""
     place = _format_place(error["loc"])
     cause = error.get("ctx", {}).get("error")
     if isinstance(cause, TableError):
         checked.partial[place] = cause.partial
-        yield from (problem.below(place) for problem in cause.problems)
+        yield from (problem.nest_under(place) for problem in cause.problems)
     elif isinstance(cause, ConfigError):
         yield from (Problem(place, line) for line in cause.lines)
     elif error["type"] == "extra_forbidden":
         model = _field_at(kind, error["loc"])[0]
-        yield Problem(place, f"unknown key{format_suggestion(str(error['loc'][-1]), tuple(describe_keys(model)))}")
+        yield Problem(place, f"unknown key{format_suggestion(str(error['loc'][-1]), tuple(fields_by_key(model)))}")
     else:
         yield Problem(place, _describe(error))
 
@@ -233,16 +233,16 @@ def _describe(error: ErrorDetails) -> str:
     return f"expected {EXPECTED.get(error['type'], 'another value')}, got {format_value(value)}"
 
 
-def _add_conflicts(checked: CheckedTable[Any], value: object, place: str) -> None:
+def _add_conflicts(checked: TableCheckResult[Any], value: object, place: str) -> None:
     """Add the conflicts of a model and of all models in it."""
     if isinstance(value, SettingsModel):
-        for one in value.conflicts():
-            problem = Problem(one.key, one.text).below(place)
+        for one in value.find_conflicts():
+            problem = Problem(one.key, one.text).nest_under(place)
             keys = (*one.others, one.key) if one.key else one.others
-            if checked.is_sound(*(Problem(key, "").below(place).place for key in keys)):
+            if checked.is_sound(*(Problem(key, "").nest_under(place).place for key in keys)):
                 checked.problems.append(problem)
-        for key, info in zip(describe_keys(type(value)), type(value).model_fields, strict=True):
-            _add_conflicts(checked, getattr(value, info), Problem(key, "").below(place).place)
+        for key, info in zip(fields_by_key(type(value)), type(value).model_fields, strict=True):
+            _add_conflicts(checked, getattr(value, info), Problem(key, "").nest_under(place).place)
     elif isinstance(value, tuple):
         for i, one in enumerate(value):
             _add_conflicts(checked, one, f"{place}[{i}]")
@@ -270,7 +270,7 @@ def _field_at(kind: type[SettingsModel], place: Sequence[str | int]) -> tuple[ty
         if found is not None:
             kind = find_model(found.annotation) or kind
         if isinstance(part, str):
-            found = describe_keys(kind).get(part)
+            found = fields_by_key(kind).get(part)
     return kind, found
 
 

@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError
-from drivers.quantities import HOUR_S
+from drivers.number_ranges import HOUR_S
 
 G0: Final = 9.80665
 """Standard acceleration of free fall in m/s², exact by definition (CGPM 1901)."""

@@ -21,8 +21,8 @@ from drivers.sample import EVENT_KINDS, make_block
 from drivers.zenoh.sample_message import encode_samples
 from monitor.cli import app
 from monitor.common import topics
-from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
+from monitor.noise.model_catalogue import read_model
 from monitor.publishing.messages.results import CoefficientsMessage
 from monitor.publishing.rerun.sinks import server_url
 from monitor.publishing.zenoh.publisher import ZenohPublisher
@@ -35,7 +35,7 @@ from tests.support.waiting import wait_for
 ROOT = Path(__file__).resolve().parent.parent
 README = ROOT / "README.md"
 ARCHITECTURE = ROOT / "docs" / "architecture.md"
-NOT_DRAWN = {"discovery", "extras", "file_access", "quantities", "settings_model"}
+NOT_DRAWN = {"discovery", "extras", "file_access", "number_ranges", "settings_model"}
 """Small modules without a box of their own in the diagram."""
 SIMULATOR = ROOT / "docs" / "simulator.md"
 COMMANDS_PAGE = ROOT / "docs" / "commands.md"

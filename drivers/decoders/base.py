@@ -51,7 +51,7 @@ class Decoder(Protocol):
         """Number of rejected frames and samples since the decoder was created."""
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Reason for rejected frames, for the status line; "" if no frame was rejected recently."""
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
@@ -77,18 +77,18 @@ class AddressFilter(Protocol):
 
 
 @runtime_checkable
-class LateFrameCounter(Protocol):
+class LateFrameCountingDecoder(Protocol):
     """Interface of a decoder that joins frames to samples, and distinguishes late frames from lost frames."""
 
     @property
-    def late(self) -> int:
+    def dropped_late_samples(self) -> int:
         """Number of samples left out because some of their frames arrived too late.
 
         These samples are not included in ``bad``.
         """
 
     @property
-    def late_hint(self) -> str:
+    def late_frames_hint(self) -> str:
         """Delay of the late frames and the remedy, for the status; "" if no frame has been late for a while."""
 
 
@@ -96,7 +96,7 @@ HINT_FRAMES: Final = 1000
 """Number of good frames after a rejected frame until the hint about the rejected frame ends."""
 
 
-class RejectionHint:
+class RecentRejection:
     """Reason for the last rejected frame, which is shown until HINT_FRAMES good frames have followed."""
 
     def __init__(self) -> None:
@@ -104,15 +104,15 @@ class RejectionHint:
         self._good_frames = HINT_FRAMES
 
     @property
-    def text(self) -> str:
+    def rejection_reason(self) -> str:
         """Reason for the last rejected frame; "" if no frame was rejected recently."""
         return self._text if self._good_frames < HINT_FRAMES else ""
 
-    def note_rejected(self, text: str) -> None:
+    def note_rejection(self, text: str) -> None:
         """Store the reason for a rejected frame."""
         self._text, self._good_frames = text, 0
 
-    def count_good(self, frames: int = 1) -> None:
+    def count_good_frames(self, frames: int = 1) -> None:
         """Count good frames."""
         self._good_frames += frames
 
@@ -124,11 +124,11 @@ class BlockBuilder:
         self.bad = 0  # rejected frames and implausible samples so far
         self._missing = 0  # samples missing before the next block
 
-    def reset(self) -> None:
-        """Discard the number of rejected frames that were not followed by a sample."""
+    def forget_rejected_frames(self) -> None:
+        """Set the number of samples missing before the next block to 0."""
         self._missing = 0
 
-    def build_blocks(
+    def build_plausible_blocks(
         self,
         t_ns: Ints,
         values: Floats,
@@ -209,20 +209,22 @@ class Frames:
     t_ns: Ints  # [n] arrival of the chunk that completed each frame
     bad_before: Ints  # [n] number of frames rejected just before each frame
     adjacent: NDArray[np.bool_]  # [n] True if the frame follows the previous one without other bytes
+    bad_after: int = 0  # number of frames rejected after the last frame
 
-    def select_frames(self, rows: Sequence[int]) -> tuple["Frames", int]:
-        """Return the frames with these indices, and the number of frames rejected after the last of them.
+    def select_frames(self, rows: Sequence[int]) -> "Frames":
+        """Return the frames with these indices.
 
-        Frames that were rejected before an unselected frame count before the next selected frame.
+        The rejected frames before an omitted frame are added to ``bad_before`` of the next selected frame, or to
+        ``bad_after``.
         """
         if len(rows) == len(self.data):
-            return self, 0
+            return self
         at = list(rows)
         rejected = np.cumsum(self.bad_before)
         rejected_at = rejected[at]
         after = int(rejected[-1] if rejected.size else 0) - int(rejected_at[-1] if rejected_at.size else 0)
         bad_before = np.diff(rejected_at, prepend=0)
-        return Frames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at]), after
+        return Frames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at], after)
 
     def stack_bytes(self, rows: Sequence[int]) -> Bytes:
         """Return the frames with these indices, which have the same length, as an array [n, length] of uint8."""
@@ -283,14 +285,14 @@ class FrameBuffer:
         self._skipped_bytes = 0  # bytes skipped since the last frame
         self._rejected = 0  # candidates rejected since the last frame
         self._last_rejected = NO_OFFSET  # stream offset of the last rejected candidate
-        self._hint = RejectionHint()
+        self._rejection = RecentRejection()
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Reason for rejected or missing frames; "" if the stream is free of errors."""
         if self._skipped_bytes >= MAX_BYTES_WITHOUT_FRAME:
             return f"{self._skipped_bytes} bytes without a valid frame: is the baud rate right, and the decoder?"
-        return self._hint.text
+        return self._rejection.rejection_reason
 
     def feed(self, chunks: Sequence[Chunk]) -> Frames:
         """Return all frames that these chunks complete."""
@@ -321,7 +323,7 @@ class FrameBuffer:
         self._buffer_offset += at
         while len(self._arrivals) > 1 and self._arrivals[0][0] <= self._buffer_offset:
             self._arrivals.popleft()
-        self._hint.count_good(len(found))
+        self._rejection.count_good_frames(len(found))
         return frames
 
     def _examine_candidate(self, buffer: bytes, at: int) -> tuple[int, int]:
@@ -367,7 +369,7 @@ class FrameBuffer:
         self._skipped_bytes = self._rejected = 0
         self._last_rejected = NO_OFFSET
         if count:
-            self._hint.note_rejected("frames fail their check: bytes are lost or damaged on the line")
+            self._rejection.note_rejection("frames fail their check: bytes are lost or damaged on the line")
         return count
 
     def _arrival_times(self, ends: list[int]) -> Ints:
@@ -402,14 +404,14 @@ class FrameStreamDecoder(ABC):
         return self._builder.bad
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Reason for rejected frames; "" if no frame was rejected recently."""
-        return self._buffer.hint
+        return self._buffer.recent_problem
 
     def reset(self) -> None:
         """Discard an incomplete frame."""
         self._buffer.reset()
-        self._builder.reset()
+        self._builder.forget_rejected_frames()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples of the frames that these chunks complete."""
@@ -421,9 +423,9 @@ class FrameStreamDecoder(ABC):
     ) -> tuple[list[SampleBlock], int | None]:
         """Return the samples of the frames with at least one measured axis, and the index of the last such frame."""
         rows = np.flatnonzero(~np.isnan(values).all(axis=1))
-        kept, bad_after = frames.select_frames(rows.tolist())
-        blocks = self._builder.build_blocks(
-            kept.t_ns, values[rows], temperature_c[rows], ticks[rows], kept.bad_before, bad_after
+        kept = frames.select_frames(rows.tolist())
+        blocks = self._builder.build_plausible_blocks(
+            kept.t_ns, values[rows], temperature_c[rows], ticks[rows], kept.bad_before, kept.bad_after
         )
         return blocks, int(rows[-1]) if rows.size else None
 

@@ -18,9 +18,9 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint
+from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RecentRejection
 from drivers.errors import DecodeError
-from drivers.sample import NO_TICK, Chunk, Floats, SampleBlock, SenderTiming, Timing
+from drivers.sample import NO_TICK, Chunk, Floats, SampleBlock, SenderTimedFormat, Timing
 
 HEADER_BYTES: Final = 4
 DOUBLES: Final = 37
@@ -62,8 +62,8 @@ class Ros2ImuDecoder:
     carrier: ClassVar[str] = "messages"
 
     def __init__(self) -> None:
-        self.timing: Timing = SenderTiming()
-        self._hint = RejectionHint()
+        self.timing: Timing = SenderTimedFormat()
+        self._rejection = RecentRejection()
         self._builder = BlockBuilder()
         self._lost_in_builder = 0  # lost messages that the builder has counted as bad
         self._lost = 0  # messages lost before the next message
@@ -77,15 +77,15 @@ class Ros2ImuDecoder:
         return self._builder.bad - self._lost_in_builder
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Reason for the last rejected message, while it is recent."""
-        return self._hint.text
+        return self._rejection.rejection_reason
 
     def reset(self) -> None:
         """Start the count of lost messages again. There are no incomplete messages."""
         self._sequence = None
         self._lost = 0
-        self._builder.reset()
+        self._builder.forget_rejected_frames()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return one sample per message at its own time stamp. ``ticks`` is the sequence number of the publisher."""
@@ -98,15 +98,15 @@ class Ros2ImuDecoder:
             try:
                 messages.append(_parse_message(chunk.data))
             except DecodeError as error:
-                self._hint.note_rejected(str(error))
+                self._rejection.note_rejection(str(error))
                 rejected += 1
                 continue
-            self._hint.count_good()
+            self._rejection.count_good_frames()
             ticks.append(sequence)
             missing.append(self._lost + rejected)
             self._lost_in_builder += self._lost
             self._lost = rejected = 0
-        return self._builder.build_blocks(
+        return self._builder.build_plausible_blocks(
             np.array([m.t_ns for m in messages], np.int64),
             _read_values(messages),
             ticks=np.array(ticks, np.int64),

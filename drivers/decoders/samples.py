@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Final
 
-from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RejectionHint
+from drivers.decoders.base import BlockBuilder, Decoder, DecoderSettings, RecentRejection
 from drivers.errors import DecodeError
-from drivers.sample import Chunk, SampleBlock, SenderTiming, Timing
+from drivers.sample import Chunk, SampleBlock, SenderTimedFormat, Timing
 from drivers.zenoh.sample_message import decode_samples, encode_samples
 
 MAX_GAP_SAMPLES: Final = 1_000_000_000
@@ -29,8 +29,8 @@ class SamplesDecoder:
     carrier: ClassVar[str] = "messages"
 
     def __init__(self) -> None:
-        self.timing: Timing = SenderTiming()
-        self._hint = RejectionHint()
+        self.timing: Timing = SenderTimedFormat()
+        self._rejection = RecentRejection()
         self._builder = BlockBuilder()
         self._rejected = 0  # messages
         self._received: int | None = None  # count of the publisher in its last message
@@ -43,15 +43,15 @@ class SamplesDecoder:
         return self._rejected + self._builder.bad
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Reason for the last rejected message, while it is recent."""
-        return self._hint.text
+        return self._rejection.rejection_reason
 
     def reset(self) -> None:
         """Start the count of lost samples again. There are no incomplete messages."""
         self._received = None
         self._lost = 0
-        self._builder.reset()
+        self._builder.forget_rejected_frames()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples of each message. ``t_ns`` are the Unix times of the message."""
@@ -59,10 +59,10 @@ class SamplesDecoder:
         for chunk in chunks:
             try:
                 found += self._decode_message(chunk.data)
-                self._hint.count_good()
+                self._rejection.count_good_frames()
             except DecodeError as error:
                 self._rejected += 1
-                self._hint.note_rejected(str(error))
+                self._rejection.note_rejection(str(error))
         return found
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
@@ -75,7 +75,7 @@ class SamplesDecoder:
         message = decode_samples(data)
         rows = message.block
         self._lost = min(self._lost + rows.lost + self._count_skipped(message.samples, len(rows)), MAX_GAP_SAMPLES)
-        blocks = self._builder.build_blocks(rows.t_ns, rows.values, rows.temperature_c, rows.ticks)
+        blocks = self._builder.build_plausible_blocks(rows.t_ns, rows.values, rows.temperature_c, rows.ticks)
         if blocks and self._lost:
             blocks[0] = replace(blocks[0], lost=blocks[0].lost + self._lost)
             self._lost = 0

@@ -40,8 +40,8 @@ from drivers.decoders.base import (
     quantize,
 )
 from drivers.errors import ConfigError
-from drivers.quantities import RATE_HZ
-from drivers.sample import Chunk, CounterTiming, Floats, Ints, SampleBlock, Timing
+from drivers.number_ranges import RATE_HZ
+from drivers.sample import Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.settings_model import Conflict, WordOr, checked_by
 from drivers.units import DEGREE, G0
 
@@ -108,7 +108,7 @@ class Settings(DecoderSettings):
     ] = Field("auto", description="first byte of the datagrams, such as 0x93; auto takes it from the first datagram")
     crlf: bool = Field(False, description="true: a simulated sensor ends datagrams with CR LF; both can be read")
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         """Yield a conflict if an increment cannot be converted to a rate."""
         if "increment" in (self.gyro_output, self.accelerometer_output) and self.rate is None:
             yield Conflict("rate", 'missing; an output of "increment" needs the sample rate in Hz')
@@ -121,7 +121,7 @@ class Stim300Decoder(FrameStreamDecoder):
         wanted = b"" if settings.identifier == "auto" else bytes([settings.identifier])
         super().__init__(FrameBuffer(wanted, self._match_datagram, LONGEST))
         self._settings = settings
-        self.timing: Timing = CounterTiming(256, 1.0 / 2000.0)
+        self.timing: Timing = CounterTimedFormat(256, 1.0 / 2000.0)
         rate = settings.rate or 1.0
         self._gyro_step = DEGREE * (rate / 2**21 if settings.gyro_output == "increment" else 1 / 2**14)
         bits = ACCEL_BITS[settings.accelerometer_range]
@@ -130,13 +130,13 @@ class Stim300Decoder(FrameStreamDecoder):
         self._status = 0
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Meaning of the status byte, or reason for rejected datagrams."""
         if self._status & START_UP:
             return "the sensor is starting up"
         if self._status:
             return f"the sensor reports an error: status 0x{self._status:02X}"
-        return super().hint
+        return super().recent_problem
 
     def _decode(self, frames: Frames) -> list[SampleBlock]:
         """Return the samples of these datagrams. The sensor may have switched to another identifier among them."""
@@ -148,7 +148,7 @@ class Stim300Decoder(FrameStreamDecoder):
             data = frames.stack_bytes(rows)
             values[rows], temperature_c[rows] = self._read_measurements(data, IDENTIFIERS[identifier])
             ticks[rows] = data[:, -7]
-        return self._builder.build_blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
+        return self._builder.build_plausible_blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
 
     def _read_measurements(self, data: Bytes, parts: int) -> tuple[Floats, Floats]:
         """Return values [n, 6], infinite where the status byte shows an error, and temperatures [n] in °C."""

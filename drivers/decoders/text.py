@@ -23,14 +23,14 @@ from drivers.decoders.base import (
     BlockBuilder,
     Decoder,
     DecoderSettings,
-    RejectionHint,
+    RecentRejection,
     chunk_per_sample,
     xor_checksum,
 )
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError
-from drivers.quantities import COUNTER_MODULUS, HEADER_LINES, SCALE
-from drivers.sample import AXES, ArrivalTiming, Chunk, CounterTiming, Floats, Ints, SampleBlock, Timing
+from drivers.number_ranges import COUNTER_MODULUS, HEADER_LINES, SCALE
+from drivers.sample import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.settings_model import ListOf, checked_by, one_of
 
 MAX_LINE_BYTES: Final = 4096
@@ -133,7 +133,7 @@ class TextDecoder:
         self._comment = settings.comment.encode()
         self._delimiter = settings.delimiter.encode()
         self._builder = BlockBuilder()
-        self._hint = RejectionHint()
+        self._rejection = RecentRejection()
         self.reset()
 
     @property
@@ -142,9 +142,9 @@ class TextDecoder:
         return self._builder.bad
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Description of the last bad line, while it is recent."""
-        return self._hint.text
+        return self._rejection.rejection_reason
 
     def reset(self) -> None:
         """Discard an incomplete line. The next line is a first line again."""
@@ -152,7 +152,7 @@ class TextDecoder:
         self._overlong = False
         self._first_line_ended = False  # True if the end of the first line has arrived
         self._lines_seen = 0  # lines since the link was opened
-        self._builder.reset()
+        self._builder.forget_rejected_frames()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples of the lines that these chunks complete."""
@@ -178,7 +178,7 @@ class TextDecoder:
             lines[0] = lines[0] if self._first_is_whole(lines[0]) else b""
         if len(rest) > MAX_LINE_BYTES:
             rest, self._overlong = b"", True
-            self._hint.note_rejected(OVERLONG_HINT)
+            self._rejection.note_rejection(OVERLONG_HINT)
         self._rest = rest
         return [line for line in lines if line]
 
@@ -212,16 +212,16 @@ class TextDecoder:
         """Return an array [n, columns]. Regular lines are parsed together. Other lines are parsed one by one."""
         table = self._parse_regular_lines(bodies)
         if table is not None:
-            self._hint.count_good(len(bodies))
+            self._rejection.count_good_frames(len(bodies))
             return table
         rows = []
         for body in bodies:
             row, error = (None, "a line fails its checksum") if body is None else self._parse_line(body)
             rows.append(row or [np.inf] * self._width)
             if error:
-                self._hint.note_rejected(error)
+                self._rejection.note_rejection(error)
             else:
-                self._hint.count_good()
+                self._rejection.count_good_frames()
         return np.array(rows).reshape(-1, self._width)
 
     def _parse_regular_lines(self, bodies: list[bytes | None]) -> Floats | None:
@@ -273,12 +273,12 @@ class TextDecoder:
                 values[:, axis] = scaled[:, self._column[name]]
         temperature_c = scaled[:, self._column["temperature"]] if "temperature" in self._column else None
         ticks = None
-        if isinstance(self.timing, CounterTiming):
+        if isinstance(self.timing, CounterTimedFormat):
             counts = scaled[:, self._column["t" if "t" in self._column else "counter"]]
             bad |= ~(np.abs(counts) < float(UNWRAPPED_TICKS))  # missing or implausible clock value
             ticks = np.rint(np.where(bad, 0.0, counts)).astype(np.int64) % self.timing.modulus
         values[bad] = np.inf
-        return self._builder.build_blocks(t_ns, values, temperature_c, ticks)
+        return self._builder.build_plausible_blocks(t_ns, values, temperature_c, ticks)
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return one line per sample in the configured columns and units, with full precision."""
@@ -344,8 +344,8 @@ def _timing(settings: Settings) -> Timing:
     if "t" in settings.columns:
         unit_ticks = round(units.time_factor(settings.time_unit) / TICK_S)
         wraps = settings.time_unit in ("ms", "us")
-        return CounterTiming(DEVICE_WRAP * unit_ticks if wraps else UNWRAPPED_TICKS, TICK_S)
-    return CounterTiming(settings.counter_modulus) if "counter" in settings.columns else ArrivalTiming()
+        return CounterTimedFormat(DEVICE_WRAP * unit_ticks if wraps else UNWRAPPED_TICKS, TICK_S)
+    return CounterTimedFormat(settings.counter_modulus) if "counter" in settings.columns else ArrivalTimedFormat()
 
 
 def build(settings: Settings) -> Decoder:

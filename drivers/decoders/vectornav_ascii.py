@@ -31,7 +31,7 @@ from drivers.decoders.base import (
     nan_to_infinity,
     xor_checksum,
 )
-from drivers.sample import ArrivalTiming, Chunk, Floats, SampleBlock, Timing
+from drivers.sample import ArrivalTimedFormat, Chunk, Floats, SampleBlock, Timing
 
 LONGEST: Final = 256
 """Maximum length of a sentence in bytes. The longest sentence of the manual is under 200."""
@@ -60,17 +60,17 @@ class VectornavAsciiDecoder(FrameStreamDecoder):
 
     def __init__(self, settings: Settings) -> None:
         super().__init__(FrameBuffer(b"$VN", _match_sentence, LONGEST))
-        self.timing: Timing = ArrivalTiming()
+        self.timing: Timing = ArrivalTimedFormat()
         self._wanted = b"" if settings.sentence == "auto" else f"${settings.sentence},".encode()
         self._sentence = self._wanted
         self._unwanted_sentences = 0  # number of sentences since the last wanted sentence
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Reason for missing samples or rejected sentences."""
         if self._unwanted_sentences > MAX_UNWANTED_SENTENCES:
             return "sentences arrive, but none of the wanted kind: set the sensor's async output to VNIMU"
-        return super().hint
+        return super().recent_problem
 
     def reset(self) -> None:
         """Discard an incomplete sentence, and with auto the selected sentence."""
@@ -84,12 +84,14 @@ class VectornavAsciiDecoder(FrameStreamDecoder):
         wanted = self._sentence or b"none yet"
         rows = [i for i, f in enumerate(frames.data) if f.startswith(wanted)]
         self._unwanted_sentences = 0 if rows else self._unwanted_sentences + len(frames.data)
-        frames, bad_after = frames.select_frames(rows)
+        frames = frames.select_frames(rows)
         axes, width, temperature = COLUMNS.get(self._sentence, COLUMNS[b"$VNIMU,"])
         table = _parse_numbers([f[7 : f.rindex(b"*")] for f in frames.data], width)
         temperature_c = None if temperature is None else table[:, temperature]
         values = nan_to_infinity(table[:, axes])
-        return self._builder.build_blocks(frames.t_ns, values, temperature_c, None, frames.bad_before, bad_after)
+        return self._builder.build_plausible_blocks(
+            frames.t_ns, values, temperature_c, None, frames.bad_before, frames.bad_after
+        )
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return sentences as the device prints them: VNYMR if it is configured, otherwise VNIMU.

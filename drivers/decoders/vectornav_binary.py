@@ -34,7 +34,7 @@ from drivers.decoders.base import (
     group_indices,
     nan_to_infinity,
 )
-from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, Floats, SampleBlock, Timing
+from drivers.sample import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, SampleBlock, Timing
 
 FIELD_SIZES: Final = {
     1: (8, 8, 8, 12, 16, 12, 24, 12, 12, 24, 20, 28, 2, 4, 8),
@@ -138,15 +138,15 @@ class VectornavBinaryDecoder(FrameStreamDecoder):
         super().__init__(FrameBuffer(b"\xfa", self._match_message, LONGEST))
         self._compensated = settings.compensated
         self._uses_device_time = settings.clock == "time_startup"
-        self.timing: Timing = CounterTiming(TICKS, 1e-9) if self._uses_device_time else ArrivalTiming()
+        self.timing: Timing = CounterTimedFormat(TICKS, 1e-9) if self._uses_device_time else ArrivalTimedFormat()
         self._time_missing = False
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Remedy for messages that are rejected or contain no time."""
         if self._time_missing:
             return 'messages contain no TimeStartup: enable it in the sensor, or set clock = "arrival"'
-        return super().hint
+        return super().recent_problem
 
     def _decode(self, frames: Frames) -> list[SampleBlock]:
         """Return the samples of the messages with rates or accelerations."""

@@ -30,8 +30,8 @@ from drivers.decoders.base import (
     chunk_per_sample,
     quantize,
 )
-from drivers.quantities import FULL_SCALE
-from drivers.sample import ArrivalTiming, Chunk, Floats, Ints, SampleBlock, Timing
+from drivers.number_ranges import FULL_SCALE
+from drivers.sample import ArrivalTimedFormat, Chunk, Floats, Ints, SampleBlock, Timing
 from drivers.units import DEGREE, G0
 
 ACCEL, RATE = 0x51, 0x52
@@ -78,7 +78,7 @@ class WitmotionDecoder(FrameStreamDecoder):
             super().__init__(FrameBuffer(b"\x55", _match_bluetooth, BLUETOOTH_LENGTH + 2))
         else:
             super().__init__(FrameBuffer(b"\x55", _match_uart, UART_LENGTH))
-        self.timing: Timing = ArrivalTiming()
+        self.timing: Timing = ArrivalTimedFormat()
         self._accel_step = settings.accelerometer_range * G0 / 2**15
         self._gyro_step = settings.gyro_range * DEGREE / 2**15
         self._temperature_step, self._temperature_offset = TEMPERATURE[settings.temperature]
@@ -91,11 +91,11 @@ class WitmotionDecoder(FrameStreamDecoder):
         return super().bad + self._harmless_rejects
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Reason for missing samples or rejected packets."""
         if self._pairs.unpaired > MAX_UNPAIRED_PACKETS:
             return "packets arrive, but no 0x51 directly followed by 0x52: enable both outputs in the sensor"
-        return super().hint
+        return super().recent_problem
 
     def reset(self) -> None:
         """Discard an incomplete packet or pair."""
@@ -108,10 +108,10 @@ class WitmotionDecoder(FrameStreamDecoder):
 
     def _decode_bluetooth(self, frames: Frames) -> list[SampleBlock]:
         """Return the samples of Bluetooth packets."""
-        kept, bad_after = frames.select_frames([i for i, f in enumerate(frames.data) if f[1] == HEADERS[0][1]])
+        kept = frames.select_frames([i for i, f in enumerate(frames.data) if f[1] == HEADERS[0][1]])
         words = np.frombuffer(b"".join(kept.data), "<i2").reshape(-1, BLUETOOTH_LENGTH // 2)
         values = self._to_si(words[:, 4:7], words[:, 1:4])
-        return self._builder.build_blocks(kept.t_ns, values, None, None, kept.bad_before, bad_after)
+        return self._builder.build_plausible_blocks(kept.t_ns, values, None, None, kept.bad_before, kept.bad_after)
 
     def _decode_uart(self, frames: Frames) -> list[SampleBlock]:
         """Return the samples of pairs of UART packets."""
@@ -120,7 +120,7 @@ class WitmotionDecoder(FrameStreamDecoder):
         words = np.ascontiguousarray(packets[:, :, 2:10]).view("<i2")  # [n, 0x51 and 0x52, 4]
         values = self._to_si(words[:, 1, :3], words[:, 0, :3])
         temperature_c = words[:, 0, 3] * self._temperature_step + self._temperature_offset
-        return self._builder.build_blocks(frames.t_ns[at], values, temperature_c, None, missing)
+        return self._builder.build_plausible_blocks(frames.t_ns[at], values, temperature_c, None, missing)
 
     def _to_si(self, gyro: Ints, accel: Ints) -> Floats:
         """Convert raw words to rad/s and m/s² [n, 6]."""

@@ -36,7 +36,7 @@ from drivers.decoders.base import (
     nan_to_infinity,
     quantize,
 )
-from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, Floats, SampleBlock, Timing
+from drivers.sample import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, SampleBlock, Timing
 
 SYNC: Final = b"\xfa\xff\x36"
 MAX_PAYLOAD: Final = 2048
@@ -134,9 +134,9 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
         self._settings = settings
         # (timing, DID, size of the counter in bytes)
         clocks: dict[str, tuple[Timing, int, int]] = {
-            "sample_time_fine": (CounterTiming(1 << 32, 1e-4), SAMPLE_TIME_FINE, 4),
-            "packet_counter": (CounterTiming(1 << 16), PACKET_COUNTER, 2),
-            "arrival": (ArrivalTiming(), 0, 0),
+            "sample_time_fine": (CounterTimedFormat(1 << 32, 1e-4), SAMPLE_TIME_FINE, 4),
+            "packet_counter": (CounterTimedFormat(1 << 16), PACKET_COUNTER, 2),
+            "arrival": (ArrivalTimedFormat(), 0, 0),
         }
         self.timing, self._clock, self._clock_size = clocks[settings.clock]
         self._accel, self._gyro = (ACCEL_HR, GYRO_HR) if settings.high_rate else (ACCEL, GYRO)
@@ -144,11 +144,11 @@ class XsensMtdata2Decoder(FrameStreamDecoder):
         self._clock_missing = False
 
     @property
-    def hint(self) -> str:
+    def recent_problem(self) -> str:
         """Remedy for packets that are rejected or contain no clock."""
         if self._clock_missing:
             return f'packets contain no {self._settings.clock}: enable it in the device, or set "clock"'
-        return super().hint
+        return super().recent_problem
 
     def reset(self) -> None:
         """Discard an incomplete packet and the last temperature."""

@@ -16,7 +16,7 @@ from typing import Annotated, Literal, Protocol, runtime_checkable
 from pydantic import Field
 
 from drivers.errors import LinkLost
-from drivers.quantities import SILENCE_S
+from drivers.number_ranges import SILENCE_S
 from drivers.sample import Chunk
 from drivers.settings_model import SettingsModel
 
@@ -50,7 +50,7 @@ class Link(Protocol):
             If the link cannot be opened. The text says what to do.
         """
 
-    def read(self, timeout_s: float) -> list[Chunk] | None:
+    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
         """Return the received chunks, after waiting up to ``timeout_s`` seconds for the first chunk.
 
         Return None if nothing arrived.
@@ -88,7 +88,7 @@ class PolledLink(ABC):
                 self._open_source()
                 self._closing.clear()
 
-    def read(self, timeout_s: float) -> list[Chunk] | None:
+    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
         """Return the received chunks, after waiting up to ``timeout_s`` seconds for the first chunk."""
         deadline = time.monotonic() + timeout_s
         with self._in_use:
@@ -127,5 +127,5 @@ class PolledLink(ABC):
 class AddressFilteringLink(Protocol):
     """Interface of a link that can filter by address."""
 
-    def accept(self, addresses: Sequence[int]) -> None:
+    def set_address_filter(self, addresses: Sequence[int]) -> None:
         """Receive only chunks of these addresses. The method is called before ``open``."""

@@ -30,7 +30,7 @@ from drivers.discovery import format_choices
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.quantities import BIT_RATE, format_value
+from drivers.number_ranges import BIT_RATE, format_value
 from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
 from drivers.settings_model import checked_by
 
@@ -118,7 +118,7 @@ class CanLink(PolledLink):
         self.error_frames = 0
         self.garbled = 0  # answers of the adapter that were not frames
 
-    def accept(self, addresses: Sequence[int]) -> None:
+    def set_address_filter(self, addresses: Sequence[int]) -> None:
         """Receive only these identifiers from the next ``open`` on. Without identifiers, receive all frames.
 
         ``EXTENDED_ID`` marks 29-bit identifiers. With ``ANY_SOURCE``, only the J1939 parameter group of the identifier
@@ -135,7 +135,7 @@ class CanLink(PolledLink):
         # python-can reports missing vendor libraries as warnings
         logging.getLogger("can").setLevel(logging.ERROR)
         s = self._settings
-        if missing := missing_package(s.interface):
+        if missing := describe_missing_package(s.interface):
             raise LinkUnavailable(missing)
         # exceptions of python-can's modules if a vendor library or a key is missing
         wrong_set_up = (NameError, AttributeError, TypeError, ValueError, ArithmeticError, NotImplementedError)
@@ -238,7 +238,7 @@ class CanLink(PolledLink):
             bus.shutdown()
 
 
-def missing_package(interface: str) -> str:
+def describe_missing_package(interface: str) -> str:
     """Return the missing package of a python-can interface and how to install it; "" if no package is missing."""
     module, package, requirement = PACKAGES.get(interface, ("", "", ""))
     if not module or importlib.util.find_spec(module) is not None:

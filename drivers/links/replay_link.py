@@ -35,7 +35,7 @@ from drivers.discovery import format_choices
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError, describe_error
 from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.quantities import BYTE_RATE, RATE_HZ, REPLAY_SPEED
+from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, segment
 from drivers.sample import Chunk
 from drivers.settings_model import FilePath, WordOr

@@ -26,7 +26,7 @@ from drivers.credential_masking import mask_secrets
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.quantities import BIT_RATE, READ_TIMEOUT_S
+from drivers.number_ranges import BIT_RATE, READ_TIMEOUT_S
 from drivers.sample import Chunk
 from drivers.settings_model import checked_by
 

@@ -27,7 +27,12 @@ from drivers.links.base import Carrier, Link, LinkSettings
 from drivers.sample import Chunk
 from drivers.settings_model import FilePath, ListOf
 from drivers.zenoh.connection_errors import explain_refusals
-from drivers.zenoh.session import DEFAULT_CONFIGURATION, build_session_config, find_connect_endpoints, format_error
+from drivers.zenoh.session_config import (
+    DEFAULT_CONFIGURATION,
+    build_session_config,
+    find_connect_endpoints,
+    format_zenoh_error,
+)
 
 if TYPE_CHECKING:
     import zenoh
@@ -98,7 +103,7 @@ class ZenohLink:
                 subscriber: Any = session.declare_subscriber(self._settings.key, channel)
             except zenoh.ZError as error:
                 self._close_session()
-                raise LinkUnavailable(f"{self.name}: cannot subscribe: {format_error(error)}") from error
+                raise LinkUnavailable(f"{self.name}: cannot subscribe: {format_zenoh_error(error)}") from error
             self._clear_waiting()
             self._running = True
             self._receiver = threading.Thread(
@@ -107,7 +112,7 @@ class ZenohLink:
             self._receiver.start()
             atexit.register(self.close)
 
-    def read(self, timeout_s: float) -> list[Chunk] | None:
+    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
         """Return the received messages, after waiting up to ``timeout_s`` seconds for the first."""
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or not self._running, timeout_s)
@@ -177,7 +182,7 @@ class ZenohLink:
         nobody = f"nobody at {shown}; start the router or the publisher there"
         if config.get_json("mode") == '"client"':
             return f"{self.name}: {explain_refusals(endpoints, config) or nobody}"
-        return f"{self.name}: check the endpoints of listen and connect: {format_error(error)}"
+        return f"{self.name}: check the endpoints of listen and connect: {format_zenoh_error(error)}"
 
 
 def _to_chunk(sample: Any, t_ns: int) -> Chunk:
@@ -213,11 +218,11 @@ def build(settings: Settings) -> Link:
     try:
         zenoh.KeyExpr(settings.key)
     except zenoh.ZError as error:
-        wrong.append(f'key: "{settings.key}": {format_error(error)}')
+        wrong.append(f'key: "{settings.key}": {format_zenoh_error(error)}')
     try:
         _configuration(settings)
     except zenoh.ZError as error:
-        wrong.append(f"zenoh settings: {format_error(error)}")
+        wrong.append(f"zenoh settings: {format_zenoh_error(error)}")
     if wrong:
         raise ConfigError(*wrong)
     return ZenohLink(settings)

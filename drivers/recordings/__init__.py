@@ -24,9 +24,9 @@ from numpy.typing import NDArray
 
 from drivers.errors import ConfigError, RecordingError, describe_error, format_one_line
 from drivers.file_access import check_regular
-from drivers.quantities import DURATION_S, RATE_HZ
+from drivers.number_ranges import DURATION_S, RATE_HZ
 from drivers.recordings import memory_check
-from drivers.recordings.formats import FORMATS, format_for_path, is_recording
+from drivers.recordings.formats import FORMATS, find_format, is_recording
 from drivers.recordings.table import EXAMPLE_HEADER, T_LIMIT_S, Table
 from drivers.recordings.writing import open_recording_writer, save_samples
 from drivers.sample import AXES, Floats, SampleBlock, make_block
@@ -134,7 +134,7 @@ def _load_file(path: Path, rate_hz: float | None) -> Recording:
     """Read one file. A pipe or a device is refused, since it has no end."""
     check_regular(path)
     if path.stat().st_size:
-        return _assemble(path, format_for_path(path).read(path), rate_hz)
+        return _assemble(path, find_format(path).read(path), rate_hz)
     if not is_recording(path):
         raise ConfigError(
             f"{path}: the file is empty, and its name does not end like that of a recording; known are "
@@ -288,7 +288,7 @@ def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> Non
     for segment in segments:
         try:
             check_regular(segment)
-            rows += format_for_path(segment).count_rows(segment) if segment.stat().st_size else 0
+            rows += find_format(segment).count_rows(segment) if segment.stat().st_size else 0
         except (RecordingError, OSError):
             continue  # left out, with a note, when the segment is read
         size_bytes += segment.stat().st_size

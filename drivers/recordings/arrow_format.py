@@ -16,13 +16,13 @@ import numpy as np
 from drivers.errors import ConfigError, RecordingError
 from drivers.file_access import open_regular
 from drivers.recordings import memory_check
-from drivers.recordings.arrow_messages import check_buffer_sizes, count_buffers, iter_batch_sizes
+from drivers.recordings.arrow_message_sizes import check_buffer_sizes, count_buffers, iter_batch_sizes
 from drivers.recordings.table import (
     BATCH_ROWS,
     PARTIAL_SUFFIX,
     AppendColumns,
     Table,
-    check_width,
+    check_column_count,
     choose_columns,
     describe_content,
 )
@@ -82,12 +82,12 @@ def count_parquet_rows(path: Path) -> int:
 def _check_parquet(path: Path, file: Any, notes: list[str]) -> tuple[dict[str, str], int]:
     """Return the columns to read and the number of rows, after checking both against the limits."""
     metadata = file.metadata
-    check_width(path, metadata.num_columns)
+    check_column_count(path, metadata.num_columns)
     chosen = choose_columns(path, file.schema_arrow.names, notes)
     _check_types(path, file.schema_arrow, chosen)
     rows = int(metadata.num_rows)
     stated = sum(metadata.row_group(i).num_rows for i in range(metadata.num_row_groups))
-    memory_check.read_limit(path).check_rows(max(rows, stated))
+    memory_check.measure_read_limit(path).check_rows(max(rows, stated))
     return chosen, rows
 
 
@@ -180,7 +180,7 @@ def _ipc_schema(path: Path, file: Any) -> Any:
     try:
         file.seek(_ipc_start(path))
         schema = pa.ipc.open_stream(file).schema
-        check_width(path, len(schema))
+        check_column_count(path, len(schema))
         schema.names, schema.metadata  # noqa: B018 - raises for names that are not UTF-8
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise RecordingError(
@@ -198,7 +198,7 @@ def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -
         for field in schema
         for count in (count_buffers(pa, field.type),)
     ]
-    limit = memory_check.read_limit(path)
+    limit = memory_check.measure_read_limit(path)
     batches = rows = dictionaries = 0
     with open_regular(path) as file:
         for size in iter_batch_sizes(file, start):

@@ -32,7 +32,7 @@ from drivers.recordings.table import (
     AppendColumns,
     Columns,
     Table,
-    check_width,
+    check_column_count,
     choose_columns,
     describe_content,
 )
@@ -102,7 +102,7 @@ def read_csv(path: Path) -> Table:
 
 def count_csv_rows(path: Path) -> int:
     """Return the number of lines of a text up to a truncation, after checking number and size against the limits."""
-    limit = memory_check.read_limit(path)
+    limit = memory_check.measure_read_limit(path)
     lines = unpacked = 0
     with open_regular(path) as file:
         for text in _whole_lines(_decompressed(file, []), []):
@@ -238,7 +238,7 @@ def _column_names(path: Path, head: _Header) -> list[str]:
             raise RecordingError(
                 f"{path}: the columns of line {head.number} are separated by {word}; separate them by commas"
             )
-    check_width(path, text.count(",") + 1)
+    check_column_count(path, text.count(",") + 1)
     names = [name.strip(' \t"') for name in _split_fields(text)]
     if all(_parse_number(name) is not None for name in names):
         raise RecordingError(

@@ -42,7 +42,7 @@ FORMATS: Final[Mapping[str, Format]] = {
 """Formats of recordings by suffix."""
 
 
-def format_for_path(path: Path) -> Format:
+def find_format(path: Path) -> Format:
     """Return the format for the suffix of a path. Raise ConfigError if no format of recordings has the suffix."""
     suffix = _suffix(path)
     if not suffix:

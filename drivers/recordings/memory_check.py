@@ -95,7 +95,7 @@ class ReadLimit:
             )
 
 
-def read_limit(path: Path) -> ReadLimit:
+def measure_read_limit(path: Path) -> ReadLimit:
     """Return the limits on a file, with the memory that is available now. Raise OSError if the file does not exist."""
     return ReadLimit(path, path.stat().st_size, available_bytes())
 

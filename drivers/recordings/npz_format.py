@@ -35,7 +35,7 @@ from drivers.recordings.table import (
     AppendColumns,
     Columns,
     Table,
-    check_width,
+    check_column_count,
     choose_columns,
     describe_content,
 )
@@ -166,7 +166,7 @@ def _find_member(archive: zipfile.ZipFile, key: str) -> zipfile.ZipInfo:
 def _check_columns(path: Path, archive: zipfile.ZipFile, chosen: Mapping[str, str]) -> int:
     """Return the rows of the longest column, after checking the headers of all columns against the limits."""
     rows = 0
-    limit = memory_check.read_limit(path)
+    limit = memory_check.measure_read_limit(path)
     for key in chosen.values():
         header = _read_header(path, archive, key)
         if header.dtype.kind not in NUMERIC_KINDS:
@@ -286,14 +286,14 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
 
     Return the arrays by name, and the name of the truncated array if there is one. Arrays with unknown names are empty.
     """
-    limit = memory_check.read_limit(path)
+    limit = memory_check.measure_read_limit(path)
     arrays: dict[str, NDArray[Any]] = {}
     unpacked = members = 0
     with open_regular(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
         at = data.find(LOCAL_MAGIC)
         while 0 <= at <= len(data) - LOCAL_HEADER.size:
             members += 1
-            check_width(path, members)
+            check_column_count(path, members)
             _, _, flags, method, _, _, _, packed, _, name_size, extra_size = LOCAL_HEADER.unpack_from(data, at)
             start = at + LOCAL_HEADER.size + name_size
             key = data[start - name_size : start].decode("utf-8", errors="replace").removesuffix(".npy")

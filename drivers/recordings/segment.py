@@ -30,9 +30,9 @@ import numpy as np
 
 from drivers.errors import ImuError, RecordingError
 from drivers.file_access import open_regular
-from drivers.quantities import COUNTER_STEP, RATE_HZ
+from drivers.number_ranges import COUNTER_STEP, RATE_HZ
 from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, first_line, import_pyarrow
-from drivers.recordings.arrow_messages import iter_batch_sizes
+from drivers.recordings.arrow_message_sizes import iter_batch_sizes
 from drivers.recordings.memory_check import ROW_BYTES
 from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S
 from drivers.sample import AXES, Chunk, SampleBlock, concatenate_blocks, make_block, ns_to_seconds, seconds_to_ns
@@ -42,7 +42,7 @@ NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
 SCHEMA: Final = "imu-monitor/recording/1"
 RAW_BATCH_BYTES: Final = 4_000_000
 MAX_BATCH_BYTES: Final = 64_000_000
-"""Maximum unpacked size of a batch, far above what ``SegmentWriter`` and ``compress_segment`` write."""
+"""Maximum unpacked size of a batch, far above what ``SingleSegmentWriter`` and ``compress_segment`` write."""
 MAX_LOST_SAMPLES: Final = 10**11
 """Maximum number of consecutive missing samples. No clock reports a larger number."""
 
@@ -81,7 +81,7 @@ class SegmentPiece:
     state: DaemonState
 
 
-class SegmentWriter:
+class SingleSegmentWriter:
     """Writer that appends batches to one segment.
 
     Parameters
@@ -124,11 +124,11 @@ class SegmentWriter:
         """Write one batch of chunks whose ``t_ns`` are Unix times."""
         self._write_batch(_chunk_batch(self._pa, self._schema, chunks), None)
 
-    def sync(self) -> None:
+    def flush_to_disk(self) -> None:
         """Flush the written data to the disk, so that they survive a power failure."""
         os.fdatasync(self._file.fileno())
 
-    def external_change(self) -> str:
+    def describe_external_change(self) -> str:
         """Return how another program has changed the file that is being written; "" if it has not."""
         try:
             named = os.stat(self.path if self._valid_bytes else self._temporary_path, follow_symlinks=False)
@@ -139,7 +139,7 @@ class SegmentWriter:
             return "was replaced by another file"
         return "was cut or written by another program" if self._valid_bytes and own.st_size != self._valid_bytes else ""
 
-    def abandon(self) -> None:
+    def close_changed_file(self) -> None:
         """Close a file that another program has changed. If its length is unchanged, the stream is ended properly."""
         try:
             if os.fstat(self._file.fileno()).st_size == self._valid_bytes:
@@ -173,7 +173,7 @@ class SegmentWriter:
         self._valid_bytes = self._file.tell()
 
 
-def segment_name(number: int, unix_s: float) -> str:
+def format_segment_name(number: int, unix_s: float) -> str:
     """Return the file name of a segment.
 
     Parameters
@@ -183,7 +183,7 @@ def segment_name(number: int, unix_s: float) -> str:
     unix_s
         Unix time of the first row in s.
 
-    >>> segment_name(42, 1_700_000_000.0)
+    >>> format_segment_name(42, 1_700_000_000.0)
     '00000042_2023-11-14T22-13-20Z.arrows'
     """
     try:
@@ -193,10 +193,10 @@ def segment_name(number: int, unix_s: float) -> str:
     return f"{number:08d}_{when}{SUFFIX}"
 
 
-def segment_start_s(path: Path) -> float:
+def parse_segment_start_s(path: Path) -> float:
     """Return the Unix time in the name of a segment in whole seconds; 0 if the name contains none.
 
-    >>> segment_start_s(Path("00000042_2023-11-14T22-13-20Z.arrows"))
+    >>> parse_segment_start_s(Path("00000042_2023-11-14T22-13-20Z.arrows"))
     1700000000.0
     """
     try:
@@ -212,7 +212,7 @@ def list_segments(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if NAME.fullmatch(path.name))
 
 
-def segment_number(path: Path) -> int:
+def parse_segment_number(path: Path) -> int:
     """Return the number of a segment in its folder; 0 if the file name is not the name of a segment."""
     found = NAME.fullmatch(path.name)
     return int(found[1]) if found else 0

@@ -55,7 +55,7 @@ class Table:
     notes: list[str]
 
 
-def check_width(path: Path, columns: int) -> None:
+def check_column_count(path: Path, columns: int) -> None:
     """Check the number of columns of a file.
 
     Parameters
@@ -100,7 +100,7 @@ def choose_columns(path: Path, names: Sequence[str], notes: list[str], where: st
     RecordingError
         If there is no axis among the columns, a known column occurs twice, or there are too many columns.
     """
-    check_width(path, len(names))
+    check_column_count(path, len(names))
     known = {*COLUMNS, *ALIASES}
     repeated = sorted(name for name, count in Counter(names).items() if count > 1 and name in known)
     if repeated:

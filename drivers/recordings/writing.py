@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.recordings.formats import format_for_path
+from drivers.recordings.formats import find_format
 from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, format_names
 from drivers.sample import AXES, Floats
 
@@ -59,7 +59,7 @@ def open_recording_writer(path: Path, axes: Sequence[str], temperature: bool) ->
     if unknown or not axes:
         what = f"unknown axis {format_names(unknown)}" if unknown else "no axis has a value"
         raise RecordingError(f"{path}: {what}; axes are {' '.join(AXES)}")
-    open_writer = format_for_path(path).open_writer
+    open_writer = find_format(path).open_writer
     names = ["t", *axes, *(["temperature"] if temperature else [])]
     with atomic_write_path(path) as part, open_writer(part, names) as append_columns:
 

@@ -49,7 +49,7 @@ class ArrivalRegression:
         self._first_x = self._first_t = 0.0
         self._w = self._mx = self._mt = self._sxx = self._sxt = self._stt = 0.0
 
-    def add(self, index: float, t_s: float, nominal_hz: float | None = None) -> None:
+    def add_point(self, index: float, t_s: float, nominal_hz: float | None = None) -> None:
         """Add one point.
 
         Parameters
@@ -81,20 +81,20 @@ class ArrivalRegression:
         self._stt += (1.0 - gain) * et * et
         self.count += 1
 
-    def move(self, samples: float) -> None:
+    def shift_points(self, samples: float) -> None:
         """Shift all points by a number of samples that are known to be missing before the first point."""
         self._x0 += samples
         self._first_x += samples
 
-    def span_s(self) -> float:
+    def elapsed_s(self) -> float:
         """Return the time from the first point to the newest one in seconds."""
         return self._t0 - self._first_t
 
-    def settled(self) -> bool:
+    def can_tell_gap_from_jitter(self) -> bool:
         """Return True if there are enough points to tell a gap from jitter."""
-        return self._x0 - self._first_x >= MIN_SAMPLES and self.span_s() >= MIN_SPAN_S
+        return self._x0 - self._first_x >= MIN_SAMPLES and self.elapsed_s() >= MIN_SPAN_S
 
-    def measured(self, final: bool = False) -> tuple[float, float] | None:
+    def measure_rate(self, final: bool = False) -> tuple[float, float] | None:
         """Return the rate that the points alone show, and its uncertainty.
 
         Parameters
@@ -110,7 +110,11 @@ class ArrivalRegression:
             (Cauchy-Schwarz inequality). For the remaining delays about the line, s/S = √(1/r² − 1), where r is the
             correlation of time and index.
         """
-        enough = self._x0 - self._first_x >= MIN_SAMPLES - 1 if final else self.settled() and self.count >= MIN_POINTS
+        enough = (
+            self._x0 - self._first_x >= MIN_SAMPLES - 1
+            if final
+            else self.can_tell_gap_from_jitter() and self.count >= MIN_POINTS
+        )
         if not enough or not self._sxt > 0.0:
             return None
         r2 = self._sxt * self._sxt / (self._sxx * self._stt) if self._stt > 0.0 else 0.0
@@ -118,12 +122,12 @@ class ArrivalRegression:
 
     def is_slower_than(self, period_s: float) -> bool:
         """Return True if the points show with certainty a longer period than ``period_s``."""
-        found = self.measured()
+        found = self.measure_rate()
         return found is not None and found[0] * period_s < 1.0 - found[1]
 
     def period_s(self) -> float | None:
         """Return the sample period in seconds; None before the second point if there is no nominal rate."""
-        if self.count >= 2 and self._sxt > 0.0 and (self.settled() or self._nominal_s is None):
+        if self.count >= 2 and self._sxt > 0.0 and (self.can_tell_gap_from_jitter() or self._nominal_s is None):
             return self._sxt / self._sxx
         return self._nominal_s if self.count else None
 
@@ -132,7 +136,7 @@ class ArrivalRegression:
         period = self.period_s()
         return 1.0 / period if period else None
 
-    def at(self, index: float) -> float:
+    def time_at_index_s(self, index: float) -> float:
         """Return the time of the line at a sample index in seconds."""
         period = self.period_s() or 0.0
         return self._t0 + self._mt + (index - self._x0 - self._mx) * period

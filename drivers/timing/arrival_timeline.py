@@ -14,8 +14,8 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import NS_PER_S, Ints, SampleBlock, make_block
-from drivers.timing.arrival_bound import ArrivalBound
 from drivers.timing.arrival_regression import ArrivalRegression
+from drivers.timing.earliest_sample_time import EarliestSampleTime
 
 CATCH_UP_S: Final = 3.0
 """Time within which a delay of the host must be caught up. Otherwise samples are missing."""
@@ -49,7 +49,7 @@ class ArrivalTimeline:
         self.assumed_hz = nominal_hz
         """Rate in Hz until the line shows one: the configured rate, or the rate before a restart of the program."""
         self.line = ArrivalRegression()
-        self.bound = ArrivalBound()
+        self.earliest_time = EarliestSampleTime()
         self.index = 0.0
         """Number of samples since the start, missing samples included."""
         self.arrived_ns = 0
@@ -60,7 +60,7 @@ class ArrivalTimeline:
         """Origin of the times in seconds. A float64 of Unix time would resolve only 240 ns."""
         self._delay: _Delay | None = None
 
-    def seconds(self, t_ns: int) -> float:
+    def seconds_since_origin(self, t_ns: int) -> float:
         """Return the seconds since the first sample."""
         return (t_ns - (self.origin_ns or 0)) / NS_PER_S
 
@@ -68,17 +68,17 @@ class ArrivalTimeline:
         """Begin a new line, because the number of missing samples is unknown or the clock has jumped."""
         self.line = ArrivalRegression()
 
-    def certain_period_s(self) -> float | None:
+    def undelayed_period_s(self) -> float | None:
         """Return the sample period in s without the effect of late readings.
 
         The configured period is used until the arrivals show one.
         """
-        found = self.line.measured() if self.bound.settled else None
+        found = self.line.measure_rate() if self.earliest_time.has_enough_arrivals else None
         if found is not None and found[1] < PERIOD_TOLERANCE:
             return 1.0 / found[0]
-        return None if self.bound.period_s or not self.assumed_hz else 1.0 / self.assumed_hz
+        return None if self.earliest_time.period_s or not self.assumed_hz else 1.0 / self.assumed_hz
 
-    def place(self, samples: SampleBlock, missing: Ints) -> list[SampleBlock]:
+    def assign_line_times(self, samples: SampleBlock, missing: Ints) -> list[SampleBlock]:
         """Add the newest arrival to the line, and give the samples their times on it.
 
         Parameters
@@ -92,14 +92,14 @@ class ArrivalTimeline:
         passed = float(index[-1]) - self.index
         self.index = float(index[-1])
         self.arrived_ns = int(samples.t_ns[-1])
-        arrived_s = self.seconds(self.arrived_ns)
+        arrived_s = self.seconds_since_origin(self.arrived_ns)
         if self._delay is None:  # a possible gap must not bend the line
             # the last sample of a chunk has waited for the shortest time
-            self.line.add(self.index, arrived_s, self.nominal_hz)
-        self.bound.update(passed, arrived_s, self.certain_period_s())
+            self.line.add_point(self.index, arrived_s, self.nominal_hz)
+        self.earliest_time.advance_clock(passed, arrived_s, self.undelayed_period_s())
         period_s = self.line.period_s() or 1.0 / NS_PER_S  # the first samples of an unknown rate are at least in order
         # no sample is newer than its arrival, apart from the scatter of the line
-        newest_s = min(self.line.at(self.index), arrived_s + JUMP_S)
+        newest_s = min(self.line.time_at_index_s(self.index), arrived_s + JUMP_S)
         t_s = newest_s - (self.index - index) * period_s
         if t_s[0] < -MAX_OFFSET_S or t_s[-1] > MAX_OFFSET_S:  # arrivals decades apart must stay within int64
             t_s = np.clip(t_s, -MAX_OFFSET_S, MAX_OFFSET_S)
@@ -111,7 +111,7 @@ class ArrivalTimeline:
         self.last_t_ns = int(t_ns[-1])
         return split_at_gaps(samples, t_ns, missing)
 
-    def missing_since_arrival(self, arrived_ns: int, arrived: int) -> int:
+    def count_missing_since_arrival(self, arrived_ns: int, arrived: int) -> int:
         """Return the number of samples missing since the last arrival if ``arrived`` samples arrive at ``arrived_ns``.
 
         Parameters
@@ -131,7 +131,7 @@ class ArrivalTimeline:
         """Discard a delay that was not decided yet, because the link was closed in the meantime."""
         self._delay = None
 
-    def gap_from_delay(self, arrived_ns: int, counted: int, least: float = MIN_GAP_PERIODS) -> int:
+    def count_missing_after_delay(self, arrived_ns: int, counted: int, least: float = MIN_GAP_PERIODS) -> int:
         """Return the number of samples missing because of a sudden delay that was not caught up within CATCH_UP_S.
 
         Parameters
@@ -144,27 +144,27 @@ class ArrivalTimeline:
             Smallest number of missing samples that counts as a gap.
         """
         period_s = self.line.period_s()
-        if period_s is None or not self.line.settled():
+        if period_s is None or not self.line.can_tell_gap_from_jitter():
             return 0
         least_s = max(least * period_s, MIN_GAP_S)
-        index, arrived_s = self.index + counted, self.seconds(arrived_ns)
-        behind_s = arrived_s - self.line.at(index)
+        index, arrived_s = self.index + counted, self.seconds_since_origin(arrived_ns)
+        behind_s = arrived_s - self.line.time_at_index_s(index)
         if self._delay is None:
             pause_s = (arrived_ns - self.arrived_ns) / NS_PER_S - counted * period_s
             if pause_s > least_s and behind_s > least_s:
                 self._delay = _Delay(arrived_ns, behind_s, ArrivalRegression())
-                self._delay.line.add(index, arrived_s, self.nominal_hz)
+                self._delay.line.add_point(index, arrived_s, self.nominal_hz)
             return 0
         delay = self._delay
         delay.least_s = min(delay.least_s, behind_s)
-        delay.line.add(index, arrived_s, self.nominal_hz)
+        delay.line.add_point(index, arrived_s, self.nominal_hz)
         if delay.least_s < least_s:  # caught up: the host was late
             self._delay = None
             return 0
         if arrived_ns - delay.since_ns < CATCH_UP_S * NS_PER_S:
             return 0
         gap = min(round(delay.least_s / max(period_s, 1.0 / MAX_RATE_HZ)), MAX_GAP_SAMPLES)
-        delay.line.move(gap)
+        delay.line.shift_points(gap)
         rest_s = behind_s - gap * period_s
         if delay.line.is_slower_than(period_s):  # the delay grows since the period is wrong
             self.line, self._delay = delay.line, None

@@ -3,9 +3,9 @@
 The counter shows missing samples exactly, apart from whole turns of a short counter. A pause of the link or a delay
 that is not caught up shows these turns (``drivers.timing.arrival_timeline``).
 
-A sample may be read late but never early. A step of the counter is therefore a gap if that many samples fit between the
-earliest time at which the last sample can have been taken (``drivers.timing.arrival_bound``) and the arrival. A longer
-step is a jump of the counter, and the arrival time decides how many samples are missing.
+A sample may be read late but never early. ``drivers.timing.earliest_sample_time`` gives the earliest time at which the
+last sample can have been taken. A counter step is a gap if the missing samples fit between this time and the arrival
+time. A longer step is a jump of the counter, and the arrival time decides how many samples are missing.
 """
 
 from collections import deque
@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import NS_PER_S, CounterTiming, Ints, SampleBlock
+from drivers.sample import NS_PER_S, CounterTimedFormat, Ints, SampleBlock
 from drivers.timing.arrival_regression import ArrivalRegression
 from drivers.timing.arrival_timeline import JUMP_S, MAX_GAP_SAMPLES, MAX_RATE_HZ, PERIOD_TOLERANCE, ArrivalTimeline
 from drivers.timing.event_rate_limiter import EventRateLimiter
@@ -33,7 +33,7 @@ class CounterGaps:
 
     Parameters
     ----------
-    counter : CounterTiming
+    counter : CounterTimedFormat
         Modulus and tick length of the counter.
     timeline : ArrivalTimeline
         Arrival times of the samples.
@@ -41,7 +41,7 @@ class CounterGaps:
         Receiver of the events about jumps and a stuck counter.
     """
 
-    def __init__(self, counter: CounterTiming, timeline: ArrivalTimeline, events: EventRateLimiter) -> None:
+    def __init__(self, counter: CounterTimedFormat, timeline: ArrivalTimeline, events: EventRateLimiter) -> None:
         self.typical_step = TypicalStep()
         self.clock_line = ArrivalRegression()
         """Line of device time against sample index. It is empty if the length of a tick is unknown."""
@@ -52,20 +52,20 @@ class CounterGaps:
         self._clock_s = self._clock_index = 0.0
         self._stuck = 0  # samples since the counter last advanced
 
-    def resume(self, tick: int, tick_step: float) -> None:
+    def resume(self, tick: int, ticks_per_sample: float) -> None:
         """Continue from the last counter value before a restart of the program.
 
         Parameters
         ----------
         tick : int
             Last counter value.
-        tick_step : float
+        ticks_per_sample : float
             Ticks per sample.
         """
         self._tick = tick
-        self.typical_step.update(np.array([round(tick_step)]))
+        self.typical_step.update(np.array([round(ticks_per_sample)]))
 
-    def interrupt(self) -> None:
+    def forget_last_tick(self) -> None:
         """Forget the last counter value, because samples without a counter value have arrived."""
         self._tick = None
 
@@ -87,16 +87,16 @@ class CounterGaps:
         np.subtract(samples.ticks[1:], samples.ticks[:-1], out=steps[1:])
         steps %= counter.modulus
         self.typical_step.update(steps)
-        tick_step = self._ticks_per_sample()
+        ticks_per_sample = self._ticks_per_sample()
         if not first:
-            steps[0] += counter.modulus * self._hidden_wraps(steps, tick_step, arrived_ns, paused)
+            steps[0] += counter.modulus * self._hidden_wraps(steps, ticks_per_sample, arrived_ns, paused)
         self._tick = int(samples.ticks[-1])
         waited = self._find_stuck_counter(samples, steps[1:] if first else steps)
         missing = np.zeros(len(samples), np.int64)
-        if tick_step is not None:
-            counted = np.rint(np.minimum(steps / tick_step, MAX_GAP_SAMPLES)).astype(np.int64)
+        if ticks_per_sample is not None:
+            counted = np.rint(np.minimum(steps / ticks_per_sample, MAX_GAP_SAMPLES)).astype(np.int64)
             missing = np.maximum(counted - 1 - waited, 0)
-        unseen = self._timeline.missing_since_arrival(arrived_ns, len(samples)) if first and paused else 0
+        unseen = self._timeline.count_missing_since_arrival(arrived_ns, len(samples)) if first and paused else 0
         if not steps.any():  # a stuck counter shows nothing
             missing[0] = max(samples.lost, unseen)
         elif self._has_jumped(missing, steps, arrived_ns):
@@ -106,7 +106,7 @@ class CounterGaps:
         if counter.tick_s is not None:
             self._clock_s += float(steps.sum()) * counter.tick_s
             self._clock_index += len(samples) + int(missing.sum())
-            self.clock_line.add(self._clock_index, self._clock_s)
+            self.clock_line.add_point(self._clock_index, self._clock_s)
         return missing
 
     def _discard_jump(self, samples: SampleBlock, missing: Ints, steps: Ints, first: bool) -> None:
@@ -116,14 +116,14 @@ class CounterGaps:
         elapsed_s = (arrived_ns - self._timeline.arrived_ns) / NS_PER_S
         moved = f"back by {modulus - ahead}" if 2 * ahead > modulus else f"ahead by {ahead}"
         text = f"the counter jumped {moved} ticks within {elapsed_s:.3f} s"
-        self._events.report("clock_jumped", int(samples.t_ns[0]), text)
+        self._events.report_event("clock_jumped", int(samples.t_ns[0]), text)
         self.clock_line = ArrivalRegression()
         at = int(np.argmax(steps))
         missing[at] = steps[at] = 0
         if self._has_jumped(missing, steps, arrived_ns):  # more than one jump: no step is reliable
             missing[:] = 0
         if not first:
-            missing[at] = self._timeline.missing_since_arrival(arrived_ns, len(samples) + int(missing.sum()))
+            missing[at] = self._timeline.count_missing_since_arrival(arrived_ns, len(samples) + int(missing.sum()))
 
     def _ticks_per_sample(self) -> float | None:
         """Return the ticks per sample; None if they are unknown."""
@@ -134,23 +134,23 @@ class CounterGaps:
         # the counter overrides a nominal rate that is far off
         return nominal if seen is None or abs(seen - nominal) < 0.5 * nominal else seen
 
-    def _hidden_wraps(self, steps: Ints, tick_step: float | None, arrived_ns: int, paused: bool) -> int:
+    def _hidden_wraps(self, steps: Ints, ticks_per_sample: float | None, arrived_ns: int, paused: bool) -> int:
         """Return how often a short counter wrapped unseen during a pause of the link or a delay not caught up."""
-        if tick_step is None:
+        if ticks_per_sample is None:
             return 0
         counter, timeline = self._counter, self._timeline
-        by_ticks_hz = 1.0 / (tick_step * counter.tick_s) if counter.tick_s else timeline.assumed_hz
+        by_ticks_hz = 1.0 / (ticks_per_sample * counter.tick_s) if counter.tick_s else timeline.assumed_hz
         rate_hz = timeline.line.rate_hz() or by_ticks_hz
         if rate_hz is None:
             return 0
-        turn = counter.modulus / tick_step  # samples
-        counted = int(np.rint(steps / tick_step).sum())
+        turn = counter.modulus / ticks_per_sample  # samples
+        counted = int(np.rint(steps / ticks_per_sample).sum())
         if paused:
             timeline.forget_delay()
             elapsed_s = (arrived_ns - timeline.arrived_ns) / NS_PER_S
             turns = max(0, round((elapsed_s * rate_hz - counted) / turn))
         else:
-            turns = round(timeline.gap_from_delay(arrived_ns, counted, turn / 2.0) / turn)
+            turns = round(timeline.count_missing_after_delay(arrived_ns, counted, turn / 2.0) / turn)
         return turns if turns * counter.modulus < MAX_STEP_TICKS else 0
 
     def _find_stuck_counter(self, samples: SampleBlock, steps: Ints) -> Ints:
@@ -162,7 +162,7 @@ class CounterGaps:
         self._stuck = before + len(steps) if moved.size == 0 else len(steps) - 1 - int(moved[-1])
         if before < MIN_STUCK_SAMPLES <= self._stuck:
             text = f"the counter stopped at {samples.ticks[-1]}"
-            self._events.report("clock_jumped", int(samples.t_ns[-1]), text)
+            self._events.report_event("clock_jumped", int(samples.t_ns[-1]), text)
         waited = np.zeros(len(samples), np.int64)
         if moved.size:
             at = moved + len(samples) - len(steps)
@@ -176,7 +176,7 @@ class CounterGaps:
         as the sample may have waited in a buffer until the reading process got processor time.
         """
         counter, timeline = self._counter, self._timeline
-        period_s = timeline.bound.period_s or timeline.certain_period_s()
+        period_s = timeline.earliest_time.period_s or timeline.undelayed_period_s()
         lost = float(missing.sum(dtype=np.float64))
         lasted_s = lost / MAX_RATE_HZ
         if period_s is not None:
@@ -185,8 +185,8 @@ class CounterGaps:
             lasted_s = max(float(steps.sum(dtype=np.float64)) * counter.tick_s, lasted_s)
         elif 2 * int(steps.max()) > counter.modulus:  # a step of more than half the modulus is more likely a step back
             return True
-        arrived_s = timeline.seconds(arrived_ns)
-        taken_s = timeline.bound.newest_s
+        arrived_s = timeline.seconds_since_origin(arrived_ns)
+        taken_s = timeline.earliest_time.newest_sample_not_before_s
         return lasted_s > max(arrived_s - (arrived_s if taken_s is None else taken_s), 0.0) + JUMP_S
 
 

@@ -10,7 +10,17 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import NO_TICK, NS_PER_S, CounterTiming, Floats, Ints, SampleBlock, SenderTiming, Timing, make_block
+from drivers.sample import (
+    NO_TICK,
+    NS_PER_S,
+    CounterTimedFormat,
+    Floats,
+    Ints,
+    SampleBlock,
+    SenderTimedFormat,
+    Timing,
+    make_block,
+)
 from drivers.timing.event_rate_limiter import EventRateLimiter
 
 Mask = NDArray[np.bool_]
@@ -42,7 +52,7 @@ class DuplicateDetector:
         self._kept = 0  # number of rows in the tail
         self._fresh = self._shared = 0.0
 
-    def find(self, keys: Ints, values: Floats) -> tuple[Mask | None, int]:
+    def find_repeats(self, keys: Ints, values: Floats) -> tuple[Mask | None, int]:
         """Find the rows that repeat an earlier row.
 
         Parameters
@@ -122,35 +132,35 @@ class RowFilter:
     """
 
     def __init__(self, timing: Timing, events: EventRateLimiter) -> None:
-        self.repeated_rows = 0
+        self.dropped_repeated_rows = 0
         """Number of rows removed because they repeat an earlier row."""
         self._timing = timing
         self._events = events
-        self._detector = DuplicateDetector(ordered=isinstance(timing, SenderTiming))
+        self._detector = DuplicateDetector(ordered=isinstance(timing, SenderTimedFormat))
         self._carried_lost = 0  # missing samples before rows that were removed
 
     def remove_repeats(self, samples: SampleBlock) -> SampleBlock | None:
         """Remove the rows that repeat an earlier row. Return None if no row remains."""
-        if isinstance(self._timing, SenderTiming):
+        if isinstance(self._timing, SenderTimedFormat):
             keys, key_name = samples.t_ns, "time"
-        elif isinstance(self._timing, CounterTiming) and (samples.ticks != NO_TICK).all():
+        elif isinstance(self._timing, CounterTimedFormat) and (samples.ticks != NO_TICK).all():
             keys, key_name = samples.ticks, "count"
         else:
             return samples
-        repeats, shared = self._detector.find(keys, samples.values)
+        repeats, shared = self._detector.find_repeats(keys, samples.values)
         t_ns = int(samples.t_ns[-1])
         if shared:
             text = f"{{n}} rows have the same {key_name} as another row and other values; all rows are kept"
-            self._events.report("samples_repeated", t_ns, text, shared)
+            self._events.report_event("samples_repeated", t_ns, text, shared)
         if repeats is None:
             return samples
         n = int(repeats.sum())
-        self.repeated_rows += n
+        self.dropped_repeated_rows += n
         text = f"{{n}} rows repeat an earlier row with the same {key_name} and values, and are left out"
-        self._events.report("samples_repeated", t_ns, text, n)
-        return self.select(samples, np.flatnonzero(~repeats))
+        self._events.report_event("samples_repeated", t_ns, text, n)
+        return self.select_rows(samples, np.flatnonzero(~repeats))
 
-    def select(self, samples: SampleBlock, rows: Ints) -> SampleBlock | None:
+    def select_rows(self, samples: SampleBlock, rows: Ints) -> SampleBlock | None:
         """Return some rows of a block, or None if there are none.
 
         Samples that are missing before a removed row count as missing before the next row.

@@ -19,7 +19,7 @@ class EventRateLimiter:
         self._last_ns: dict[str, int] = {}
         self._held_back: dict[tuple[str, str], tuple[int, str, int]] = {}
 
-    def report(self, kind: str, t_ns: int, text: str, n: int = 0) -> None:
+    def report_event(self, kind: str, t_ns: int, text: str, n: int = 0) -> None:
         """Report an event.
 
         Parameters
@@ -41,9 +41,9 @@ class EventRateLimiter:
             n = held[2] + 1 if held else 0
             text = held[1] if held else text
         self._held_back[key] = (t_ns, text, n)
-        self.release(t_ns)
+        self.release_held_events(t_ns)
 
-    def release(self, t_ns: int) -> None:
+    def release_held_events(self, t_ns: int) -> None:
         """Pass on the events that have been held back long enough at the time ``t_ns``."""
         for (kind, what), (at_ns, text, n) in [*self._held_back.items()] if self._held_back else ():
             if kind not in self._last_ns or abs(t_ns - self._last_ns[kind]) >= MIN_EVENT_INTERVAL_S * NS_PER_S:
@@ -52,11 +52,11 @@ class EventRateLimiter:
                 more = f", and {n} more events of this kind within one second" if n and "{n}" not in text else ""
                 self._events.append(Event(kind, at_ns, text.replace("{n}", str(n)) + more))
 
-    def take(self, ended: bool = False) -> list[Event]:
+    def take_events(self, ended: bool = False) -> list[Event]:
         """Return the events since the last call. If ``ended`` is True, return the events that are held back, too."""
         while ended and self._held_back:
             self._last_ns.clear()
-            self.release(0)
+            self.release_held_events(0)
         if ended:
             self._last_ns.clear()
         events, self._events = self._events, []

@@ -20,8 +20,8 @@ from typing import Final
 
 import numpy as np
 
-from drivers.quantities import RATE_HZ
-from drivers.sample import NO_TICK, CounterTiming, Event, Ints, SampleBlock, SenderTiming, Timing
+from drivers.number_ranges import RATE_HZ
+from drivers.sample import NO_TICK, CounterTimedFormat, Event, Ints, SampleBlock, SenderTimedFormat, Timing
 from drivers.timing.arrival_regression import MIN_SAMPLES, MIN_SPAN_S, snap_to_standard_rate
 from drivers.timing.arrival_timeline import MAX_RATE_HZ, ArrivalTimeline
 from drivers.timing.counter_gaps import CounterGaps
@@ -48,7 +48,7 @@ class LastSample:
     t_ns: int  # in the epoch of the device's times
     tick: int  # counter of the device; NO_TICK = none
     rate_hz: float | None
-    tick_step: float | None  # ticks per sample
+    ticks_per_sample: float | None  # ticks per sample
 
 
 class SampleClock:
@@ -73,9 +73,9 @@ class SampleClock:
         self._timeline = ArrivalTimeline(rate_hz)
         self._counter: CounterGaps | None = None
         self._sender: SenderTimes | None = None
-        if isinstance(timing, CounterTiming):
+        if isinstance(timing, CounterTimedFormat):
             self._counter = CounterGaps(timing, self._timeline, self._events)
-        elif isinstance(timing, SenderTiming):
+        elif isinstance(timing, SenderTimedFormat):
             self._sender = SenderTimes(self._timeline, self._rows, self._events)
         self._stamped = 0  # samples
         self._stamped_s = 0.0  # from the first sample to the newest, by their original times
@@ -88,24 +88,24 @@ class SampleClock:
         self._resumed = self._paused = True
         timeline.assumed_hz = timeline.nominal_hz or before.rate_hz
         timeline.last_t_ns = timeline.arrived_ns = timeline.origin_ns = before.t_ns
-        timeline.bound.start(-MAX_RESUME_DELAY_S)
+        timeline.earliest_time.start_clock(-MAX_RESUME_DELAY_S)
         if self._sender is not None:
-            timeline.line.add(timeline.index, 0.0, timeline.assumed_hz)
-        if self._counter is not None and before.tick != NO_TICK and before.tick_step is not None:
-            self._counter.resume(before.tick, before.tick_step)
+            timeline.line.add_point(timeline.index, 0.0, timeline.assumed_hz)
+        if self._counter is not None and before.tick != NO_TICK and before.ticks_per_sample is not None:
+            self._counter.resume(before.tick, before.ticks_per_sample)
 
     @property
-    def repeated_rows(self) -> int:
+    def dropped_repeated_rows(self) -> int:
         """Number of rows left out because they repeat earlier rows."""
-        return self._rows.repeated_rows
+        return self._rows.dropped_repeated_rows
 
     @property
-    def late_rows(self) -> int:
+    def dropped_late_rows(self) -> int:
         """Number of rows left out because they had been counted as missing."""
-        return 0 if self._sender is None else self._sender.late_rows
+        return 0 if self._sender is None else self._sender.dropped_late_rows
 
     @property
-    def tick_step(self) -> float | None:
+    def ticks_per_sample(self) -> float | None:
         """Ticks of the device counter per sample; None until the counter has advanced."""
         return None if self._counter is None else self._counter.typical_step.mean
 
@@ -118,7 +118,7 @@ class SampleClock:
         """
         if self._check is not None:
             return self._check.rate_hz
-        if not self._timeline.line.settled():
+        if not self._timeline.line.can_tell_gap_from_jitter():
             return self._timeline.assumed_hz
         measured = self._timeline.line.rate_hz()
         return snap_to_standard_rate(measured) if measured and RATE_HZ.supports(measured) else None
@@ -126,7 +126,7 @@ class SampleClock:
     @property
     def measured_hz(self) -> float | None:
         """Sample rate in Hz by the clock of the host, without rounding; None until it is known."""
-        return self._timeline.line.rate_hz() if self._timeline.line.settled() else None
+        return self._timeline.line.rate_hz() if self._timeline.line.can_tell_gap_from_jitter() else None
 
     @property
     def contradicted_hz(self) -> float | None:
@@ -145,7 +145,7 @@ class SampleClock:
             return False
         return self._arrivals_are_timed or self._sender is not None or self._has_device_clock
 
-    def end(self) -> None:
+    def compare_rates_at_end(self) -> None:
         """Compare the rates with the available samples, since no more samples will arrive."""
         if not self._ended and self._check is not None and self._check.measured_hz is None:
             self._check_rate(final=True)
@@ -153,13 +153,13 @@ class SampleClock:
 
     def take_events(self, ended: bool = False) -> list[Event]:
         """Return the events since the last call. If ``ended`` is True, return the events that are held back, too."""
-        return self._events.take(ended)
+        return self._events.take_events(ended)
 
-    def pause(self) -> None:
+    def note_link_closed(self) -> None:
         """Note that the link was closed. The arrival of the next sample shows how many samples are missing."""
         self._paused = True
 
-    def link_idle(self, t_ns: int) -> None:
+    def note_no_unread_data(self, t_ns: int) -> None:
         """Note that the link held no unread data at the host time ``t_ns``. Data that arrive later were sent later.
 
         Only the time before the first sample is used. It limits how long the first samples may have waited.
@@ -185,14 +185,14 @@ class SampleClock:
             if self._idle_ns is not None:
                 # one period before the first sample, which was not taken before the link was idle
                 period_s = 1.0 / (timeline.nominal_hz or MAX_RATE_HZ)
-                timeline.bound.start(min(timeline.seconds(self._idle_ns), 0.0) - period_s)
-        self._events.release(int(samples.t_ns[-1]))
+                timeline.earliest_time.start_clock(min(timeline.seconds_since_origin(self._idle_ns), 0.0) - period_s)
+        self._events.release_held_events(int(samples.t_ns[-1]))
         kept = self._rows.remove_repeats(samples)
         if kept is not None and self._sender is not None:
-            kept = self._sender.sort(kept)
+            kept = self._sender.sort_rows(kept)
         stamped = [] if kept is None else self._stamp(kept)
         self._stamped += sum(len(one) for one in stamped)
-        self._stamped_s = timeline.seconds(int(samples.t_ns[-1]))
+        self._stamped_s = timeline.seconds_since_origin(int(samples.t_ns[-1]))
         self._check_rate()
         return stamped
 
@@ -211,32 +211,34 @@ class SampleClock:
             line = self._counter.clock_line
         elif self._sender is not None or (self._arrivals_are_timed and not final):
             line = self._timeline.line
-        found = line.measured(final) if self._check is not None and line is not None else None
+        found = line.measure_rate(final) if self._check is not None and line is not None else None
         if self._check is not None and found is not None:
             self._check.update(*found)
 
     def _stamp(self, samples: SampleBlock) -> list[SampleBlock]:
         """Determine missing samples and times according to the timing of the wire format."""
         if self._sender is not None:
-            return self._sender.place(samples)
+            return self._sender.split_at_missing_samples(samples)
         if self._paused and self.rate_hz is None:
             self._timeline.restart_line()  # the number of missing samples is unknown: a line cannot span the pause
         if self._counter is not None and (samples.ticks != NO_TICK).all():
             missing = self._counter.count_missing(samples, self._paused)
         else:
             if self._counter is not None:
-                self._counter.interrupt()
+                self._counter.forget_last_tick()
             missing = self._missing_by_arrival(samples)
         self._paused = False
-        return self._timeline.place(samples, missing)
+        return self._timeline.assign_line_times(samples, missing)
 
     def _missing_by_arrival(self, samples: SampleBlock) -> Ints:
         """Return the missing samples [n] before each row of samples without a counter."""
         missing = np.zeros(len(samples), np.int64)
         arrived_ns = int(samples.t_ns[-1])
         if self._paused:
-            missing[0] = max(samples.lost, self._timeline.missing_since_arrival(arrived_ns, len(samples)))
+            missing[0] = max(samples.lost, self._timeline.count_missing_since_arrival(arrived_ns, len(samples)))
             self._timeline.forget_delay()
         else:
-            missing[0] = samples.lost + self._timeline.gap_from_delay(arrived_ns, len(samples) + samples.lost)
+            missing[0] = samples.lost + self._timeline.count_missing_after_delay(
+                arrived_ns, len(samples) + samples.lost
+            )
         return missing

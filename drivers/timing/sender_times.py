@@ -47,7 +47,7 @@ class SenderTimes:
     """
 
     def __init__(self, timeline: ArrivalTimeline, rows: RowFilter, events: EventRateLimiter) -> None:
-        self.late_rows = 0
+        self.dropped_late_rows = 0
         """Number of rows left out because they had been counted as missing."""
         self._timeline = timeline
         self._rows = rows
@@ -56,7 +56,7 @@ class SenderTimes:
         self._went_back = False
         self._steps_s: deque[float] = deque(maxlen=STEP_HISTORY)
 
-    def sort(self, samples: SampleBlock) -> SampleBlock | None:
+    def sort_rows(self, samples: SampleBlock) -> SampleBlock | None:
         """Sort the rows of a block by their times, and remove late rows. Return None if no row remains."""
         t, last_ns = samples.t_ns, self._timeline.last_t_ns
         in_order = t[0] >= last_ns and (len(t) == 1 or (np.diff(t) >= 0).all())
@@ -69,14 +69,14 @@ class SenderTimes:
         if kept is None:
             return None
         steps = np.diff(kept.t_ns)
-        order = None if (steps < -JUMP_S * NS_PER_S).any() else steady_order(kept.t_ns, period_s)
+        order = None if (steps < -JUMP_S * NS_PER_S).any() else find_steady_order(kept.t_ns, period_s)
         if order is None:
             return kept
         n = int((steps < 0).sum())
-        self._events.report("clock_jumped", int(kept.t_ns[-1]), "rows out of order: {n}; sorted by time", n)
-        return self._rows.select(kept, order)
+        self._events.report_event("clock_jumped", int(kept.t_ns[-1]), "rows out of order: {n}; sorted by time", n)
+        return self._rows.select_rows(kept, order)
 
-    def place(self, samples: SampleBlock) -> list[SampleBlock]:
+    def split_at_missing_samples(self, samples: SampleBlock) -> list[SampleBlock]:
         """Return the samples with their own times. A new block begins where samples are missing."""
         t, timeline = samples.t_ns, self._timeline
         steps = np.empty(len(samples), np.int64)
@@ -95,7 +95,7 @@ class SenderTimes:
             first = int(jumps[-1])
             timeline.restart_line()
         for row in (first, len(samples) - 1):
-            timeline.line.add(float(index[row]), timeline.seconds(int(t[row])))
+            timeline.line.add_point(float(index[row]), timeline.seconds_since_origin(int(t[row])))
         timeline.index, timeline.last_t_ns = float(index[-1]), int(t[-1])
         if period_s:
             self._keep_missing_times(t, missing, period_s)
@@ -111,10 +111,10 @@ class SenderTimes:
         filled = set(distance_ns[late].argmin(axis=1).tolist())
         self._missing_t_ns = deque((t for i, t in enumerate(self._missing_t_ns) if i not in filled), maxlen=SEARCH_ROWS)
         n = int(late.sum())
-        self.late_rows += n
+        self.dropped_late_rows += n
         text = "{n} samples arrived after they had been counted as missing, and are left out"
-        self._events.report("clock_jumped", int(samples.t_ns[-1]), text, n)
-        return self._rows.select(samples, np.flatnonzero(~late))
+        self._events.report_event("clock_jumped", int(samples.t_ns[-1]), text, n)
+        return self._rows.select_rows(samples, np.flatnonzero(~late))
 
     def _keep_missing_times(self, t: Ints, missing: Ints, period_s: float) -> None:
         """Keep the times of samples that count as missing, because they may arrive later."""
@@ -125,7 +125,7 @@ class SenderTimes:
 
     def _period_s(self, steps: Ints) -> float | None:
         """Return the period for the search of gaps; None as long as all samples may be one burst of a late sender."""
-        if self._timeline.line.settled():
+        if self._timeline.line.can_tell_gap_from_jitter():
             return self._timeline.line.period_s()
         if self._timeline.assumed_hz:
             return 1.0 / self._timeline.assumed_hz
@@ -136,11 +136,11 @@ class SenderTimes:
         back = steps < (-JUMP_S * NS_PER_S if self._went_back else 0.0)  # jitter back and forth is reported once
         if back.any():
             at = int(np.argmax(back))
-            self._events.report("clock_jumped", int(t[at]), f"time went back by {-steps[at] / NS_PER_S:.6g} s")
+            self._events.report_event("clock_jumped", int(t[at]), f"time went back by {-steps[at] / NS_PER_S:.6g} s")
             self._went_back = True
         if (steps > FORWARD_JUMP_S * NS_PER_S).any():
             at = int(np.argmax(steps))
-            self._events.report("clock_jumped", int(t[at]), f"time jumped ahead by {steps[at] / NS_PER_S:.6g} s")
+            self._events.report_event("clock_jumped", int(t[at]), f"time jumped ahead by {steps[at] / NS_PER_S:.6g} s")
 
     def _count_missing(self, steps_s: Floats, period_s: float) -> Ints:
         """Return the missing samples [n] before each row; all zero unless most steps are one period long.
@@ -166,7 +166,7 @@ class SenderTimes:
         return gap
 
 
-def steady_order(t_ns: Ints, period_s: float) -> Ints | None:
+def find_steady_order(t_ns: Ints, period_s: float) -> Ints | None:
     """Return the order in which sender times form a steady sequence.
 
     Parameters
@@ -183,9 +183,9 @@ def steady_order(t_ns: Ints, period_s: float) -> Ints | None:
 
     Examples
     --------
-    >>> steady_order(np.array([0, 10, 30, 20, 40]) * 10**6, 0.01).tolist()
+    >>> find_steady_order(np.array([0, 10, 30, 20, 40]) * 10**6, 0.01).tolist()
     [0, 1, 3, 2, 4]
-    >>> steady_order(np.array([0, 10, 8, 20, 18]) * 10**6, 0.01) is None
+    >>> find_steady_order(np.array([0, 10, 8, 20, 18]) * 10**6, 0.01) is None
     True
     """
     if (np.diff(t_ns) >= 0).all():

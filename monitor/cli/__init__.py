@@ -1,8 +1,8 @@
 """Command line of the program: registers the commands, and turns every error into one line and an exit status.
 
 Exit status: 0 for success, 1 for a failure at run time, 2 for a wrong argument or input file, and 3 if the data do not
-support an answer. Each command has a module with its arguments and its printing. It imports the heavy libraries that
-it needs when it is called.
+support an answer. Each command has a module that defines the arguments and prints the results. Heavy libraries are
+imported only when a command runs.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ import typer
 
 from monitor.cli import (
     analyze,
-    check,
+    check_config,
     compensate,
     demo,
     doctor,
@@ -27,16 +27,16 @@ from monitor.cli import (
     history,
     reconcile,
     run,
-    simulate,
+    simulate_recording,
     thermal,
     view,
     warm_up,
     watch,
 )
-from monitor.cli.shared.errors import DEBUG, INTERRUPTED, explain
+from monitor.cli.shared.errors import DEBUG, INTERRUPTED, message_and_status
 
 # This must precede the import of NumPy. The matrices are small, and the program has its own threads for the work.
-# Additional threads of the linear algebra libraries would only wait actively.
+# Additional threads of the linear algebra libraries would only use processor time.
 for _pool in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_pool, "1")
 # pydantic would otherwise search all installed packages for plug-ins
@@ -77,13 +77,13 @@ def options_of_all_commands(
 for _command in (
     demo.demo,
     run.run,
-    check.check,
+    check_config.check,
     doctor.doctor,
     warm_up.warm_up,
     watch.watch,
     view.view,
     analyze.analyze,
-    simulate.simulate,
+    simulate_recording.simulate,
     reconcile.reconcile,
     compensate.compensate,
     history.history,
@@ -115,7 +115,7 @@ def main() -> None:
     except Exception as error:  # noqa: BLE001 - any other error is printed in one line, with a request to report it
         if debug:
             traceback.print_exc()
-        line, status = explain(error)
+        line, status = message_and_status(error)
         if isinstance(error, OSError):
             _discard_output()
         if not isinstance(error, BrokenPipeError):  # the reader of the output has gone, so a message is useless
@@ -142,18 +142,18 @@ def report_failed_thread(debug: bool, failed: threading.ExceptHookArgs) -> None:
         if debug:
             traceback.print_exception(error)
         thread = "a thread" if failed.thread is None else f'thread "{failed.thread.name}"'
-        print(f"imu-monitor: {thread} ended: {explain(error)[0]}", file=sys.stderr, flush=True)  # noqa: T201
+        print(f"imu-monitor: {thread} ended: {message_and_status(error)[0]}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 def _ignore_impossible_width(environment: MutableMapping[str, str]) -> None:
-    """Remove terminal sizes from the environment that leave no space to print: a table of no columns would be empty."""
+    """Remove terminal sizes of zero from the environment, because tables without columns would be empty."""
     for name in ("COLUMNS", "LINES"):
         if not re.fullmatch(r"0*[1-9][0-9]{0,4}", environment.get(name, "")):
             environment.pop(name, None)
 
 
 def split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:
-    """Return the arguments without ``--debug``, and True if it was among them. ``--`` ends the options.
+    """Return the arguments without ``--debug``, and True if ``--debug`` was given. ``--`` ends the options.
 
     Examples
     --------
@@ -165,7 +165,7 @@ def split_debug(arguments: Sequence[str]) -> tuple[list[str], bool]:
 
 
 def _discard_output() -> None:
-    """Discard the buffered rest of standard output, whose output at exit would fail again with a traceback."""
+    """Discard buffered text of standard output. Writing the text at exit would fail again and print a traceback."""
     with contextlib.suppress(OSError, ValueError, AttributeError):  # standard output is closed, or is not a file
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, sys.stdout.fileno())

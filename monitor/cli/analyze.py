@@ -35,22 +35,24 @@ def analyze(
 
     if plot is not None and plot.suffix not in (".png", ".html"):
         raise ConfigError(f"--plot: {plot}: a name ending in .png or .html is needed")
-    window_s = options.duration("--window", window)
-    last_s = options.duration("--last", last)
-    wanted = offline.Request(recording, rate, options.tau(tau), window_s, rest, bool(json or plot), last_s)
+    window_s = options.parse_duration("--window", window)
+    last_s = options.parse_duration("--last", last)
+    wanted = offline.Request(
+        recording, rate, options.parse_averaging_times(tau), window_s, rest, bool(json or plot), last_s
+    )
     try:
-        with output.progress() as tell:
-            output.compile_kernels(tell)
+        with output.show_progress() as tell:
+            output.compile_analysis_kernels(tell)
             results = offline.run_analysis(wanted, tell)
     except offline.TooFewSamples as error:
         if json is not None:
-            output.write("--json", json, FailedAnalysisMessage(error.samples, [str(error)]).encode() + b"\n")
+            output.write_bytes("--json", json, FailedAnalysisMessage(error.samples, [str(error)]).encode() + b"\n")
         raise
     if json is not None:
         message = AnalysisMessage.of(
             results.analysis, results.total, results.hadamard, results.dynamic, results.without_temperature
         )
-        output.write("--json", json, message.encode() + b"\n")
+        output.write_bytes("--json", json, message.encode() + b"\n")
     if plot is not None:
         offline.draw_plots(results, plot, recording.name)
     if json != Path("-"):

@@ -7,7 +7,7 @@ import typer
 
 from drivers.errors import ConfigError
 from drivers.file_access import real_path
-from monitor.cli.shared import options, output, terminal_session
+from monitor.cli.shared import options, output, service_in_terminal
 
 
 def compensate(
@@ -39,18 +39,18 @@ def compensate(
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
     for option, place in (("--out", out), ("--json", json), ("--plot", plot)):
-        output.check_place(option, place)
+        output.check_output_folder(option, place)
     for option, place in (("--json", json), ("--plot", plot), ("RECORDING", recording)):
         if place is not None and real_path(place) == real_path(out):
-            raise ConfigError(f"{option}: {place} is what --out writes; another name is needed")
-    terminal_session.end_on_sigterm()
-    last_s = options.duration("--last", last)
-    wanted = compensating.Request(recording, out, method, rate, options.order(order), last_s)
-    with output.progress() as tell:
-        output.compile_kernels(tell)
+            raise ConfigError(f"{option}: {place} is also the output file of --out; choose another name")
+    service_in_terminal.exit_on_sigterm()
+    last_s = options.parse_duration("--last", last)
+    wanted = compensating.Request(recording, out, method, rate, options.parse_arma_order(order), last_s)
+    with output.show_progress() as tell:
+        output.compile_analysis_kernels(tell)
         result = compensating.run_compensation(wanted, tell)
     if json is not None:
-        output.write("--json", json, text.encode_compensation(result) + b"\n")
+        output.write_bytes("--json", json, text.encode_compensation(result) + b"\n")
     if plot is not None:
         from monitor.publishing.plots.compensate_plot import save_compensation_plot
 

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from monitor.cli.shared import options, terminal_session
+from monitor.cli.shared import options, service_in_terminal
 
 
 def demo(
@@ -28,6 +28,6 @@ def demo(
     """Run the service on a simulated MEMS IMU that sends a real wire format over a pseudo-terminal."""
     from monitor.simulator.demo import demo_config as configuration
 
-    terminal_session.serve(
-        configuration(sensor, effect or (), options.duration("--effect-at", effect_at)), seconds, viewer
+    service_in_terminal.run_service(
+        configuration(sensor, effect or (), options.parse_duration("--effect-at", effect_at)), seconds, viewer
     )

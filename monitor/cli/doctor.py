@@ -26,10 +26,10 @@ def doctor(
 
     from monitor.commands import doctor as checks
 
-    output.check_place("--json", json)
+    output.check_output_folder("--json", json)
     findings = checks.examine(config)
     if json is not None:
-        output.write("--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n")
+        output.write_bytes("--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n")
     if json != Path("-"):
         _print(findings)
     if checks.worst_mark(findings) == "wrong":

@@ -35,5 +35,5 @@ def export(
         if form in exports.FORMATS and form != belong[name]:
             option = name.removesuffix("_s").replace("_", "-")
             raise ConfigError(f"--{option}: belongs to --format {belong[name]}, not {form}")
-    text = exports.export(options.noise(source), form, inflation, **given)
-    output.write("--out", out or Path("-"), text.encode())
+    text = exports.export(options.read_noise_coefficients(source), form, inflation, **given)
+    output.write_bytes("--out", out or Path("-"), text.encode())

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 MAX_TABLE_ROWS: Final = 24
 """Number of rows in the table of one axis over time."""
 Get = Callable[["HistoryQuery"], "HistoryTable"]
-"""Function that answers a question about the history of a device."""
+"""Function that returns the results of a query."""
 
 
 def history(
@@ -49,7 +49,7 @@ def history(
         Path | None, typer.Option(metavar="FILE.png", help="Coefficients over time and events as a picture.")
     ] = None,
 ) -> None:
-    """Print past coefficients, temperatures, losses and events of hours or years."""
+    """Print past coefficients, temperatures, lost samples and events, over periods from hours to years."""
     from rich.console import Console
 
     from drivers.sample import AXES
@@ -64,7 +64,7 @@ def history(
     _check_output_files(json, out, plot)
     live = connect is not None or zenoh is not None
     if source is not None and live:
-        raise ConfigError(f"{source}: either a file's history or --connect, not both")
+        raise ConfigError(f"{source}: give either a file or --connect, not both")
     step_s = None if step is None else max(int(_for_option("--step", parse_duration_s, step)), 1)
     axes = AXES if axis is None else (axis,)
     asked = HistoryQuery(_span(since, until), step_s, PARTS, axes)
@@ -87,16 +87,16 @@ def _check_output_files(json: Path | None, out: Path | None, plot: Path | None) 
     Raises
     ------
     ConfigError
-        A file cannot be written, or its suffix is not supported.
+        If a file cannot be written, or if a suffix is not supported.
     """
-    from drivers.recordings.formats import format_for_path
+    from drivers.recordings.formats import find_format
 
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
     for option, place in (("--json", json), ("--out", out), ("--plot", plot)):
-        output.check_place(option, place)
+        output.check_output_folder(option, place)
     if out is not None:
-        format_for_path(out)
+        find_format(out)
 
 
 def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: Path | None, plot: Path | None) -> None:
@@ -107,7 +107,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
     if json is not None:
         newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
         message = HistoryMessage.reply(past, asked, newest_s, int(past.counts[:, 0].sum()))
-        output.write("--json", json, message.encode() + b"\n")
+        output.write_bytes("--json", json, message.encode() + b"\n")
     if out is not None:
         history_file.save_history(past, out)
     if plot is not None:
@@ -117,12 +117,12 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:
-    """Return a function that answers from a history file. A daemon may write to the file at the same time."""
+    """Return a function that reads results from a history file. A daemon may write to the file at the same time."""
     from monitor.history import reading as past
     from monitor.history.sqlite_store import open_history
 
     if source is None:
-        raise ConfigError("CONFIG.toml or a folder is missing; or --connect ENDPOINT for a running daemon")
+        raise ConfigError("CONFIG.toml or a folder is needed, or --connect ENDPOINT for a running daemon")
     path = _history_path(source)
     with open_history(path) as reader:
         device = _select_device(name, list(reader.devices()), str(path))
@@ -135,8 +135,8 @@ def _from_file(source: Path | None, name: str | None) -> Get:
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
-    """Return a function that answers over zenoh."""
-    from monitor.publishing.zenoh.history_query import query_histories
+    """Return a function that queries the history of a running daemon over zenoh."""
+    from monitor.publishing.zenoh.history_client import query_histories
 
     def get(asked: "HistoryQuery") -> "HistoryTable":
         found = {one.device: one for one in query_histories(endpoint, name or "*", asked.parameters(), prefix, file)}
@@ -156,7 +156,7 @@ def _history_path(source: Path) -> Path:
         return source
     config = loading.load(source, pipe=True)
     if config.storage is None:
-        raise ConfigError(f"{source}: keeps no history; [storage] folder is missing")
+        raise ConfigError(f"{source}: stores no history, because [storage] has no folder")
     return config.storage.folder / FILE_NAME
 
 
@@ -166,19 +166,19 @@ def _select_device(name: str | None, there: list[str], where: str) -> str:
     Raises
     ------
     NotReady
-        There is no history yet.
+        If there is no history yet.
     ConfigError
-        No device has this name, or a name is needed to choose between devices.
+        If no device has this name, or if a name is needed to choose between devices.
     """
     from drivers.discovery import format_suggestion
     from drivers.errors import NotReady
 
     if not there:
-        raise NotReady(f"{where}: nothing is kept yet")
+        raise NotReady(f"{where}: there is no history yet")
     if name is None and len(there) == 1:
         return there[0]
     if name is None:
-        raise ConfigError(f"{where}: history of {len(there)} devices; choose with --device: {', '.join(there)}")
+        raise ConfigError(f"{where}: history of {len(there)} devices; choose one with --device: {', '.join(there)}")
     if name not in there:
         raise ConfigError(f'--device: "{name}"{format_suggestion(name, there)}')
     return name

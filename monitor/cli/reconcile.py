@@ -8,7 +8,7 @@ import typer
 
 from drivers.errors import NotReady
 from drivers.extras import check_extra
-from monitor.cli.shared import options, output, terminal_session
+from monitor.cli.shared import options, output, service_in_terminal
 
 
 def reconcile(
@@ -36,19 +36,19 @@ def reconcile(
     from rich.console import Console
 
     from monitor.commands import reconcile as reconciling
-    from monitor.noise.catalogue import load_model
+    from monitor.noise.model_catalogue import load_model
     from monitor.publishing.terminal import reconcile_text as text
     from monitor.reconcile import report
     from monitor.reconcile.several_recordings import comparison_report
 
-    last_s = options.duration("--last", last)
-    output.check_place("--json", json)
+    last_s = options.parse_duration("--last", last)
+    output.check_output_folder("--json", json)
     tested = None if model is None else load_model(model, Path.cwd())
     several = len(recordings) > 1
-    terminal_session.end_on_sigterm()
+    service_in_terminal.exit_on_sigterm()
     try:
-        with output.progress() as tell:
-            output.compile_kernels(tell)
+        with output.show_progress() as tell:
+            output.compile_analysis_kernels(tell)
             if several:
                 every = reconciling.ComparisonRequest(tuple(recordings), tested, out, seed, rate, last_s)
                 runs = reconciling.compare_recordings(every, tell)
@@ -60,9 +60,9 @@ def reconcile(
                 data, show = report.encode_report(one), partial(text.print_report, one)
     except NotReady:
         if json is not None:
-            output.write("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")
+            output.write_bytes("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")
         raise
     if json is not None:
-        output.write("--json", json, data + b"\n")
+        output.write_bytes("--json", json, data + b"\n")
     if json != Path("-"):
         show(Console())

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from monitor.cli.shared import options, terminal_session
+from monitor.cli.shared import options, service_in_terminal
 
 
 def run(
@@ -17,8 +17,10 @@ def run(
         typer.Option(metavar="S", help="Show the last part of the history in the live view: 1d, 12h; needs [storage]."),
     ] = None,
 ) -> None:
-    """Run the service for all devices of a file, until a signal."""
+    """Run the service for all devices of a configuration file until the process is interrupted."""
     from monitor.settings import loading
 
-    found = terminal_session.with_history(loading.load(config, pipe=True), options.duration("--history", history))
-    terminal_session.serve(found, seconds, viewer)
+    found = service_in_terminal.with_history_span(
+        loading.load(config, pipe=True), options.parse_duration("--history", history)
+    )
+    service_in_terminal.run_service(found, seconds, viewer)

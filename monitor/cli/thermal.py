@@ -34,15 +34,15 @@ def thermal_fit(
     from monitor.publishing.terminal import thermal_text as text
 
     _check_thermal(json, plot)
-    output.check_place("--out", out)
-    interval_s, last_s = options.duration("--interval", interval), options.duration("--last", last)
+    output.check_output_folder("--out", out)
+    interval_s, last_s = options.parse_duration("--interval", interval), options.parse_duration("--last", last)
     study = thermal.fit_recording(recording, interval_s, rate, last_s)
     if json is not None:
-        output.write("--json", json, text.encode_thermal_fit(study) + b"\n")
+        output.write_bytes("--json", json, text.encode_thermal_fit(study) + b"\n")
     if not study.fits:
         raise NotReady("; ".join(f"{axis}: {why}" for axis, why in study.refused.items()))
     if out is not None:
-        output.write("--out", out, thermal.write_model_file(study) + b"\n")
+        output.write_bytes("--out", out, thermal.encode_model_file(study) + b"\n")
     if plot is not None:
         from monitor.publishing.plots.thermal_plot import save_thermal_fit_plot
 
@@ -67,10 +67,10 @@ def thermal_predict(
 
     _check_thermal(json, plot)
     outlook = thermal.predict_recording(
-        recording, thermal.read_model_file(model), rate, options.duration("--last", last)
+        recording, thermal.read_model_file(model), rate, options.parse_duration("--last", last)
     )
     if json is not None:
-        output.write("--json", json, text.encode_thermal_prediction(outlook) + b"\n")
+        output.write_bytes("--json", json, text.encode_thermal_prediction(outlook) + b"\n")
     if not outlook.judged:
         raise NotReady("; ".join(f"{axis}: {why}" for axis, why in outlook.refused.items()))
     if plot is not None:
@@ -87,9 +87,9 @@ def _check_thermal(json: Path | None, plot: Path | None) -> None:
     Raises
     ------
     ConfigError
-        A file cannot be written, or the picture has another suffix than .png.
+        If a file cannot be written, or if the suffix of the picture is not .png.
     """
     if plot is not None and plot.suffix != ".png":
         raise ConfigError(f"--plot: {plot}: a name ending in .png is needed")
-    output.check_place("--json", json)
-    output.check_place("--plot", plot)
+    output.check_output_folder("--json", json)
+    output.check_output_folder("--plot", plot)

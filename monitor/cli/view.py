@@ -4,7 +4,7 @@ from typing import Annotated
 
 import typer
 
-from monitor.cli.shared import options, terminal_session
+from monitor.cli.shared import options, service_in_terminal
 
 
 def view(
@@ -19,4 +19,4 @@ def view(
     seconds: options.Seconds = None,
 ) -> None:
     """Show any number of daemons in one viewer: a table of all devices, and chosen devices in detail."""
-    terminal_session.view(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)
+    service_in_terminal.run_fleet_viewer(keyexpr, connect or (), zenoh, detail or (), viewer or "auto", seconds)

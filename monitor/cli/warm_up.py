@@ -20,12 +20,12 @@ def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True
     folder = cache_folder()
     if folder is None:
         raise ConfigError(
-            "compiled kernels cannot be kept, because no cache folder can be written; set NUMBA_CACHE_DIR to a folder "
-            "that can"
+            "compiled kernels cannot be stored, because no cache folder can be written; set NUMBA_CACHE_DIR to a "
+            "writable folder"
         )
     cold = [group for group in kernel_parts.GROUPS if not kernel_compilation.is_warm(group)]
     begun_s = time.monotonic()
-    with output.progress() as show:
+    with output.show_progress() as show:
 
         def tell(progress: kernel_compilation.Progress) -> None:
             show(str(progress), progress.share)

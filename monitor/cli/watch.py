@@ -2,7 +2,7 @@
 
 import threading
 
-from monitor.cli.shared import options, terminal_session
+from monitor.cli.shared import options, service_in_terminal
 
 
 def watch(
@@ -17,5 +17,5 @@ def watch(
     from monitor.publishing.terminal.watch import watch as show
 
     stop = threading.Event()
-    terminal_session.on_signals(stop.set)
+    service_in_terminal.install_signal_handlers(stop.set)
     show(keyexpr, connect or (), stop, Console(), seconds, zenoh)

@@ -1,10 +1,11 @@
 """Command ``analyze``: reads a recording and computes all requested results, in several threads.
 
-The curve, the fit, motion and changes are always computed. Total and Hadamard deviations take four times as long as the
-Allan curve, so they are computed only if they are drawn or written. Dynamic curves are computed if a window is given.
+Allan deviations, noise coefficients, motion and changes of the noise are always determined. Total and Hadamard
+deviations take four times as long as Allan deviations, so they are computed only if they are drawn or written. Allan
+deviations over time are computed if a window is given.
 
-Axes of the curve, and results that do not depend on each other, are computed in parallel, because kernels release the
-GIL. Dynamic curves run in the calling thread, so that Ctrl-C ends them at once.
+Independent axes and results are computed in parallel threads, because kernels release the GIL. Allan deviations over
+time are computed in the calling thread, so that Ctrl-C ends the computation at once.
 """
 
 import os
@@ -18,7 +19,7 @@ import numpy as np
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
 from drivers.sample import AXES, Ints, SampleBlock
-from monitor.drift.thermal.temperature_share import TemperatureShare, remove_temperature, temperature_varied
+from monitor.drift.thermal.temperature_removal import TemperatureRemoval, remove_temperature, temperature_varied
 from monitor.estimation.allan.batch import TauGrid
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
@@ -30,7 +31,7 @@ from monitor.publishing.plots.dynamic_figure import ChangeMark
 from monitor.publishing.terminal.thermal_text import temperature_notes
 
 ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
+"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 
 
 class TooFewSamples(NotReady):
@@ -71,7 +72,7 @@ class Results:
     hadamard: HadamardCurve | None = None
     dynamic: DynamicAllan | None = None
     lacking: str = ""  # reason why requested dynamic curves are missing
-    without_temperature: TemperatureShare | None = (
+    without_temperature: TemperatureRemoval | None = (
         None  # coefficients without the effect of temperature, if it explains any axis
     )
 
@@ -89,15 +90,16 @@ def run_analysis(request: Request, tell: ProgressCallback = lambda _what, _share
     Raises
     ------
     RecordingError, ConfigError
-        The recording cannot be read, it does not allow a requested τ, rate or window, or there is not enough memory.
+        If the recording cannot be read, if it is too short for a requested τ or window, or if there is not enough
+        memory.
     TooFewSamples
-        The recording has too few samples for any result.
+        If the recording has too few samples for any result.
     """
     try:
         return _make(request, tell)
     except MemoryError as error:
         raise ConfigError(
-            f"{request.recording}: the analysis needs more memory than is free; take the end alone with --last, or "
+            f"{request.recording}: the analysis needs more memory than is free; use only the end with --last, or "
             "split the recording"
         ) from error
 
@@ -148,13 +150,13 @@ def draw_plots(results: Results, path: Path, title: str) -> None:
     Raises
     ------
     ConfigError
-        The plotting library is not installed, or the file cannot be written.
+        If the plotting library is not installed, or if the file cannot be written.
     """
-    from monitor.publishing.plots.analysis_plot import DrawnAnalysis, save_analysis_plot
+    from monitor.publishing.plots.analysis_plot import AnalysisPlotData, save_analysis_plot
 
     result = results.analysis
     marks = [ChangeMark(change.since / result.estimate.rate_hz, AXES[change.axis]) for change in result.changes]
-    drawn = DrawnAnalysis(result, other_deviations(results.total, results.hadamard), results.dynamic, marks)
+    drawn = AnalysisPlotData(result, other_deviations(results.total, results.hadamard), results.dynamic, marks)
     if path.suffix == ".html":
         from monitor.publishing.reports.analysis_report import write_html_report
 
@@ -165,7 +167,7 @@ def draw_plots(results: Results, path: Path, title: str) -> None:
 
 def _without_temperature(
     result: Analysis, blocks: Sequence[SampleBlock], rate_hz: float | None
-) -> TemperatureShare | None:
+) -> TemperatureRemoval | None:
     """Return the coefficients without the effect of temperature; None if the temperature is missing or constant."""
     if not temperature_varied(np.concatenate([samples.temperature_c for samples in blocks])):
         return None
@@ -188,7 +190,7 @@ def _dynamic_curves(result: Analysis, request: Request, tell: ProgressCallback) 
 
 
 def _total_and_hadamard(result: Analysis, tau: TauGrid) -> tuple[TotalCurve, HadamardCurve | None]:
-    """Return total and Hadamard deviations on octaves, or at those listed τ that the length of the recording allows."""
+    """Return total and Hadamard deviations at octaves, or at the listed τ if the recording is long enough."""
     values, rate_hz, theta = result.values, result.estimate.rate_hz, np.where(result.fit.entered, result.fit.theta, 0.0)
     listed = None if isinstance(tau, str) else result.estimate.curve.factors
     short: Ints | None = None if listed is None else listed[3 * listed <= len(values)]

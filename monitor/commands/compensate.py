@@ -1,9 +1,9 @@
 """Command ``compensate``: writes a recording without the drift of its gyroscopes, and measures the improvement.
 
-The method ``adaptive`` is the one of the daemon, sample by sample. The method ``fixed`` is the same without adaptation
-of the noise. The other methods are used elsewhere for finished recordings. All are evaluated on the same stretches at
-rest. The first third of these stretches serves the methods that learn from a whole recording, and is excluded from the
-evaluation.
+The method ``adaptive`` processes the samples one by one, as the daemon does. The method ``fixed`` differs from
+``adaptive`` in that the noise of the drift is not adapted. The other methods are published methods for finished
+recordings. All methods are evaluated on the same samples at rest. The first third of the samples at rest is excluded,
+because some methods use it for learning.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ BLOCK_ROWS: Final = 1 << 16
 """Number of rows that are written at a time."""
 
 ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
+"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,14 +65,15 @@ def run_compensation(request: Request, tell: ProgressCallback = lambda _what, _s
     Returns
     -------
     Result
-        Deviations before and after, for each gyroscope axis.
+        Quality of the uncompensated and the compensated rate of each gyroscope axis.
 
     Raises
     ------
     ConfigError, RecordingError
-        The method is unknown, the recording cannot be read or has no gyroscope axis, or the result cannot be written.
+        If the method is unknown, if the recording cannot be read or has no gyroscope axis, or if the result cannot be
+        written.
     NotReady
-        The sensor was never at rest for long enough. Nothing is written.
+        If the sensor was never at rest for long enough. No file is written.
     """
     if request.method not in METHODS:
         raise ConfigError(f'--method: unknown method "{request.method}"{format_suggestion(request.method, METHODS)}')
@@ -80,7 +81,7 @@ def run_compensation(request: Request, tell: ProgressCallback = lambda _what, _s
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
-        raise ConfigError(f"{request.recording}: no gyro axis in it; columns gx, gy, gz in rad/s are needed")
+        raise ConfigError(f"{request.recording}: there is no gyro axis; columns gx, gy, gz in rad/s are needed")
     values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     orders = ORDERS if request.order is None else (request.order,)
     live = Compensator(rate_hz, adapts=request.method != "fixed", orders=orders)
@@ -90,12 +91,12 @@ def run_compensation(request: Request, tell: ProgressCallback = lambda _what, _s
     learned, judged = _split_learning(rest)
     if not judged.any():
         raise NotReady(
-            f"{request.recording}: never at rest for {MIN_CONFIRMED_INTERVALS * live.interval_s:g} s: "
-            "no drift can be learned from it"
+            f"{request.recording}: never at rest for {MIN_CONFIRMED_INTERVALS * live.interval_s:g} s, "
+            "so the drift cannot be learned"
         )
     if request.method in REFERENCE_METHODS:
         out = _compensate_offline(request.method, values, learned, axes, tell)
-    tell("judging", None)
+    tell("evaluating", None)
     judged_axes: dict[str, AxisCompensation] = {
         str(axis): _evaluate_axis(AXES.index(axis), values, out, learned, judged, live, intervals) for axis in axes
     }
@@ -122,14 +123,14 @@ def _run(live: Compensator, values: Floats, tell: ProgressCallback) -> Floats:
     size = live.interval_samples
     for start in range(0, len(values), size):
         out[start : start + size] = live.compensate(values[start : start + size])
-        live.identify()
+        live.identify_due_models()
         if start % (256 * size) == 0:
             tell("compensating", start / len(values))
     return out
 
 
 def _at_rest(intervals: tuple[DriftInterval, ...], n: int, size: int) -> NDArray[np.bool_]:
-    """Return the mask [n, 3] of the samples in intervals that the drift was estimated from, after a bias was known."""
+    """Return a mask [n, 3] that is True for samples of the intervals that updated a known bias."""
     mask = np.zeros((n, len(GYROS)), dtype=bool)
     for one in intervals:
         mask[one.end - size : one.end] = (one.outcome == USED) & np.isfinite(one.expected)
@@ -137,7 +138,7 @@ def _at_rest(intervals: tuple[DriftInterval, ...], n: int, size: int) -> NDArray
 
 
 def _split_learning(rest: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return the masks of the first third of the samples at rest, for each axis, and of the other samples at rest."""
+    """Return two masks for the samples at rest of each axis: the first third, and the remaining samples."""
     count = np.cumsum(rest, axis=0)
     first = count <= LEARNING_SHARE * count[-1]
     return rest & first, rest & ~first
@@ -164,13 +165,15 @@ def _evaluate_axis(
     live: Compensator,
     intervals: tuple[DriftInterval, ...],
 ) -> AxisCompensation:
-    """Return the deviations of one axis before and after."""
+    """Return the quality of one axis before and after compensation."""
     before = values[:, at] - np.nanmean(values[learned[:, at], at])
     first = int(np.argmax(judged[:, at]))
     model = live.models[at]
     became = np.array([one.outcome[at] for one in intervals])
     return AxisCompensation(
-        model=None if model is None else fit_arma(*live.identification_data(at), [model.order], intervals=True),
+        model=None
+        if model is None
+        else fit_arma(*live.identification_means_and_variance(at), [model.order], intervals=True),
         uncompensated=score_at_rest(np.where(judged[:, at], before, np.nan)[first:], live.rate_hz),
         compensated=score_at_rest(np.where(judged[:, at], out[:, at], np.nan)[first:], live.rate_hz),
         rejected_intervals=int((became == REJECTED).sum()),

@@ -1,13 +1,13 @@
 """Command ``doctor``: checks a machine and a configuration for unattended operation, and returns findings with advice.
 
-Each check returns findings and raises no error. If a check cannot determine the state, its finding says so. No device
-is opened. The checks have three side effects: a port is bound for a moment, a connection to a router is opened and
-closed, and an empty file is created in the storage folder and removed.
+Each check returns findings and raises no error. If a check cannot determine a state, the finding says so. No device is
+opened. The checks have three side effects: a port is bound for a moment, a connection to a router is opened and closed,
+and an empty file is created in the storage folder and removed.
 
 The disk use per day, in bytes, is rate · 86400 · SAMPLE_BYTES for each recorded device. Raw bytes add RAW_BYTES for
-each sample. SAMPLE_BYTES is the size of a sample in a packed segment with six axes, temperature and counter, for noise
-that fills a 32-bit float. Sensors with coarser resolution need less. The history of results is small in comparison and
-not counted.
+each sample. SAMPLE_BYTES is the size of a sample in a packed segment with six axes, temperature and counter, if the
+noise uses all digits of a 32-bit float. Sensors with a coarser resolution need less. The history of results is
+comparatively small and is not counted.
 """
 
 import ctypes
@@ -29,11 +29,11 @@ from pathlib import Path
 from typing import Any, Final, Literal
 
 from drivers import file_access
-from drivers.extras import missing_packages
-from drivers.links.can_link import missing_package
+from drivers.extras import find_missing_packages
+from drivers.links.can_link import describe_missing_package
 from drivers.links.replay_link import ReplayLink
-from drivers.quantities import DAY_S
-from monitor.commands.check import check
+from drivers.number_ranges import DAY_S
+from monitor.commands.check_config import check_configuration
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, lock_holder
 from monitor.settings.file_permissions import contains_secret
 from monitor.settings.loading import Config, Storage
@@ -43,7 +43,7 @@ Mark = Literal["well", "doubt", "wrong"]
 SAMPLE_BYTES: Final = 35.0
 """Size of a sample in a packed segment.
 
-It is 32.5 to 33.3 bytes for a sensor that fills a float, and 17 to 23 bytes for a sensor with a coarse resolution.
+Sensors that use all digits of a float need 32.5 to 33.3 bytes, and sensors with a coarse resolution 17 to 23 bytes.
 """
 RAW_BYTES: Final = 60.0
 """Approximate size of the received frame of a sample. It depends on the protocol."""
@@ -60,7 +60,7 @@ UNIT: Final = "imu-monitor.service"
 PACKAGE: Final = "imu-monitor"
 """Name of the distribution package."""
 PACKAGES: Final = ("monitor", "drivers")
-"""Import packages of the program. Their names are common, so other packages may have the same."""
+"""Import packages of the program. The names are common, so other packages may have the same names."""
 TCP_ENDPOINT: Final = re.compile(r"(?:tcp|tls)/\[?([^\]]+?)\]?:(\d+)(?:[?#].*)?")
 """Regular expression for the host and the port of a zenoh endpoint over TCP or TLS."""
 REQUIREMENT: Final = re.compile(r"([A-Za-z0-9._-]+)\s*(?:\[[^\]]*\])?\s*\(?([^;)]*)\)?\s*(?:;(.*))?")
@@ -81,10 +81,16 @@ class Finding:
 
 def examine(path: Path | None = None) -> list[Finding]:
     """Check the machine, and the configuration if a path is given."""
-    found = [*check_libraries(), *check_packages(sys.path), *_check_kernels(), *check_clock(), *_check_systemd_unit()]
+    found = [
+        *check_library_versions(),
+        *check_shadowed_packages(sys.path),
+        *_check_kernels(),
+        *check_clock(),
+        *_check_systemd_unit(),
+    ]
     if path is None:
         return found
-    config, wrong = read(path)
+    config, wrong = read_configuration(path)
     found = [*wrong, *found]
     if path.is_file():
         found += _check_permissions(path)
@@ -108,9 +114,9 @@ def examine(path: Path | None = None) -> list[Finding]:
 # --- the configuration
 
 
-def read(path: Path) -> tuple[Config | None, list[Finding]]:
+def read_configuration(path: Path) -> tuple[Config | None, list[Finding]]:
     """Read and check the configuration; return it, or None if it has a mistake, and the findings."""
-    config, wrong = check(path, pipe=True)
+    config, wrong = check_configuration(path, pipe=True)
     if config is None:
         return None, [Finding("wrong", "configuration", line) for line in wrong]
     count = len(config.devices)
@@ -216,7 +222,7 @@ def check_can_interface(
     sysfs : Path, optional
         Folder with the network interfaces of the kernel.
     """
-    if missing := missing_package(interface):
+    if missing := describe_missing_package(interface):
         text, _, command = missing.partition(": ")
         return [Finding("wrong", about, text, command)]
     if interface != "socketcan":
@@ -246,7 +252,7 @@ def _check_zenoh(config: Config) -> list[Finding]:
     own = config.zenoh
     if own.mode == "none":
         return []
-    found = [one for endpoint in own.listen or () if own.mode != "client" for one in port_is_free("zenoh", endpoint)]
+    found = [one for endpoint in own.listen or () if own.mode != "client" for one in check_port_free("zenoh", endpoint)]
     found += [one for endpoint in own.connect for one in _reachable("zenoh", endpoint)]
     for endpoint in own.listen or ():
         host = _host(endpoint)
@@ -258,8 +264,8 @@ def _check_zenoh(config: Config) -> list[Finding]:
     return found
 
 
-def port_is_free(about: str, endpoint: str) -> list[Finding]:
-    """Check that a port can be listened on, by binding it for a moment.
+def check_port_free(about: str, endpoint: str) -> list[Finding]:
+    """Check that a port is free, by listening on the port for a moment.
 
     Parameters
     ----------
@@ -327,7 +333,7 @@ def _check_metrics(config: Config) -> list[Finding]:
         text = "metrics.listen is set, but prometheus-client is not installed"
         return [Finding("wrong", "metrics", text, 'pip install "imu-monitor[metrics]"')]
     host = f"[{own.host}]" if ":" in own.host else own.host
-    found = port_is_free("metrics", f"tcp/{host}:{own.port}")
+    found = check_port_free("metrics", f"tcp/{host}:{own.port}")
     if not own.host.startswith(LOOPBACK):
         text = f"{own.host}: everyone who reaches this machine can read the metrics"
         found.append(Finding("doubt", "metrics", text, "listen on 127.0.0.1, and let a local collector forward them"))
@@ -336,7 +342,7 @@ def _check_metrics(config: Config) -> list[Finding]:
 
 def _check_reconcile(config: Config) -> list[Finding]:
     """Check that ``command/reconcile`` can be answered, if a folder is configured for its reports."""
-    missing = missing_packages("reconcile")
+    missing = find_missing_packages("reconcile")
     if not missing or not any(one.reconcile_folder for one in config.devices):
         return []
     text = (
@@ -360,7 +366,7 @@ def _check_storage(config: Config) -> list[Finding]:
         found.append(Finding("wrong", "storage", text, 'pip install "imu-monitor[arrow]"'))
     folder = next(one for one in (own.folder, *own.folder.parents) if os.path.exists(one))
     try:
-        file_access.check_folder(folder)
+        file_access.check_folder_or_absent(folder)
         with tempfile.TemporaryFile(dir=folder):
             pass
         usage = shutil.disk_usage(folder)
@@ -368,7 +374,7 @@ def _check_storage(config: Config) -> list[Finding]:
         text = f"{own.folder}: cannot be written: {error.strerror or error}"
         return [*found, Finding("wrong", "storage", text, f"create it, owned by {_user(os.geteuid())}")]
     found += _check_in_use(own)
-    return [*found, *disk_space(own, bytes_a_day(config), usage.total, usage.free)]
+    return [*found, *check_disk_space(own, recorded_bytes_per_day(config), usage.total, usage.free)]
 
 
 def _check_in_use(own: Storage) -> list[Finding]:
@@ -379,17 +385,17 @@ def _check_in_use(own: Storage) -> list[Finding]:
     return [Finding("doubt", "storage", f"{own.folder}: in use by {one}", do) for one in holders]
 
 
-def bytes_a_day(config: Config) -> float | None:
+def recorded_bytes_per_day(config: Config) -> float | None:
     """Return the disk use of all devices per day in bytes; None if the rate of a device is not configured.
 
     Examples
     --------
     >>> import dataclasses
-    >>> from monitor.common.config_files import CONFIG_FOLDER
+    >>> from monitor.common.shipped_file_paths import CONFIG_FOLDER
     >>> from monitor.settings.loading import load
     >>> one = load(CONFIG_FOLDER / "demo.toml")
     >>> kept = Storage(folder=Path("kept"))
-    >>> bytes_a_day(dataclasses.replace(one, storage=kept)) == one.devices[0].rate_hz * DAY_S * SAMPLE_BYTES
+    >>> recorded_bytes_per_day(dataclasses.replace(one, storage=kept)) == one.devices[0].rate_hz * DAY_S * SAMPLE_BYTES
     True
     """
     own = config.storage
@@ -401,8 +407,8 @@ def bytes_a_day(config: Config) -> float | None:
     return None if len(known) < len(rates) else sum(known) * DAY_S * each
 
 
-def disk_space(own: Storage, a_day: float | None, total: int, available: int) -> list[Finding]:
-    """Check that the data to be kept fit on the disk.
+def check_disk_space(own: Storage, a_day: float | None, total: int, available: int) -> list[Finding]:
+    """Check that the disk has enough space for the data to be kept.
 
     Parameters
     ----------
@@ -433,9 +439,9 @@ def disk_space(own: Storage, a_day: float | None, total: int, available: int) ->
 # --- the machine
 
 
-def check_libraries() -> list[Finding]:
+def check_library_versions() -> list[Finding]:
     """Check the version of each library against the requirements of this program."""
-    wanted = list(requirements())
+    wanted = list(required_libraries())
     if not wanted:
         return [
             Finding(
@@ -453,7 +459,7 @@ def check_libraries() -> list[Finding]:
                 wrong.append(Finding("wrong", "libraries", f"{name} is missing", f'pip install "{name}{versions}"'))
             continue
         count += 1
-        if not satisfies(there, versions):
+        if not version_satisfies(there, versions):
             text = f"{name} {there} is installed, {versions} is required"
             wrong.append(Finding("wrong", "libraries", text, f'pip install "{name}{versions}"'))
     return wrong or [
@@ -461,8 +467,8 @@ def check_libraries() -> list[Finding]:
     ]
 
 
-def requirements() -> Iterator[tuple[str, str, bool]]:
-    """Yield name, versions and whether it is optional, for every library except those for tests."""
+def required_libraries() -> Iterator[tuple[str, str, bool]]:
+    """Yield the name, the versions and True if it is optional, for every library that is not only for tests."""
     try:
         lines = metadata.requires(PACKAGE) or []
     except metadata.PackageNotFoundError:
@@ -476,7 +482,7 @@ def requirements() -> Iterator[tuple[str, str, bool]]:
             yield match[1], match[2].replace(" ", ""), extra is not None
 
 
-def satisfies(version: str, wanted: str) -> bool:
+def version_satisfies(version: str, wanted: str) -> bool:
     """Return True if a version is within bounds like ``>=0.41,<0.42``. Bounds of another kind are ignored.
 
     Parameters
@@ -488,16 +494,16 @@ def satisfies(version: str, wanted: str) -> bool:
 
     Examples
     --------
-    >>> satisfies("0.41.2", ">=0.41,<0.42"), satisfies("0.42.0", ">=0.41,<0.42"), satisfies("2.0rc1", ">=1.9")
-    (True, False, True)
+    >>> version_satisfies("0.41.2", ">=0.41,<0.42"), version_satisfies("0.42.0", ">=0.41,<0.42")
+    (True, False)
     """
     compare = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt, "==": operator.eq}
     bounds = re.findall(r"(>=|<=|==|>|<)\s*([\d.]+)", wanted)
     return all(compare[sign](_numbers(version), _numbers(bound)) for sign, bound in bounds)
 
 
-def check_packages(module_path: Sequence[str]) -> list[Finding]:
-    """Report foreign packages and modules that have the name of one of the program's packages and are found first.
+def check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
+    """Report foreign modules that Python would import in place of the packages of the program.
 
     Parameters
     ----------
@@ -511,7 +517,7 @@ def check_packages(module_path: Sequence[str]) -> list[Finding]:
         if folder == own:
             break
         for name in PACKAGES:
-            # a folder without __init__.py is a namespace package, and a regular package that is found later replaces it
+            # a folder without __init__.py is a namespace package, and Python prefers a regular package on a later path
             places = (folder / name / "__init__.py", folder / f"{name}.py")
             foreign = next((one for one in places if one.is_file()), None)
             if foreign is not None:
@@ -540,7 +546,7 @@ def _check_kernels() -> list[Finding]:
 
 
 def check_clock() -> list[Finding]:
-    """Check that the host clock is synchronised, because results carry its time."""
+    """Check that the host clock is synchronised, because the times of results are taken from this clock."""
     state = _adjtimex()
     if state is None:
         return [Finding("doubt", "clock", "the system does not report whether it is synchronised")]
@@ -551,7 +557,7 @@ def check_clock() -> list[Finding]:
 
 
 def _check_systemd_unit() -> list[Finding]:
-    """Check the service under systemd, if it is installed there."""
+    """Check the state of the systemd unit, if it is installed."""
     if shutil.which("systemctl") is None or not Path("/run/systemd/system").is_dir():
         return []
     command = ["systemctl", "show", UNIT, "--property=LoadState,ActiveState,SubState,NRestarts,UnitFileState"]
@@ -559,15 +565,15 @@ def _check_systemd_unit() -> list[Finding]:
         said = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False).stdout
     except (OSError, subprocess.TimeoutExpired) as error:
         return [Finding("doubt", "systemd", f"the state is unknown: {error}")]
-    return unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
+    return check_unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
 
 
-def unit_state(seen: Mapping[str, str]) -> list[Finding]:
+def check_unit_state(seen: Mapping[str, str]) -> list[Finding]:
     """Return the findings for the output of ``systemctl show``; none if there is no such unit.
 
     Examples
     --------
-    >>> unit_state({"LoadState": "not-found"})
+    >>> check_unit_state({"LoadState": "not-found"})
     []
     """
     if seen.get("LoadState") != "loaded":

@@ -4,8 +4,8 @@
 completely or not at all. If the data do not support an answer, only ``report.json`` is written, and it states the
 reason. Kernels and transforms release the GIL, so that axes and simulated recordings are processed in parallel.
 
-Several recordings are compared with one model, one after the other. Each has its own folder in ``DIR/``. The common
-results and the differences are written to ``DIR/`` itself.
+Several recordings are compared with one model, one after the other. The report of each recording is written to a
+subfolder of ``DIR/``. The common results and the differences are written to ``DIR/`` itself.
 """
 
 import os
@@ -31,10 +31,10 @@ from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.report import SCHEMA, encode_report
 from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.several_recordings import comparison_report
-from monitor.reconcile.several_recordings.comparison import Comparison, NamedResult, compare
+from monitor.reconcile.several_recordings.comparison import Comparison, NamedResult, compare_results
 
 ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
+"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 REPORT: Final = "report.json"
 """File name of the report as JSON."""
 
@@ -44,7 +44,7 @@ class Request:
     """Recording and model to compare."""
 
     recording: Path
-    model: NoiseModel | None  # None if the five terms are fitted first
+    model: NoiseModel | None  # None: the five noise terms are fitted to the recording
     out: Path
     seed: int = 1
     rate_hz: float | None = None
@@ -57,7 +57,7 @@ class ComparisonRequest:
     """Several recordings of one sensor, and the model to compare them with."""
 
     recordings: tuple[Path, ...]
-    model: NoiseModel | None  # None if the five terms are fitted to the first recording
+    model: NoiseModel | None  # None: the five noise terms are fitted to the first recording
     out: Path
     seed: int = 1
     rate_hz: float | None = None
@@ -77,19 +77,19 @@ def run_reconciliation(request: Request, tell: ProgressCallback = lambda _what, 
     Raises
     ------
     RecordingError, ConfigError
-        The recording cannot be read, or the folder cannot be written.
+        If the recording cannot be read, or if the folder cannot be written.
     NotReady
-        The data do not support an answer. The report states the reason.
+        If the data do not support an answer. The report states the reason.
     """
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
-    check_folder(request.out)
+    create_report_folder(request.out)
     try:
         recording, notes = _to_regular_grid(found)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
             result = reconcile(recording, request.model, request.seed, pool.map, lambda what: tell(what, None))
     except NotReady as error:
-        _write(request.out / REPORT, write_failure(str(error), len(found)))
+        _write(request.out / REPORT, encode_failure(str(error), len(found)))
         raise
     result = replace(result, notes=(*request.notes, *found.notes, *notes, *result.notes))
     tell("writing", None)
@@ -110,17 +110,20 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
     Raises
     ------
     RecordingError, ConfigError
-        As for ``make``, or a recording is given twice.
+        If a recording cannot be read or is given twice, or if the folder cannot be written.
     NotReady
-        Fewer than two recordings support an answer, or the first does not and the model was to be fitted to it.
+        If fewer than two recordings can be evaluated, or if no model is given and the first recording cannot be
+        evaluated.
     """
-    named = unique_names(request.recordings)
+    named = unique_recording_names(request.recordings)
     _check_recordings(named, request.out)
-    check_folder(request.out)
+    create_report_folder(request.out)
     model, runs, silent = request.model, list[NamedResult](), dict[str, str]()
     fitted_to = next(iter(named)) if model is None else None
     for at, (name, path) in enumerate(named.items(), start=1):
-        notes = (f"The model under test are the five terms of {fitted_to}.",) if fitted_to and at > 1 else ()
+        notes = (
+            (f"The model under test consists of the five noise terms of {fitted_to}.",) if fitted_to and at > 1 else ()
+        )
         one = Request(path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s)
         try:
             result = run_reconciliation(one, _tell_for(tell, f"{name}, {at} of {len(named)}"))
@@ -133,11 +136,11 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = lamb
         runs.append(NamedResult(name, result))
     if len(runs) < 2:
         why = "; ".join(f"{name}: {said}" for name, said in silent.items())
-        why = f"two recordings at least are compared with each other, and {len(runs)} can be: {why}"
-        _write(request.out / REPORT, write_failure(why, 0, comparison_report.SCHEMA))
+        why = f"at least two recordings are needed for a comparison, but only {len(runs)} can be evaluated: {why}"
+        _write(request.out / REPORT, encode_failure(why, 0, comparison_report.SCHEMA))
         raise NotReady(why)
     tell("writing", None)
-    comparison = compare(runs, fitted_to, silent)
+    comparison = compare_results(runs, fitted_to, silent)
     write_comparison(comparison, request.out)
     return comparison
 
@@ -159,23 +162,23 @@ def write_comparison(result: Comparison, folder: Path) -> None:
     _write(folder / "report.html", render_page(result).encode())
 
 
-def unique_names(recordings: Sequence[Path]) -> dict[str, Path]:
+def unique_recording_names(recordings: Sequence[Path]) -> dict[str, Path]:
     """Return a unique name for each recording: the file name without its suffix, and a number if names are equal.
 
     Raises
     ------
     ConfigError
-        A recording is given twice.
+        If a recording is given twice.
 
     Examples
     --------
-    >>> list(unique_names([Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/warm.npz")]))
+    >>> list(unique_recording_names([Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/warm.npz")]))
     ['run', 'run-2', 'warm']
     """
     found: dict[str, Path] = {}
     for path in recordings:
         if real_path(path) in [real_path(other) for other in found.values()]:
-            raise ConfigError(f"{path}: is given twice; recordings that are compared must be different ones")
+            raise ConfigError(f"{path}: is given twice; a comparison needs different recordings")
         full = real_path(path).name
         suffix = next((one for one in FORMATS if full.lower().endswith(one)), "")
         stem = full[: len(full) - len(suffix)] or full
@@ -190,7 +193,9 @@ def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
         if not path.exists():
             raise RecordingError(f"{path}: cannot be read: there is no such file or folder")
         if any(real_path(out / name) == real_path(path) for name in named):
-            raise ConfigError(f"--out: {out}: {path} is a recording, and a report would be written into it")
+            raise ConfigError(
+                f"--out: {out}: {path} is a recording; choose a folder that contains no recording of the comparison"
+            )
 
 
 def _tell_for(tell: ProgressCallback, which: str) -> ProgressCallback:
@@ -223,8 +228,8 @@ def write_report(result: Reconciliation, folder: Path, title: str) -> None:
         write_rrd(result, place)
 
 
-def write_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
-    """Return the content of ``report.json`` if there is no verdict.
+def encode_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
+    """Return the content of ``report.json`` for data that do not support an answer.
 
     Parameters
     ----------
@@ -238,22 +243,22 @@ def write_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
     return msgspec.json.encode({"schema": schema, "verdict": None, "why": why, "samples": samples})
 
 
-def check_folder(folder: Path) -> None:
+def create_report_folder(folder: Path) -> None:
     """Create the folder of the report.
 
     Raises
     ------
     ConfigError
-        The folder cannot be created.
+        If the folder cannot be created.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(f"--out: {folder}: cannot be made: {error.strerror}") from error
+        raise ConfigError(f"--out: {folder}: cannot be created: {error.strerror}") from error
 
 
 def _to_regular_grid(found: Samples) -> tuple[Recording, list[str]]:
-    """Return the recording on a regular grid with the axes of the file, and the notes about it."""
+    """Return the axes of the recording on a regular time grid, and notes about the resampling."""
     values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     columns = {axis: np.ascontiguousarray(values[:, AXES.index(axis)], np.float64) for axis in found.axes}
     return Recording(columns, rate_hz, temperature_c), notes

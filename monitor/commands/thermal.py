@@ -1,7 +1,7 @@
 """Commands ``thermal fit`` and ``thermal predict``: fit thermal models to a recording, and predict the bias of another.
 
-If an axis cannot be fitted or predicted, the reason is reported, and the other axes are processed. The model file is
-JSON. ``predict`` reads the file that ``fit`` writes.
+If an axis cannot be fitted or predicted, the reason is reported, and the remaining axes are processed. The model file
+is JSON. ``predict`` reads the file that ``fit`` writes.
 """
 
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ import numpy as np
 
 from drivers import file_access
 from drivers.errors import ConfigError, NotReady
-from drivers.quantities import DURATION_S, FIT_NUMBER
+from drivers.number_ranges import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks, load_samples
 from drivers.sample import AXES, Floats
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
@@ -24,8 +24,8 @@ from monitor.drift.thermal.thermal_response import ThermalModelForm
 from monitor.drift.thermal.thermal_study import (
     ThermalFitReport,
     ThermalPredictionReport,
+    choose_interval_s,
     compare_with_means,
-    round_interval_s,
 )
 from monitor.estimation.regular_grid import resample_with_temperature
 
@@ -33,7 +33,7 @@ SCHEMA: Final = "imu-monitor/thermal-model/1"
 """Schema of the model file."""
 
 
-class AxisRow(msgspec.Struct):
+class AxisModelRecord(msgspec.Struct):
     """Thermal model of one axis in a model file."""
 
     powers: int
@@ -54,7 +54,7 @@ class ModelFile(msgspec.Struct):
 
     schema: str
     interval: float
-    axes: dict[str, AxisRow]
+    axes: dict[str, AxisModelRecord]
 
 
 def fit_recording(
@@ -67,7 +67,7 @@ def fit_recording(
     recording : Path
         Recording with temperature.
     interval_s : float, optional
-        Length of an interval mean in seconds. By default it follows from the length of the recording.
+        Length of an interval in seconds. By default, the length is derived from the length of the recording.
     rate_hz : float, optional
         Sample rate, if the recording has none.
     last_s : float, optional
@@ -76,10 +76,10 @@ def fit_recording(
     Raises
     ------
     RecordingError, ConfigError
-        The recording cannot be read, or it has no temperature.
+        If the recording cannot be read, or if it has no temperature.
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
-    means = _means(values, temperature_c, rate, interval_s or round_interval_s(temperature_c.size / rate, rate))
+    means = _means(values, temperature_c, rate, interval_s or choose_interval_s(temperature_c.size / rate, rate))
     interval = next(iter(means.values())).interval_s  # rounded to a whole number of samples
     fits, refused = {}, {}
     for axis, one in means.items():
@@ -109,7 +109,7 @@ def predict_recording(
     Raises
     ------
     RecordingError, ConfigError
-        The recording cannot be read, or it has no temperature.
+        If the recording cannot be read, or if it has no temperature.
     """
     values, temperature_c, rate, notes = _read(recording, rate_hz, last_s)
     interval = next(iter(models.values())).interval_s
@@ -117,7 +117,7 @@ def predict_recording(
     judged, refused = {}, {}
     for axis, one in means.items():
         if axis not in models:
-            refused[axis] = "the model says nothing of it"
+            refused[axis] = "the model file has no model of this axis"
         elif one.known.sum() < 2:
             refused[axis] = f"fewer than two intervals of {interval:g} s"
         else:
@@ -125,7 +125,7 @@ def predict_recording(
     return ThermalPredictionReport(recording.name, interval, means, judged, refused, notes)
 
 
-def write_model_file(study: ThermalFitReport) -> bytes:
+def encode_model_file(study: ThermalFitReport) -> bytes:
     """Return the content of the model file with all axes that were fitted."""
     rows = {axis: _row(one.model) for axis, one in study.fits.items()}
     return msgspec.json.format(msgspec.json.encode(ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
@@ -137,18 +137,18 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
     Raises
     ------
     ConfigError
-        The file cannot be read, or its content is invalid.
+        If the file cannot be read, or if its content is invalid.
     """
     try:
         found = msgspec.json.decode(file_access.read_small_file(path, pipe=True), type=ModelFile)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"{path}: no thermal model: {error}") from error
+        raise ConfigError(f"{path}: not a thermal model: {error}") from error
     if found.schema != SCHEMA:
-        raise ConfigError(f'{path}: schema "{found.schema}"; "{SCHEMA}" is read')
+        raise ConfigError(f'{path}: unknown schema "{found.schema}"; "{SCHEMA}" is expected')
     if not found.axes:
-        raise ConfigError(f"{path}: no axis in it")
+        raise ConfigError(f"{path}: there is no axis in the file")
     try:
         DURATION_S.check(found.interval)
     except ConfigError as error:
@@ -156,9 +156,9 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
     return {axis: _model(path, axis, row, found.interval) for axis, row in found.axes.items()}
 
 
-def _row(model: ThermalModel) -> AxisRow:
+def _row(model: ThermalModel) -> AxisModelRecord:
     """Return a model in the form of the model file."""
-    return AxisRow(
+    return AxisModelRecord(
         powers=model.shape.powers,
         time_constants=list(model.shape.constants_s),
         reference=model.reference_c,
@@ -172,7 +172,7 @@ def _row(model: ThermalModel) -> AxisRow:
     )
 
 
-def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalModel:
+def _model(path: Path, axis: str, row: AxisModelRecord, interval_s: float) -> ThermalModel:
     """Check the model of one axis in a model file, and return it."""
     k = len(row.time_constants)
     terms = 1 + row.powers + k
@@ -182,11 +182,20 @@ def _model(path: Path, axis: str, row: AxisRow, interval_s: float) -> ThermalMod
     wrong = [
         (axis in AXES, f"no such axis; possible are {', '.join(AXES)}"),
         (row.powers >= 0, f"powers: {row.powers}; it must be 0 or more"),
-        (all(map(DURATION_S.supports, row.time_constants)), f"time_constants: each must be {DURATION_S.range_text()}"),
-        (all(map(FIT_NUMBER.supports, numbers)), f"a number is outside the supported range {FIT_NUMBER.range_text()}"),
-        (len(row.sizes) == terms, f"sizes: {len(row.sizes)} of them; {terms} are needed"),
-        (len(row.start) == k, f"start: {len(row.start)} of them; {k} are needed"),
-        (row.temperature[0] < row.temperature[1], "temperature: the coldest and the warmest of the fit are needed"),
+        (
+            all(map(DURATION_S.supports, row.time_constants)),
+            f"time_constants: each must be {DURATION_S.format_range()}",
+        ),
+        (
+            all(map(FIT_NUMBER.supports, numbers)),
+            f"a number is outside the supported range {FIT_NUMBER.format_range()}",
+        ),
+        (len(row.sizes) == terms, f"sizes: {len(row.sizes)} values; {terms} are needed"),
+        (len(row.start) == k, f"start: {len(row.start)} values; {k} are needed"),
+        (
+            row.temperature[0] < row.temperature[1],
+            "temperature: the lowest and then the highest temperature of the fit are needed",
+        ),
         (0.0 <= row.phi < 1.0, f"phi: {row.phi:g}; it must be from 0 to below 1"),
         (square, f"covariance: {size} rows and columns are needed"),
     ]
@@ -214,7 +223,7 @@ def _read(
     found = load_samples(recording, rate_hz, last_s)
     values, temperature_c, rate, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     if not np.isfinite(temperature_c).any():
-        raise ConfigError(f"{recording}: no temperature in it; a column temp or temperature, in °C, is needed")
+        raise ConfigError(f"{recording}: there is no temperature; a column temp or temperature in °C is needed")
     return values, temperature_c, rate, (*found.notes, *notes)
 
 

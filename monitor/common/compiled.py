@@ -3,14 +3,14 @@
 If no cache folder can be written (a read-only system, a user without a home folder), kernels are compiled at every
 start.
 
-Before Numba loads cached code, it checks only whether the file of the kernel has changed. A kernel also contains the
-functions and constants of other files that it uses. The stamp of the cache therefore covers all imported files.
+Before loading cached code, Numba only checks whether the file of the kernel has changed. A kernel also contains
+functions and constants from other files. The version of the cache therefore covers all imported files.
 
-Without further measures, Numba generates machine code for each kernel before another kernel can call it, and again for
-the copy in the calling kernel. A function four calls below the kernel that Python calls would go through LLVM five
-times. ``Kernel`` therefore keeps functions that other kernels call as intermediate code. This code is optimised once,
-as a part of the kernel that Python calls. This saves more than a quarter of the time of a first start
-(``docs/benchmarks.md``). The machine code of the outer kernels is the same.
+By default, Numba generates machine code for each kernel, and again for the copy of the kernel inside every calling
+kernel. LLVM would compile a function at the fifth level of calls five times. ``Kernel`` therefore keeps a function that
+other kernels call as intermediate code. This code is optimised once, as a part of the kernel that Python calls. The
+first start takes more than a quarter less time (``docs/benchmarks-service.md``). The machine code of the outer kernels
+does not change.
 
 Kernels receive and return NamedTuples of arrays. In a loop, array fields are first copied to local names, because Numba
 counts a reference at each access to a field.
@@ -35,7 +35,7 @@ import numpy as np
 
 _masked = "scipy" not in sys.modules
 if _masked:
-    # Numba imports scipy.linalg if it is installed, which takes 17 MB that no kernel here uses
+    # Numba imports scipy.linalg if SciPy is installed. The import takes 17 MB, and no kernel of the program uses it.
     sys.modules["scipy"] = None  # type: ignore[assignment]
 try:
     import numba.np.arraymath
@@ -51,7 +51,7 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 PACKAGE_ROOT: Final = Path(__file__).parents[2]
-"""Folder that contains the packages of the program."""
+"""Folder of the program's packages."""
 IDENTIFIER: Final = re.compile(r"\w+")
 """Regular expression for a name in a list of imported names."""
 IMPORT_STATEMENT: Final = re.compile(r"^ *from (monitor[\w.]*) import (?:\(([^)]*)\)|(.*))", re.MULTILINE)
@@ -59,7 +59,8 @@ IMPORT_STATEMENT: Final = re.compile(r"^ *from (monitor[\w.]*) import (?:\(([^)]
 
 
 class IntermediateLibrary(JITCodeLibrary):  # type: ignore[misc]
-    """LLVM module that is only linked into others, and neither optimised as a whole nor translated to machine code."""
+    """LLVM module that is only linked into other modules. It is neither optimised as a whole nor translated to machine
+    code."""
 
     def _optimize_final_module(self) -> None: ...
 
@@ -77,12 +78,12 @@ class IntermediateCompiler(Compiler):  # type: ignore[misc]
 
 
 def _without_machine_code(library: Any, description: Any, environment: Any) -> Any:
-    """Return a function object that identifies the compiled function inside Numba. It must never be called."""
+    """Return a placeholder object that identifies the compiled function inside Numba and must never be called."""
     library._ensure_finalized()  # noqa: SLF001
     return _dynfunc.make_function(description.lookup_module(), description.qualname, "", 0, environment, (library,))
 
 
-class Intermediate(CPUDispatcher):  # type: ignore[misc]
+class IntermediateDispatcher(CPUDispatcher):  # type: ignore[misc]
     """Dispatcher that compiles a function for calls from other kernels."""
 
     def __init__(self, function: Callable[..., Any], options: dict[str, bool | str]) -> None:
@@ -112,22 +113,25 @@ class Kernel(CPUDispatcher):  # type: ignore[misc]
             "nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "forceinline": inline,
         }  # fmt: skip
         super().__init__(function, targetoptions=options)
-        self.intermediate = Intermediate(function, options | {"no_cpython_wrapper": True})
+        self.intermediate = IntermediateDispatcher(function, options | {"no_cpython_wrapper": True})
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """Compile for a call from another kernel. Numba calls this method when it infers the types of that kernel.
 
-        A constant argument is not treated as a type of its own, so the function is compiled once for all constants.
+        Constant arguments are treated like variables of the same type, so the function is compiled once for all
+        constants.
         """
         kws = {name: types.unliteral(one) for name, one in kws.items()}
         return self.intermediate.get_call_template([types.unliteral(one) for one in args], kws)
 
     def get_overload(self, sig: Any) -> Any:
-        """Return the function that ``get_call_template`` compiled. Numba calls this to lower the calling kernel."""
+        """Return the function that ``get_call_template`` compiled. Numba calls this method to lower the calling
+        kernel."""
         return self.intermediate.get_overload(sig)
 
     def _compile_for_args(self, *args: Any, **kws: Any) -> Any:
-        """Return the function to call for these arguments. Numba calls this if no machine code for them is loaded."""
+        """Return the function to call. Numba calls this method if no machine code for the types of the arguments is
+        loaded."""
         if _interprets.get():
             return self.py_func
         return super()._compile_for_args(*args, **kws)
@@ -145,8 +149,8 @@ _interprets = ContextVar("interprets", default=False)  # each thread has its own
 def interpreted() -> Iterator[None]:
     """Run kernels that are not compiled yet in the Python interpreter, in this thread.
 
-    The results agree except for the last digit of exponentials. A call takes about a hundred times as long, but it does
-    not wait for the compiler. Compiled kernels are not affected.
+    The results agree except for the last digit of exponentials. A call takes about a hundred times as long as compiled
+    code, but need not wait for the compiler. Compiled kernels are not affected.
     """
     token = _interprets.set(True)
     try:
@@ -176,7 +180,7 @@ def compiled(function: Callable[P, R]) -> Callable[P, R]:
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """Compile a function as ``compiled`` does, and make LLVM copy it into every kernel that calls it.
 
-    This decorator is for the body of an inner loop that LLVM would not copy by itself because of its length.
+    Use this decorator for the body of an inner loop that is too long for LLVM to inline automatically.
     """
     return _cached(Kernel(function, inline=True), function)
 
@@ -186,7 +190,8 @@ def _cached(kernel: Kernel, function: Callable[P, R]) -> Callable[P, R]:
     with contextlib.suppress(RuntimeError):  # no cache folder can be written
         kernel.enable_caching()
         kept = cast("Any", kernel)._cache._cache_file  # noqa: SLF001
-        kept._source_stamp = (kept._source_stamp, source_hash(Path(inspect.getfile(function))))  # noqa: SLF001
+        # Numba compares the version before it reads the index, which may name types that no longer exist
+        kept._version = f"{kept._version} {source_hash(Path(inspect.getfile(function)))}"  # noqa: SLF001
     return cast("Callable[P, R]", kernel)
 
 

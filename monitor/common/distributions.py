@@ -23,7 +23,7 @@ MIN_ASYMPTOTIC_EDF: Final = 1000.0
 MIN_EXPANDED_EDF: Final = 30.0
 """Smallest number of degrees of freedom for which the iteration starts from the expansion.
 
-Below it, the iteration starts from the power law at zero or from Wilson and Hilferty's formula.
+With fewer degrees of freedom, the iteration starts from the power law at zero or from Wilson and Hilferty's formula.
 """
 MAX_ITERATIONS: Final = 60
 """Largest number of Halley or Newton iterations."""
@@ -74,7 +74,8 @@ def chi2_quantile(edf: Floats, probability: float) -> Floats:
     """Return the quantile of χ², which solves P(edf/2, x/2) = probability.
 
     The function uses Halley's iteration on the regularised incomplete gamma function P. The start value is accurate
-    enough for two or three steps. From MIN_ASYMPTOTIC_EDF on, the Cornish-Fisher expansion is the result.
+    enough for two or three steps. For MIN_ASYMPTOTIC_EDF degrees of freedom or more, the function returns the
+    Cornish-Fisher expansion without iteration.
 
     Parameters
     ----------
@@ -114,12 +115,13 @@ def _expanded(a: Floats, z: float) -> Floats:
 
 @lru_cache(maxsize=16)
 def _coefficients(z: float) -> tuple[float, ...]:
-    """Return y_k(z) of the gamma quantile x = a (1 + ε Σ y_k ε^k), ε = 1/√a.
+    """Return the coefficients y_k(z) of the Cornish-Fisher expansion of the gamma quantile.
 
-    The quantile x(z) of a density f satisfies x' = φ(z)/f(x), and its derivative is, for the gamma distribution,
-    (1 + εy) y'' = −z (1 + εy) y' + (ε + y) y'². Sorted by powers of ε, y_0 = z, and y_k solves
-    y_k'' − z y_k' − y_k = r_k, which has one polynomial as its solution. The first five are those of Goldberg &
-    Levine, Ann. Math. Stat. 17, 1946.
+    The expansion is x = a (1 + ε y) with y = Σ y_k ε^k and ε = 1/√a, where a is the shape and z is the normal quantile.
+    The quantile x of a density f satisfies the differential equation x' = φ(z)/f(x) with the normal density φ. For the
+    gamma distribution, the derivative of this equation is (1 + εy) y'' = −z (1 + εy) y' + (ε + y) y'². The terms of
+    equal powers of ε give y_0 = z and y_k'' − z y_k' − y_k = r_k, whose only polynomial solution is y_k. The first five
+    coefficients agree with Goldberg & Levine (Annals of Mathematical Statistics 17, 1946).
     """
     poly = np.polynomial.Polynomial
     x = poly([0.0, 1.0])
@@ -150,7 +152,8 @@ def _start(a: Floats, z: float, probability: float) -> Floats:
 def _refined(a: Floats, x: Floats, probability: float) -> Floats:
     """Return the solution x of P(a, x) = probability by Halley's iteration in ln x.
 
-    With g = ln x and h(g) = P, h' = x f(x) and h''/h' = a − x.
+    As a function of ln x, P has the first derivative x f(x) with the gamma density f. The second derivative divided by
+    the first is a − x.
     """
     logs = np.array([lgamma(one) for one in a.tolist()])
     open_ = np.flatnonzero(x > 0.0)  # x is zero if the quantile underflows
@@ -188,7 +191,8 @@ def _series(a: Floats, x: Floats) -> Floats:
 def incomplete_beta(a: float, b: float, x: Floats) -> Floats:
     """Return the regularised incomplete beta function I_x(a, b) by its continued fraction (DLMF 8.17.22).
 
-    It gives the tail of the F distribution with m and n degrees of freedom: P(F > f) = I_x(n/2, m/2), x = n/(n + m f).
+    The upper tail of the F distribution with m and n degrees of freedom is P(F > f) = I_x(n/2, m/2) with x = n/(n + m
+    f).
 
     Parameters
     ----------
@@ -243,8 +247,8 @@ def _away_from_zero(x: Floats) -> Floats:
 def student_quantile(df: int, probability: float) -> float:
     """Return the quantile of Student's distribution.
 
-    The function uses Newton's iteration on the incomplete beta function. From MIN_ASYMPTOTIC_DF on, the result is the
-    expansion of Fisher & Cornish, Technometrics 2, 1960 (Abramowitz & Stegun 26.7.5).
+    The function uses Newton's iteration on the incomplete beta function. For MIN_ASYMPTOTIC_DF degrees of freedom or
+    more, the result is the expansion of Fisher & Cornish (Abramowitz & Stegun 26.7.5).
 
     Parameters
     ----------

@@ -1,10 +1,12 @@
 """Advisory lock on a storage folder: one process at a time writes recordings there, and one writes the history.
 
-The lock is ``flock`` on a file in the folder. The kernel releases the lock when its holder ends, in whatever way. The
-file is never deleted. It holds the process id and the host of the holder, for messages. Readers need no lock.
+The lock is ``flock`` on a file in the folder. The operating system releases the lock when the process that holds the
+lock ends. The file is never deleted. It contains the process id and the host of the holder, for messages. Readers need
+no lock.
 
-``hold`` takes the lock, or checks that it is still held. If the folder or the lock file is deleted or replaced, the
-lock is lost. The file descriptor is closed when another program is executed, so hooks and viewers do not inherit it.
+``hold`` takes the lock, or checks that this process still holds the lock. If the folder or the lock file is deleted or
+replaced, the lock is lost. The file descriptor is closed when another program is executed, so hooks and viewers do not
+inherit it.
 """
 
 import contextlib
@@ -17,7 +19,7 @@ import time
 from pathlib import Path
 from typing import Final
 
-from drivers.file_access import FILE_KINDS, check_folder
+from drivers.file_access import FILE_KINDS, check_folder_or_absent
 
 RECORDING_LOCK: Final = "recording.lock"
 """Name of the lock file for recordings."""
@@ -26,13 +28,13 @@ HISTORY_LOCK: Final = "history.lock"
 LOCKS_UNSUPPORTED_ERRNOS: Final = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOTSUP, errno.EINVAL)
 """Error numbers of ``flock`` on a file system without locks."""
 RETRY_S: Final = 0.05
-"""Pause before the second attempt, because ``doctor`` holds the lock for a moment while it looks for the holder."""
+"""Pause before the second attempt, because the command ``doctor`` briefly holds the lock during its check."""
 HOLDER_BYTES: Final = 300
 """Largest length of the text about the holder in the lock file."""
 
 
 class FolderLock:
-    """Lock on one kind of content of a folder.
+    """Lock of a folder for one purpose: recordings or history.
 
     Parameters
     ----------
@@ -46,11 +48,11 @@ class FolderLock:
         self.folder = folder
         self.path = folder / name
         self.warning = ""
-        """Message if the file system has no locks, and the folder is used without a lock; else empty."""
+        """Message if the file system does not support locks, so that the folder is used without a lock; else empty."""
         self._descriptor: int | None = None
 
     def hold(self) -> str:
-        """Take the lock, or check that it is still held. Does not wait for its holder.
+        """Take the lock, or check that this process still holds it. The method does not wait for another holder.
 
         Returns
         -------
@@ -66,7 +68,7 @@ class FolderLock:
             if self._in_place(self._descriptor):
                 return ""
             self.release()
-        check_folder(self.folder)
+        check_folder_or_absent(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         descriptor = _open_lock_file(self.path)
         try:
@@ -86,7 +88,7 @@ class FolderLock:
         return self._descriptor is not None
 
     def release(self) -> None:
-        """Release the lock; the file stays."""
+        """Release the lock. The lock file is not deleted."""
         descriptor, self._descriptor = self._descriptor, None
         if descriptor is not None:
             os.close(descriptor)

@@ -8,7 +8,7 @@ from typing import Final
 from monitor.common.units import format_count
 
 MAX_PROBLEMS: Final = 3
-"""Largest number of problems in the sentence."""
+"""Largest number of problems in the status line."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -56,7 +56,7 @@ def minimize_bfgs(
         direction = -inverse @ slope
         if not slope @ direction < 0.0:
             inverse, direction = np.eye(x.size), -slope
-        # the length of the first direction is that of the gradient, which does not show the distance to the minimum
+        # the first direction has the length of the gradient, which is unrelated to the distance to the minimum
         first = 1.0 if iteration else min(1.0, 1.0 / float(np.linalg.norm(slope)))
         found = _line_search(function, x, value, slope, direction, first)
         if found is None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 ENDPOINT: Final = "tcp/127.0.0.1:7450"
-"""Default address on which a daemon listens. It is not port 7447, which the router of ROS 2 uses."""
+"""Default address on which a daemon listens. Port 7447 is avoided, because the zenoh router of ROS 2 uses it."""
 JSON: Final = "application/json"
 MSGPACK: Final = "application/msgpack"
 

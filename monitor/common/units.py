@@ -1,8 +1,8 @@
 """Units of inertial navigation, and the formatting of quantities, durations and counts as text.
 
-The program computes in SI units (rad, m, s). Only text for people has other units, and only this module converts to
-them. The factors follow from 1 rad = 180/π °, 1 h = 3600 s (√h = 60 √s) and 1 g = 9.80665 m/s² (standard gravity, CGPM
-1901).
+The program computes in SI units (rad, m, s). Terminal output and figures use the customary units of inertial
+navigation. Only this module converts SI units to customary units. The factors follow from 1 rad = 180/π °, 1 h = 3600 s
+(√h = 60 √s) and 1 g = 9.80665 m/s² (standard gravity, CGPM 1901).
 """
 
 import math
@@ -12,7 +12,7 @@ from typing import Final, Literal
 
 import numpy as np
 
-from drivers.quantities import DAY_S, HOUR_S
+from drivers.number_ranges import DAY_S, HOUR_S
 from drivers.sample import AXES
 from drivers.units import G0
 
@@ -33,7 +33,7 @@ DURATION_UNITS: Final = ((DAY_S, "d"), (HOUR_S, "h"), (60, "min"), (1, "s"))
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """Unit of the field with its name and its factor: a value in SI units times ``factor`` is a value in this unit."""
+    """Customary unit: a value in SI units times ``factor`` is a value in this unit."""
 
     factor: float
     name: str
@@ -72,15 +72,15 @@ COEFFICIENT_UNITS: Final[dict[Kind, dict[str, Unit]]] = {
         "R": Unit(MICRO_G * HOUR_S, "µg/h"),
     },
 }
-"""Field unit of each noise coefficient, for gyroscopes and accelerometers."""
+"""Customary unit of each noise coefficient, for gyroscopes and accelerometers."""
 
 DEVIATION_UNITS: Final[dict[Kind, Unit]] = {
     "gyro": Unit(DEGREE * HOUR_S, "°/h"),
     "accel": Unit(MICRO_G, "µg"),
 }
-"""Field unit of Allan deviations."""
+"""Customary unit of Allan deviations."""
 SAMPLE_UNITS: Final[dict[Kind, Unit]] = {"gyro": Unit(DEGREE, "°/s"), "accel": Unit(1.0, "m/s²")}
-"""Field unit of samples."""
+"""Customary unit of samples."""
 
 COEFFICIENT_NAMES: Final[dict[Kind, dict[str, str]]] = {
     "gyro": {
@@ -107,12 +107,12 @@ def sensor_kind(axis: str) -> Kind:
 
 
 def axes_of(kind: Kind) -> tuple[str, ...]:
-    """Return the axes x, y, z of a kind of sensor."""
+    """Return the three axes of a kind of sensor."""
     return AXES[:3] if kind == "gyro" else AXES[3:]
 
 
 def unit_of(letter: str, axis: str) -> Unit:
-    """Return the field unit of a noise coefficient.
+    """Return the customary unit of a noise coefficient.
 
     Parameters
     ----------

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import structlog
 
 from monitor.daemon.device.device_worker import DeviceWorker
-from monitor.daemon.operations.live_reconcile import Job, Reconciler
-from monitor.publishing.messages.results import ResetMessage
+from monitor.daemon.operations.reconcile_on_request import Job, Reconciler
+from monitor.publishing.messages.results import ResetReply
 from monitor.publishing.zenoh.publisher import Command, ZenohPublisher
 
 _log = structlog.get_logger("imu-monitor")
@@ -40,7 +40,7 @@ class CommandHandler:
             if command.device in workers:
                 self._execute(command, workers[command.device])
             else:
-                command.refuse("the device was removed from the configuration")
+                command.reply_refusal("the device was removed from the configuration")
 
     def publish_reconciled(self, workers: Mapping[str, DeviceWorker]) -> None:
         """Publish an event for each reconciliation that has finished since the last call.
@@ -50,7 +50,7 @@ class CommandHandler:
         workers : mapping of str to DeviceWorker
             Worker of each device by its name.
         """
-        for finished in self._reconciler.take():
+        for finished in self._reconciler.take_finished():
             if finished.device in workers:
                 workers[finished.device].publish_event("reconciled", finished.text)
 
@@ -62,20 +62,20 @@ class CommandHandler:
         """Execute one command for a device, and answer it."""
         match command.verb:
             case "reset":
-                worker.reset()
+                worker.empty_window()
                 now_s, received = worker.timeline.now_unix_s(), worker.driver.counts.received
-                command.answer(ResetMessage.of(worker.name, now_s, received, "the window is empty").encode())
+                command.reply_result(ResetReply.of(worker.name, now_s, received, "the window is empty").encode())
                 _log.info("reset", device=worker.name)
             case "reconcile":
                 self._reconcile(command, worker)
             case other:
-                command.refuse(f'unknown command "{other}"; known commands are reset and reconcile')
+                command.reply_refusal(f'unknown command "{other}"; known commands are reset and reconcile')
 
     def _reconcile(self, command: Command, worker: DeviceWorker) -> None:
         """Start a reconciliation with a copy of the window; a thread of its own sends the answer."""
-        window = worker.window_snapshot()
+        window = worker.copy_window_and_temperature()
         if window is None:
-            command.refuse("no samples yet")
+            command.reply_refusal("no samples yet")
             return
         received, device = worker.driver.counts.received, worker.device
         newest_s = worker.timeline.unix_s(worker.pipeline.newest_ns)

@@ -7,92 +7,48 @@ from monitor.common.health import Health
 
 
 class Output:
-    """Receiver of the results of the devices; a subclass overrides the methods for the results that it uses.
+    """Receiver of the results of the devices. A subclass overrides the methods for the results that it publishes.
 
-    No method may block. Every ``unix_s`` is a time in seconds on the timeline of the device's own samples. A recording,
-    or a device that stamps its samples itself, may be years away from the host clock, so its timeline is unknown before
-    its first sample. Until then no event is passed on, and ``health`` receives None as time.
+    No method may block. All times are on the timeline of the samples of the device. The samples of a recording, or of a
+    device with its own time stamps, may be years away from the host clock, so this timeline is unknown before the first
+    sample. Until then, no event is published.
 
-    Several methods have the same parameters. ``device`` is the name of the device. ``received`` is the number of
-    samples of the device since the start, up to the result.
+    Parameters
+    ----------
+    device : str
+        Parameter of all methods: name of the device.
+    unix_s : float
+        Parameter of most methods: Unix time of the result in seconds.
+    received : int
+        Parameter of most methods: number of samples of the device up to the result, since the start.
+    samples : SampleBlock
+        Parameter of two methods: samples in SI units, with times in nanoseconds.
+    offset_ns : array of int64, shape (n,), or int
+        Parameter of two methods: difference of Unix time and the times of the samples, in nanoseconds.
     """
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
-        """Receive a block of samples.
+    def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
+        """Publish a block of samples."""
 
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        received : int
-            Number of samples of the device up to the end of this block, since the start.
-        samples : SampleBlock
-            Samples in SI units, with times in nanoseconds.
-        offset_ns : array of int64, shape (n,), or int
-            Offset that converts the times to Unix time, in nanoseconds.
+    def publish_compensated_samples(
+        self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int
+    ) -> None:
+        """Publish a block of samples without the drift of the gyroscopes."""
+
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        """Publish a result of one of the kinds in ``monitor.publishing.result_kinds``.
+
+        ``unix_s`` is the time of the newest sample in the window, or of the end of the interval of the result.
         """
 
-    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        """Receive a result of one of the kinds in ``monitor.publishing.result_kinds``.
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """Publish an event of the device."""
 
-        Estimates arrive at the configured rate. A device without a model in force has no ``ModelGap``, and a device
-        without a thermal model has no ``ThermalUpdate``. A ``DriftUpdate`` arrives every second of drift compensation.
-        ``SlowStatistics`` arrive when their step by step computation is complete.
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
+        """Publish the status of the device, once a second.
 
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float
-            Time of the result: of the newest sample in the window, or of the end of the interval.
-        received : int
-            Number of samples of the device since the start.
-        result : object
-            The result.
+        ``unix_s`` is the present time on the timeline of the samples; None while this timeline is unknown.
         """
 
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
-        """Receive a block of samples without the drift of the gyroscopes.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        received : int
-            Number of samples of the device up to the end of this block, since the start.
-        samples : SampleBlock
-            Compensated samples in SI units, with times in nanoseconds.
-        offset_ns : array of int64, shape (n,), or int
-            Offset that converts the times to Unix time, in nanoseconds.
-        """
-
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        """Receive an event of the device.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float
-            Time of the event.
-        received : int
-            Number of samples of the device since the start.
-        event : Event
-            Kind, axis and text of the event.
-        """
-
-    def health(self, device: str, unix_s: float | None, health: Health) -> None:
-        """Receive the status of the device, once a second.
-
-        Parameters
-        ----------
-        device : str
-            Name of the device.
-        unix_s : float or None
-            Present time on the device's timeline; None while it is unknown.
-        health : Health
-            Status of the device.
-        """
-
-    def device_removed(self, device: str) -> None:
-        """Forget a device that was removed from the configuration. A device with the same name may be added later."""
+    def remove_device(self, device: str) -> None:
+        """Remove the data of a device that is no longer configured. A device with the same name may be added later."""

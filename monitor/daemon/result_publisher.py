@@ -77,13 +77,13 @@ class ResultPublisher:
         self._batch: list[SampleBlock] = []  # samples that were taken and not published yet
         self._refitted = False  # True if the fit was updated since the last publication
 
-    def events(self, events: Sequence[Event]) -> None:
+    def publish_events(self, events: Sequence[Event]) -> None:
         """Publish events."""
         for event in events:
             for output in self.outputs:
-                output.event(self.device.name, self._unix_s(event.t_ns), self._received, event)
+                output.publish_event(self.device.name, self._unix_s(event.t_ns), self._received, event)
 
-    def samples(self, blocks: Sequence[SampleBlock]) -> bool:
+    def publish_samples_if_due(self, blocks: Sequence[SampleBlock]) -> bool:
         """Collect new samples, and publish the collected batch if it is due; return True if it was published."""
         self._batch += blocks
         interval_s = min(self.device.publish_s, MAX_BATCH_S)
@@ -95,12 +95,12 @@ class ResultPublisher:
             self.published += len(samples)
             offsets_ns = self.timeline.offsets_ns(samples)
             for output in self.outputs:
-                output.samples(self.device.name, self.published, samples, offsets_ns)
+                output.publish_samples(self.device.name, self.published, samples, offsets_ns)
             if compensation is not None and np.isfinite(samples.values[:, :3]).any():
                 self._compensated(compensation, samples)
         return True
 
-    def estimate(self) -> bool:
+    def publish_estimate_if_due(self) -> bool:
         """Update the fit and publish the estimate if they are due; return True if the estimate was published."""
         self._refit()
         if self.latest is None or not self._refitted or not self.schedule.claim("publish", self.device.publish_s):
@@ -109,10 +109,10 @@ class ResultPublisher:
         self._result(self.latest.t_ns, self.latest)
         if self.pipeline.model_in_force is not None:
             self._model_gap(self.pipeline.model_in_force.compare(self.latest))
-        self.events(self.limits.update(self.latest))
+        self.publish_events(self.limits.check_estimate(self.latest))
         return True
 
-    def slow_statistics(self) -> None:
+    def advance_total_and_hadamard(self) -> None:
         """Compute one step of the total and Hadamard deviations, and publish them when they are complete."""
         estimator = self.pipeline.estimator
         if estimator is None or not self.pipeline.ready.all.is_set() or not self.schedule.is_due("total"):
@@ -124,7 +124,7 @@ class ResultPublisher:
         if deviations is not None:
             self._result(self.pipeline.newest_ns, SlowStatistics(*deviations))
 
-    def thermal_intervals(self) -> None:
+    def publish_thermal_intervals(self) -> None:
         """Publish the thermal intervals that were completed since the last call."""
         for interval in self.pipeline.take_thermal_intervals():
             self._result(interval.t_ns, interval)
@@ -139,7 +139,7 @@ class ResultPublisher:
     def _result(self, t_ns: int, result: Any) -> None:
         """Publish a result that belongs to the host time ``t_ns``."""
         for output in self.outputs:
-            output.result(self.device.name, self._unix_s(t_ns), self._received, result)
+            output.publish_result(self.device.name, self._unix_s(t_ns), self._received, result)
 
     def _compensated(self, live: LiveCompensation, samples: SampleBlock) -> None:
         """Publish the samples without gyroscope drift, and the state of the drift compensation."""
@@ -151,8 +151,10 @@ class ResultPublisher:
             self.pipeline.update_drift_models()
             offsets_ns = self.timeline.offsets_ns(compensated)
             for output in self.outputs:
-                output.compensated(self.device.name, self.published - len(samples) + at, compensated, offsets_ns)
-        for drift in live.take():
+                output.publish_compensated_samples(
+                    self.device.name, self.published - len(samples) + at, compensated, offsets_ns
+                )
+        for drift in live.take_updates():
             self._result(drift.t_ns, drift)
 
     def _refit(self) -> None:
@@ -163,13 +165,13 @@ class ResultPublisher:
         pipeline = self.pipeline
         if pipeline.estimator is None or not pipeline.advanced or not self.schedule.claim("refit", interval_s):
             return
-        fitted = pipeline.can_fit
+        fitted = pipeline.fit_kernels_ready
         pipeline.advanced = not fitted  # a curve without coefficients is fitted as soon as the kernels are ready
         try:
             latest = pipeline.estimator.get(fitted=fitted)
         except NotReady:
             return
-        if pipeline.fits_slowly:
+        if pipeline.fit_is_interpreted:
             self.schedule.postpone("refit", INTERPRETED_REFIT_S)
         self.latest = latest.without_coefficients() if self.withholds_coefficients else latest
         self._refitted = True
@@ -181,4 +183,4 @@ class ResultPublisher:
         events = self._agreement.update(gap)
         gap = replace(gap, agrees=self._agreement.decisions)
         self._result(gap.t_ns, gap)
-        self.events(events)
+        self.publish_events(events)

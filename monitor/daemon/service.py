@@ -1,15 +1,16 @@
-"""Main service of the daemon: starts the device workers and outputs, runs the main loop, and stops in order.
+"""Main service of the daemon: starts the device workers and outputs, runs the main loop, and stops.
 
-In each round, ``Service.loop`` calls every device worker. The worker takes the new samples, updates its estimate and
-publishes the results. Between two rounds the loop sleeps until a reader thread has pushed samples.
+In each round, ``Service.loop`` calls every device worker. The worker takes the new samples, updates the estimate and
+publishes the results. Between two rounds, the loop sleeps until a reader thread has pushed samples.
 
-An output that cannot start, or that does not keep up, is reported in the status of every device. Sampling continues.
-Under systemd, readiness is signalled as soon as a start of every output has been attempted.
+If an output cannot start or is too slow, the status of every device reports this problem, and sampling continues.
+systemd receives the readiness message as soon as the service has tried to start every output.
 
-The service stops in three steps: it stops the readers, processes and publishes the samples that are left in the ring
-buffers, and closes the outputs.
+To stop, the service first stops the readers. It then processes and publishes the samples that are left in the ring
+buffers, and finally closes the outputs.
 """
 
+import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -25,16 +26,16 @@ from monitor.common.health import Health, format_service_status
 from monitor.daemon import reload
 from monitor.daemon.command_handler import CommandHandler
 from monitor.daemon.device.device_worker import DeviceWorker
+from monitor.daemon.history_output import HistoryOutput
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.operations.hooks import Hooks
-from monitor.daemon.operations.live_reconcile import Reconciler
 from monitor.daemon.operations.log_level import set_log_level
+from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.output import Output
-from monitor.daemon.outputs import TableOutput, ViewerOutput, ZenohOutput
+from monitor.daemon.output_classes import TableOutput, ViewerOutput, ZenohOutput
 from monitor.daemon.reload import ConfigChange
-from monitor.daemon.storage.recorder import Recorder, origin
-from monitor.daemon.stored_history import StoredHistory
+from monitor.daemon.storage.recorder import Recorder, segment_metadata
 from monitor.history.reading import HistoryTable
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.terminal.queued_writer import QueuedWriter
@@ -44,7 +45,6 @@ from monitor.settings.loading import Config, Device, Storage, VirtualTable
 if TYPE_CHECKING:
     from monitor.daemon.operations.metrics import MetricsOutput
     from monitor.publishing.rerun.view import RerunView
-    from monitor.simulator import VirtualImu
 
 MAX_IDLE_S: Final = 0.05
 """Longest sleep of the main loop if no samples arrive."""
@@ -63,7 +63,7 @@ _log = structlog.get_logger("imu-monitor")
 
 
 class Service:
-    """Service that runs all configured devices and outputs.
+    """Service of all configured devices and outputs.
 
     Parameters
     ----------
@@ -74,9 +74,9 @@ class Service:
     reconciler : Reconciler, optional
         Executes ``command/reconcile``. By default a new ``Reconciler``.
     unit : SystemdNotifier, optional
-        Notifies systemd. By default nothing is sent.
+        Sends messages to systemd. By default no message is sent.
     writers : mapping of str to QueuedWriter, optional
-        Text outputs by name, such as "terminal" and "log". Their states become part of the status.
+        Text outputs by name, such as "terminal" and "log". The status contains the states of these outputs.
 
     Raises
     ------
@@ -100,14 +100,11 @@ class Service:
         self._ready = KernelReadiness()
         self._stop = threading.Event()
         self._reload_asked = False
-        self.virtual: dict[str, VirtualImu] = {}
         self.recorder = _build_recorder(config)
         self.outputs: list[Output] = []
-        self.workers: list[DeviceWorker] = []
-        for device in config.devices:
-            self._register_device(*self._build_device(device))
+        self.workers = [self._build_worker(device) for device in config.devices]
         storage = config.storage
-        self.history = StoredHistory(storage.folder) if storage is not None and storage.history else None
+        self.history = HistoryOutput(storage.folder) if storage is not None and storage.history else None
         answer_query = None if self.history is None else self.history.answer_query
         self.zenoh = ZenohPublisher(config.zenoh, [worker.name for worker in self.workers], answer_query)
         self._commands = CommandHandler(self.zenoh, reconciler or Reconciler())
@@ -121,25 +118,25 @@ class Service:
         if self.viewer is not None:
             self.outputs.append(ViewerOutput(self.viewer))
         if self.history is not None:
-            self.outputs.append(self.history.output)
+            self.outputs.append(self.history)
 
-    def stop(self) -> None:
-        """Request the end of the main loop. May be called from any thread."""
+    def request_stop(self) -> None:
+        """Request the end of the main loop. Any thread may call this method."""
         self._stop.set()
         self._wake.set()
 
-    def reload(self) -> None:
-        """Request that the main loop reads the configuration file again. May be called from any thread."""
+    def request_reload(self) -> None:
+        """Request that the main loop reads the configuration file again. Any thread may call this method."""
         self._reload_asked = True
         self._wake.set()
 
     def run(self, seconds: float | None = None) -> None:
-        """Start the service, run the main loop, and stop in order.
+        """Start the service, run the main loop, and stop the service.
 
         Parameters
         ----------
         seconds : float, optional
-            Duration in seconds. By default the service runs until ``stop`` is called or all replays have ended.
+            Duration in seconds. By default the service runs until ``request_stop`` is called or all replays have ended.
         """
         threading.Thread(target=self._ready.compile, args=(self._wake,), name="warm-up", daemon=True).start()
         try:
@@ -153,8 +150,6 @@ class Service:
         for output in (self.history, self.zenoh, self.metrics, self.viewer):
             if output is not None:
                 output.start()
-        for imu in self.virtual.values():
-            imu.start()
         for worker in self.workers:
             worker.start()
         if self.recorder is not None:
@@ -162,14 +157,14 @@ class Service:
             threading.Thread(target=self._rebuild_windows, args=(self.workers,), name="rebuild", daemon=True).start()
 
     def loop(self, until_s: float | None) -> None:
-        """Run rounds over all devices, and publish the status once a second.
+        """Process the samples of all devices in rounds, and publish the status once a second.
 
-        The loop ends when ``stop`` is called, when all replays have ended, or at the given time.
+        The loop ends when ``request_stop`` is called, when all replays have ended, or at the given time.
 
         Parameters
         ----------
         until_s : float or None
-            End of the loop on the monotonic clock, in seconds. None sets no end.
+            End of the loop on the monotonic clock, in seconds; None for no end.
         """
         status_s = 0.0
         while not self._stop.is_set():
@@ -183,7 +178,7 @@ class Service:
                 self._publish_status()
             if until_s is not None and now_s >= until_s:
                 return
-            if all(worker.ended for worker in self.workers):
+            if all(worker.replay_finished for worker in self.workers):
                 return
             if self._reload_asked:
                 self._reload_asked = False
@@ -194,12 +189,12 @@ class Service:
                 self._stop.wait(ROUND_PAUSE_S)
 
     def _work_devices(self, now_s: float) -> None:
-        """Process the new samples of every device, and announce on zenoh which devices are running."""
+        """Process the new samples of every device, and announce the running devices on zenoh."""
         for worker in self.workers:
-            worker.work(now_s)
+            worker.process_new_samples(now_s)
             self.zenoh.set_alive(worker.name, worker.driver.state == "running")
 
-    def states(self) -> dict[str, str]:
+    def output_states(self) -> dict[str, str]:
         """Return the state of each output by its name: "ok", or a text that describes the problem."""
         outputs = {
             "zenoh": self.zenoh,
@@ -215,8 +210,8 @@ class Service:
     def _read_viewer_history(self, device: str) -> HistoryTable | None:
         """Return the stored results that the viewer shows when it opens, or None if there are none.
 
-        The thread of the viewer calls this function. A device whose samples bring their own times, such as a replayed
-        recording, has no stored results.
+        The thread of the viewer calls this function. For a device with its own time stamps, such as a replayed
+        recording, the function returns None.
         """
         history_s = self.config.viewer.history
         self_timed = any(worker.name == device and worker.driver.times_are_unix for worker in self.workers)
@@ -229,32 +224,26 @@ class Service:
         """Rebuild the windows of devices from their recordings, as soon as all kernels are compiled."""
         self._ready.all.wait()
         for worker in workers:
-            worker.rebuild()
+            worker.rebuild_window()
 
-    def _build_device(self, device: Device) -> "tuple[DeviceWorker, VirtualImu | None]":
-        """Build the worker of a device, and its virtual IMU if the device is simulated, without opening either."""
-        link, imu = device.link, None
+    def _build_worker(self, device: Device) -> DeviceWorker:
+        """Build the worker of a device, with the simulated sensor if there is one, without opening anything."""
+        link, simulated = device.link, None
         if isinstance(link, VirtualTable):
-            from monitor.simulator import VirtualImu
+            from monitor.simulator import SimulatedDevice
 
-            imu = VirtualImu(link, device.decoder, device.name)
-            link = imu.link
-        return DeviceWorker(device, link, self.outputs, self._wake, self._ready, self.recorder), imu
-
-    def _register_device(self, worker: DeviceWorker, imu: "VirtualImu | None") -> None:
-        """Add a worker, and its virtual IMU if the device is simulated, to the service."""
-        self.workers = [*self.workers, worker]
-        if imu is not None:
-            self.virtual[worker.name] = imu
+            simulated = SimulatedDevice(link, device.decoder, device.name)
+            link = simulated.link
+        return DeviceWorker(device, link, self.outputs, self._wake, self._ready, self.recorder, simulated)
 
     # --- reload of the configuration
 
     def _reload(self) -> None:
-        """Read the configuration file again and apply the changes; with any mistake in the file, change nothing."""
+        """Read the configuration file again and apply the changes. A file with a mistake changes nothing."""
         self._unit.reloading()
         try:
             change = reload.compare_with_file(self.config, {worker.name: worker.model for worker in self.workers})
-            built = [self._build_device(device) for device in change.added]
+            built = [self._build_worker(device) for device in change.added]
         except ConfigError as error:
             _log.error("not reloaded, the running configuration stays in force", error=str(error))
         else:
@@ -263,11 +252,11 @@ class Service:
         if self._unit.ready_sent:
             self._unit.ready()
 
-    def _apply(self, change: ConfigChange, built: "Sequence[tuple[DeviceWorker, VirtualImu | None]]") -> None:
-        """Apply the changes of a configuration: stop removed devices, exchange limits, and start added devices."""
+    def _apply(self, change: ConfigChange, built: Sequence[DeviceWorker]) -> None:
+        """Stop the removed devices, replace the changed limits, and start the added devices."""
         leaving = [worker for worker in self.workers if worker.name in change.removed]
         for worker in leaving:
-            worker.stop()  # all devices stop side by side, because each may take a moment
+            worker.stop()  # all readers stop at the same time, because each may take a moment
         for worker in leaving:
             self._remove(worker)
         for device in change.limited:
@@ -275,43 +264,37 @@ class Service:
         self.config = change.config
         self.hooks.hooks = change.config.hooks
         set_log_level(change.config.log.level)
-        for worker, imu in built:
-            self._register_device(worker, imu)
         order = [device.name for device in change.config.devices]
-        self.workers = sorted(self.workers, key=lambda worker: order.index(worker.name))
+        self.workers = sorted([*self.workers, *built], key=lambda worker: order.index(worker.name))
         if self.viewer is not None:
             self.viewer.set_devices(_device_infos(change.config.devices))
-        for worker, imu in built:
-            self._add(worker, imu)
+        for worker in built:
+            self._start_added(worker)
 
-    def _add(self, worker: DeviceWorker, imu: "VirtualImu | None") -> None:
+    def _start_added(self, worker: DeviceWorker) -> None:
         """Start an added device while the other devices continue."""
-        self.zenoh.add(worker.name)
+        self.zenoh.add_device(worker.name)
         if self.recorder is not None:
-            self.recorder.add(_segment_origins(self.config.storage, worker.device))
-        if imu is not None:
-            imu.start()
+            self.recorder.add_recordings(_segment_origins(self.config.storage, worker.device))
         worker.start()
         if self.recorder is not None:
             threading.Thread(target=self._rebuild_windows, args=([worker],), name="rebuild", daemon=True).start()
 
     def _remove(self, worker: DeviceWorker) -> None:
         """Remove a stopped device and publish its remaining samples, while the other devices continue."""
-        if worker.name in self.virtual:
-            self.virtual.pop(worker.name).stop()
         if not self._work_until(lambda: worker.join(0.0) and not worker.restore.active):
             _log.warning("reader did not end in time", device=worker.name)
-        worker.work(time.monotonic(), drain=True)
+        worker.process_new_samples(time.monotonic(), drain=True)
         self.workers = [one for one in self.workers if one is not worker]
-        self.zenoh.remove(worker.name)
+        self.zenoh.remove_device(worker.name)
         if self.recorder is not None:
-            self.recorder.remove(worker.name)
+            self.recorder.remove_device(worker.name)
             self._work_until(lambda: self.recorder is None or not self.recorder.is_recording(worker.name))
         for output in self.outputs:
-            output.device_removed(worker.name)
+            output.remove_device(worker.name)
 
     def _work_until(self, done: Callable[[], bool]) -> bool:
-        """Process all devices until ``done`` returns True, or for JOIN_TIMEOUT_S; return its last result."""
+        """Process all devices until ``done`` returns True, or for JOIN_TIMEOUT_S; return the last value of ``done``."""
         until_s = time.monotonic() + JOIN_TIMEOUT_S
         while not (ended := done()) and time.monotonic() < until_s:
             self._work_devices(time.monotonic())
@@ -323,13 +306,13 @@ class Service:
     def _publish_status(self) -> None:
         """Publish the status of all devices, and notify systemd."""
         self._publish_recorder_events()
-        states, memory = self.states(), memory_bytes()
+        states, memory = self.output_states(), _measure_memory_bytes()
         self._announce_viewer_url()
-        healths = {worker.name: worker.publish_status(states, memory) for worker in self.workers}
+        healths = {worker.name: worker.slew_and_publish_status(states, memory) for worker in self.workers}
         self._notify_systemd(healths, states)
 
     def _notify_systemd(self, healths: Mapping[str, Health], states: Mapping[str, str]) -> None:
-        """Notify systemd of readiness, of the overall status, and that the reader threads make progress."""
+        """Send the readiness, the overall status and the watchdog message to systemd."""
         now_s = time.monotonic()
         tried = (
             not any(state in STARTING_STATES for state in states.values()) or now_s - self._started_s > READY_TIMEOUT_S
@@ -341,7 +324,7 @@ class Service:
         self._unit.status(format_service_status(healths, states, stuck))
 
     def _publish_recorder_events(self) -> None:
-        """Publish the events of the recorder."""
+        """Publish the events of the recorder as events of the devices."""
         workers = {worker.name: worker for worker in self.workers}
         for event in self.recorder.take_events() if self.recorder is not None else ():
             if event.device in workers:
@@ -358,7 +341,7 @@ class Service:
             _log.info("viewer", url=page)
         for output in self.outputs:
             if isinstance(output, TableOutput):
-                output.viewer_at(page)
+                output.set_viewer_url(page)
 
     def _close(self) -> None:
         """Stop the devices, publish their remaining samples, and close all outputs."""
@@ -373,20 +356,18 @@ class Service:
                     output.close()
 
     def _drain(self) -> None:
-        """Stop the readers, and publish the samples that are left in the ring buffers."""
+        """Stop the readers, and publish the samples that are still in the ring buffers."""
         for worker in self.workers:
             worker.stop()
         if any(worker.waits_for_all for worker in self.workers):
             self._ready.all.wait()  # the samples of these devices are still in the ring buffer
-        for imu in self.virtual.values():
-            imu.stop()
         for worker in self.workers:
             until_s = time.monotonic() + JOIN_TIMEOUT_S
             while not (ended := worker.join(ROUND_PAUSE_S)) and time.monotonic() < until_s:
-                worker.work(time.monotonic())  # a replay waits for space in its ring buffer
+                worker.process_new_samples(time.monotonic())  # a replay waits for space in its ring buffer
             if not ended:
                 _log.warning("reader did not end in time", device=worker.name)
-            worker.work(time.monotonic(), drain=True)
+            worker.process_new_samples(time.monotonic(), drain=True)
             self.zenoh.set_alive(worker.name, False)
         self._publish_status()
 
@@ -402,23 +383,21 @@ def _segment_origins(storage: Storage | None, device: Device) -> list[SegmentMet
     """Return the recordings to write for a device: samples, raw bytes, both, or none for a replay."""
     if storage is None or isinstance(device.link, ReplayLink):
         return []
-    origins = [origin(device.name, device.axes)] if storage.record else []
-    return origins + ([origin(device.name, device.axes, "raw", device.decoder.carrier)] if storage.raw else [])
+    origins = [segment_metadata(device.name, device.axes)] if storage.record else []
+    return origins + (
+        [segment_metadata(device.name, device.axes, "raw", device.decoder.carrier)] if storage.raw else []
+    )
 
 
-def memory_bytes() -> int:
+def _measure_memory_bytes() -> int:
     """Return the resident memory of this process, in bytes."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text("ascii").split()[1])
-    except OSError:  # outside Linux only the peak is available
-        import resource
-        import sys
+    import resource  # missing on Windows
 
+    try:
+        return int(Path("/proc/self/statm").read_text("ascii").split()[1]) * resource.getpagesize()
+    except OSError:  # outside Linux only the peak is available
         peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         return peak if sys.platform == "darwin" else peak * 1024
-    import resource
-
-    return pages * resource.getpagesize()
 
 
 def _build_metrics_output(config: Config) -> "MetricsOutput | None":
@@ -431,7 +410,7 @@ def _build_metrics_output(config: Config) -> "MetricsOutput | None":
 
 
 def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) -> "RerunView | None":
-    """Return the Rerun view, or None if the viewer is switched off."""
+    """Return the Rerun view, or None if the viewer is off."""
     if config.viewer.mode == "none":
         return None
     from monitor.publishing.rerun.view import RerunView
@@ -443,19 +422,14 @@ def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) ->
 
 
 def _device_infos(devices: Sequence[Device]) -> list[DeviceInfo]:
-    """Return what the viewer needs to know about each device."""
+    """Return the descriptions of the devices for the viewer."""
     return [
         DeviceInfo(
             device.name,
-            _source_description(device),
+            "simulated" if isinstance(device.link, VirtualTable) else device.link.name,
             device.model is not None,
             device.thermal_s is not None,
             device.compensate,
         )
         for device in devices
     ]
-
-
-def _source_description(device: Device) -> str:
-    """Return a short description of the source of a device's samples."""
-    return "simulated" if isinstance(device.link, VirtualTable) else device.link.name

@@ -30,14 +30,16 @@ class SlewedClock:
     >>> clock = SlewedClock(monotonic_ns=5_000_000_000, unix_ns=1_700_000_000_000_000_000)
     >>> clock.unix_ns(6_000_000_000)
     1700000001000000000
-    >>> clock.slew_to(6_000_000_000, 1_700_000_003_000_000_000)   # the host clock was set forward by 2 s
+    >>> clock.slew_and_return_host_step(6_000_000_000, 1_700_000_003_000_000_000)  # set forward by 2 s
     2000000000
     >>> clock.unix_ns(7_000_000_000)
     1700000002000500000
     """
 
     def __init__(self, monotonic_ns: int, unix_ns: int) -> None:
-        self._host_ns = unix_ns - monotonic_ns  # offset of the host clock at the last call of ``slew_to``
+        self._host_ns = (
+            unix_ns - monotonic_ns
+        )  # offset of the host clock at the last call of ``slew_and_return_host_step``
         self._slewed_at_ns = monotonic_ns
         # [n, 3] start of each correction, offset at the start, and remaining correction. The array is replaced, never
         # changed in place, because the reader threads use it as well.
@@ -48,7 +50,7 @@ class SlewedClock:
         """Time by which the slewed Unix time is behind the host clock, in nanoseconds."""
         return self._host_ns - self.offset_ns(self._slewed_at_ns)
 
-    def slew_to(self, monotonic_ns: int, unix_ns: int) -> int:
+    def slew_and_return_host_step(self, monotonic_ns: int, unix_ns: int) -> int:
         """Start to slew towards the host clock. Call this about once a second.
 
         Returns

@@ -16,8 +16,8 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ConfigError, NotReady, RecordingError
-from drivers.quantities import RATE_HZ
-from drivers.sample import AXES, NS_PER_S, Floats, Ints, SampleBlock, SenderTiming
+from drivers.number_ranges import RATE_HZ
+from drivers.sample import AXES, NS_PER_S, Floats, Ints, SampleBlock, SenderTimedFormat
 from drivers.timing.arrival_regression import snap_to_standard_rate
 from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
@@ -114,7 +114,7 @@ def _resample(
 
 def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[SampleBlock], Ints, float, list[str]]:
     """Return the stamped blocks, the missing samples before each block, the rate, and the notes on the time stamps."""
-    clock = SampleClock(SenderTiming(), rate_hz)
+    clock = SampleClock(SenderTimedFormat(), rate_hz)
     stamped = [one for samples in blocks for one in clock.assign_times(samples)]
     clock_notes = [event.text for event in clock.take_events(ended=True)]
     t_ns = np.concatenate([samples.t_ns for samples in stamped])

@@ -53,10 +53,10 @@ class HistoryRow:
         return self.start_s + self.width_s
 
 
-class RunningExtremes:
+class RunningStatistics:
     """Running count, minimum, maximum and last value of k numbers.
 
-    >>> seen = RunningExtremes(("a", "b"))
+    >>> seen = RunningStatistics(("a", "b"))
     >>> for numbers in ([1.0, 5.0], [3.0, np.nan], [2.0, 4.0]):
     ...     seen.add(np.array(numbers))
     >>> seen.count.tolist(), seen.minimum.tolist(), seen.maximum.tolist(), seen.last.tolist()
@@ -81,11 +81,11 @@ class RunningExtremes:
         np.copyto(self.last, single, where=there)
 
 
-def concatenate_columns(
+def combine_sources(
     start_s: int,
     width_s: int,
     newest_s: float,
-    parts: Sequence[RunningExtremes],
+    parts: Sequence[RunningStatistics],
     counts: tuple[int, int, int, int],
     state: int,
 ) -> HistoryRow:
@@ -179,7 +179,7 @@ def merge_rows(rows: Sequence[HistoryRow], start_s: int, width_s: int) -> Histor
     )
 
 
-def pack_statistics(row: HistoryRow) -> bytes:
+def pack_count_min_max_last(row: HistoryRow) -> bytes:
     """Return the statistics of a row as compressed bytes, without the column names."""
     low = row.low.view(np.uint32)
     n = np.minimum(row.n, _MAX_N).astype(np.uint32)
@@ -187,13 +187,13 @@ def pack_statistics(row: HistoryRow) -> bytes:
     return zlib.compress(words.view(np.uint8).reshape(-1, 4).T.tobytes(), 6)
 
 
-def unpack_statistics(data: bytes, count: int) -> tuple[Ints, Singles, Singles, Singles]:
+def unpack_count_min_max_last(data: bytes, count: int) -> tuple[Ints, Singles, Singles, Singles]:
     """Return the count, minimum, maximum and last value of each number in packed bytes.
 
     Parameters
     ----------
     data
-        Bytes made by ``pack_statistics``.
+        Bytes made by ``pack_count_min_max_last``.
     count
         Number of columns.
 

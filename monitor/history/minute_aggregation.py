@@ -13,7 +13,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.health import Health
 from monitor.estimation.estimate import Estimate
-from monitor.history.bucket import STATES, HistoryRow, RunningExtremes, concatenate_columns
+from monitor.history.bucket import STATES, HistoryRow, RunningStatistics, combine_sources
 from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
 
 MINUTE_S: Final = 60
@@ -28,9 +28,9 @@ class MinuteAggregator:
         self._numbers: ColumnConverter | None = None
         self._start_s: int | None = None
         self._newest_s = 0.0
-        self._estimates: RunningExtremes | None = None
-        self._health = RunningExtremes(HEALTH_COLUMNS)
-        self._temperature = RunningExtremes(TEMPERATURE_COLUMNS)
+        self._estimates: RunningStatistics | None = None
+        self._health = RunningStatistics(HEALTH_COLUMNS)
+        self._temperature = RunningStatistics(TEMPERATURE_COLUMNS)
         self._previous_counters = (0, 0, 0, 0)  # counters at the last report, since the start of the device
         self._counts = (0, 0, 0, 0)  # increments within this minute
         self._state = 0
@@ -53,7 +53,7 @@ class MinuteAggregator:
             full = self._close_row()  # the store merges both rows of this minute
             self._start_s, self._newest_s = start_s, unix_s
         if self._estimates is None:
-            self._estimates = RunningExtremes(self._numbers.names)
+            self._estimates = RunningStatistics(self._numbers.names)
         self._estimates.add(self._numbers.convert(estimate))
         return full
 
@@ -117,13 +117,13 @@ class MinuteAggregator:
         parts = [part for part in (self._estimates, self._health, self._temperature) if part is not None]
         parts = [part for part in parts if part.count.any()]
         assert self._start_s is not None
-        row = concatenate_columns(
+        row = combine_sources(
             self._start_s, MINUTE_S, self._newest_s, parts or [self._health], self._counts, self._state
         )
         self._estimates, self._health, self._temperature = (
             None,
-            RunningExtremes(HEALTH_COLUMNS),
-            RunningExtremes(TEMPERATURE_COLUMNS),
+            RunningStatistics(HEALTH_COLUMNS),
+            RunningStatistics(TEMPERATURE_COLUMNS),
         )
         self._counts, self._state, self._start_s = (0, 0, 0, 0), 0, None
         return row

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import NotReady
-from drivers.quantities import DAY_S
+from drivers.number_ranges import DAY_S
 from drivers.sample import Floats, Ints
 from monitor.common.units import format_utc
 from monitor.history.bucket import HistoryRow, Singles, merge_rows, select_columns

@@ -23,9 +23,16 @@ from typing import Any, Final
 import msgspec
 
 from drivers.errors import RecordingError
-from drivers.file_access import check_folder, check_regular
-from drivers.quantities import DAY_S
-from monitor.history.bucket import MAX_COLUMNS, STATES, HistoryRow, merge_rows, pack_statistics, unpack_statistics
+from drivers.file_access import check_folder_or_absent, check_regular
+from drivers.number_ranges import DAY_S
+from monitor.history.bucket import (
+    MAX_COLUMNS,
+    STATES,
+    HistoryRow,
+    merge_rows,
+    pack_count_min_max_last,
+    unpack_count_min_max_last,
+)
 from monitor.history.stored_events import (
     MAX_EVENTS,
     THINNING_SPANS_S,
@@ -97,7 +104,7 @@ class HistoryStore:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        check_folder(path.parent)
+        check_folder_or_absent(path.parent)
         path.parent.mkdir(parents=True, exist_ok=True)
         _check_files(path)
         path.touch()  # the file needs an inode that can be compared before SQLite opens it
@@ -188,7 +195,7 @@ class HistoryStore:
             self._files = _file_states(self.path)
         return done
 
-    def external_change(self) -> str:
+    def describe_external_change(self) -> str:
         """Return how another program has changed the file since this store last used the file; "" if unchanged.
 
         SQLite does not detect such changes: it would continue to write to a file that has been deleted.
@@ -249,7 +256,7 @@ class HistoryStore:
                 self._layouts.id(row.names),
                 *row.counts,
                 row.state,
-                pack_statistics(row),
+                pack_count_min_max_last(row),
             ),
         )
 
@@ -488,7 +495,7 @@ class _LayoutCache:
             self._names[layout] = tuple(text[0].split())
         names = self._names[layout]
         counts = (received, lost, bad, overflowed)
-        return HistoryRow(start, width, newest, names, *unpack_statistics(data, len(names)), counts, state)
+        return HistoryRow(start, width, newest, names, *unpack_count_min_max_last(data, len(names)), counts, state)
 
 
 def _open_read_only(path: Path) -> sqlite3.Connection:

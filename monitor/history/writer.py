@@ -223,7 +223,7 @@ class HistoryWriter:
 
     def _current_store(self) -> HistoryStore:
         """Return the open store; reopen it if another program has changed the file."""
-        change = "" if self._store is None else self._store.external_change()
+        change = "" if self._store is None else self._store.describe_external_change()
         if change:
             self._close_store()
         if self._store is None:

@@ -4,7 +4,7 @@ An effect is a frozen dataclass of parameters with units. There are four kinds o
 
 - A ``Source`` adds to the rate of its axis. The spectrum and the Allan variance of a source describe the sampled series
   that the source simulates, so fit, simulation and comparison use the same physics.
-- A ``Leak`` adds a share of the measurement of another axis.
+- A ``Leak`` adds the measurement of another axis times a coefficient.
 - ``NoiseStep`` changes the size of white noise.
 - A ``Transform`` acts on the sum of sources and leaks, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
 
@@ -24,7 +24,7 @@ import numpy as np
 
 from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
-from drivers.quantities import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, Quantity
+from drivers.number_ranges import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, NumberRange
 from drivers.sample import AXES, Floats
 from monitor.noise.spectrum import Spectrum
 
@@ -47,7 +47,7 @@ class SampleBlockContext:
 class RunningEffect:
     """Effect that is being simulated on one axis."""
 
-    def truth(self) -> dict[str, Any]:
+    def drawn_values(self) -> dict[str, Any]:
         """Return the random values drawn so far that the parameters do not contain."""
         return {}
 
@@ -83,8 +83,8 @@ class NoiseSeries(RunningEffect, ABC):
         return values
 
 
-class FunctionSeries(NoiseSeries):
-    """Series without a state: a function adds the samples of a block."""
+class StatelessSeries(NoiseSeries):
+    """Series without a state. A function adds the samples of a block."""
 
     def __init__(self, function: Callable[[Floats, SampleBlockContext], object]) -> None:
         self._function = function
@@ -103,7 +103,7 @@ class RunningTransform(RunningEffect, ABC):
 
 
 class MemorylessTransform(RunningTransform):
-    """Running transform whose output depends only on the present sample: a function changes the values in place."""
+    """Transform whose output depends only on the present sample. A function changes the values in place."""
 
     def __init__(self, function: Callable[[Floats], object]) -> None:
         self._function = function
@@ -163,7 +163,7 @@ class Effect(ParameterTable, ABC):
         if self.events_hz > MAX_EVENTS_PER_SAMPLE * rate_hz:
             raise ConfigError(
                 f"{self.name}: {self.events_hz:g} events a second at {rate_hz:g} Hz; "
-                f"at most {MAX_EVENTS_PER_SAMPLE:g} in a sample are possible"
+                f"at most {MAX_EVENTS_PER_SAMPLE:g} per sample are possible"
             )
 
 
@@ -221,8 +221,8 @@ class Source(Effect):
 class Leak(Effect):
     """Effect that adds ``coefficient`` times the measurement of the axis ``source``.
 
-    The measurement of the source axis consists of the sources and transforms of the source axis, without leaks into it.
-    Axes that leak into each other therefore need no order, and there is no circular dependence.
+    Leaks into the source axis are left out of this measurement. Axes that leak into each other therefore need no order,
+    and there is no circular dependence.
     """
 
     __slots__ = ()
@@ -238,8 +238,7 @@ class Transform(Effect):
 
     @abstractmethod
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum after the transform. The result is NaN if there is neither a closed form nor an
-        integral."""
+        """Return the spectrum after the transform. The spectrum is NaN if no formula for it is known."""
 
     @abstractmethod
     def start(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
@@ -264,7 +263,7 @@ def parameter(
     optional: bool = False,
     below_nyquist: bool = False,
     most: float = inf,
-    quantity: Quantity | None = None,
+    quantity: NumberRange | None = None,
 ) -> Any:
     """Return a dataclass field with its units and its allowed range. The default range is all numbers ≥ 0.
 
@@ -285,8 +284,8 @@ def parameter(
         True if the parameter is a frequency that must be below half the sample rate.
     most : float
         Largest allowed value.
-    quantity : Quantity or None
-        Quantity with the supported range. None selects the quantity by the unit.
+    quantity : NumberRange or None
+        NumberRange with the supported range. None selects the quantity by the unit.
     """
     metadata = {
         "units": (gyro_unit, accelerometer_unit or gyro_unit),
@@ -301,13 +300,13 @@ def parameter(
     return field(default=None, metadata=metadata) if optional else field(metadata=metadata)
 
 
-def source_axis() -> Any:
+def source_axis_field() -> Any:
     """Return a dataclass field that names another axis."""
     return field(metadata={"units": ("axis", "axis"), "axis": True})
 
 
-def parameter_units(table: type[ParameterTable]) -> Mapping[str, tuple[str, str]]:
-    """Return the unit of every parameter of an effect, on a gyroscope and on an accelerometer."""
+def gyro_and_accel_units(table: type[ParameterTable]) -> Mapping[str, tuple[str, str]]:
+    """Return the units of every parameter of an effect: first on a gyroscope, then on an accelerometer."""
     return {f.name: f.metadata["units"] for f in fields(table)}  # type: ignore[arg-type]
 
 
@@ -316,7 +315,7 @@ def required_parameters(table: type[ParameterTable]) -> tuple[str, ...]:
     return tuple(f.name for f in fields(table) if f.default is MISSING)  # type: ignore[arg-type]
 
 
-def first_sample(time_s: float, rate_hz: float) -> int:
+def first_sample_index(time_s: float, rate_hz: float) -> int:
     """Return the index of the first sample at or after a time. A millionth of a sample is allowed for rounding.
 
     Parameters
@@ -330,7 +329,7 @@ def first_sample(time_s: float, rate_hz: float) -> int:
 
 
 def _find_mistake(value: Any, allows: Mapping[str, Any]) -> str:
-    """Return what the value of a parameter must be, or an empty text if the value is allowed."""
+    """Return a message if the value of a parameter is not allowed, else an empty text."""
     if allows.get("axis"):
         return "" if value in AXES else f"must be one of {', '.join(AXES)}"
     if value is None and allows["optional"]:
@@ -342,7 +341,7 @@ def _find_mistake(value: Any, allows: Mapping[str, Any]) -> str:
     if value == 0.0 and allows["positive"]:
         return "must be above zero"
     if not allows["quantity"].supports(value):
-        return f"must be {allows['quantity'].range_text()}"
+        return f"must be {allows['quantity'].format_range()}"
     if value > allows["most"]:
         return f"must be at most {allows['most']:g}"
     return "must be a whole number" if allows["whole"] and value != int(value) else ""

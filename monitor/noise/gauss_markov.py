@@ -1,9 +1,9 @@
 """Allan variance and spectrum of processes with a geometric, real or complex autocorrelation.
 
-The autocovariance is σ² Re φ^|n| with φ = exp(−(1/T_c − iω) τ0). With a real φ, the process is first-order Gauss–Markov
-noise, and a random telegraph signal has the same second moments. With a complex φ, it is a resonance. The closed forms
-of Allan variance and spectrum are exact for the samples. Near φ = 1, the closed form of σ² suffers from cancellation in
-double precision, and its series is used instead.
+The autocovariance is σ² Re φ^|n| with φ = exp(−(1/T_c − iω) τ0). A real φ gives first-order Gauss–Markov noise. A
+random telegraph signal has the same second moments. A complex φ gives a resonance. The closed forms of Allan variance
+and spectrum are exact for the samples. Near φ = 1, the closed form of the Allan variance loses digits by cancellation,
+so a series is used instead.
 """
 
 from typing import Final
@@ -15,8 +15,8 @@ from drivers.sample import Floats
 from monitor.noise.spectrum import Spectrum
 
 MAX_SERIES_ARGUMENT: Final = 1e-3
-"""Largest |τ(1/T_c − iω)| for which the series is used. At this value, the series has an error of 2.5·10⁻⁴ of σ², and
-the closed form one of 10⁻⁷."""
+"""Largest |τ(1/T_c − iω)| for which the series is used. At this value, the relative error of the Allan variance is
+2.5·10⁻⁴ for the series and 10⁻⁷ for the closed form."""
 
 
 def gauss_markov_spectrum(sigma: float, decay: complex, tau0_s: float) -> Spectrum:
@@ -43,7 +43,7 @@ def gauss_markov_spectrum(sigma: float, decay: complex, tau0_s: float) -> Spectr
 def _avar(sigma: float, decay: complex, tau_s: Floats, tau0_s: float) -> Floats:
     """Return the overlapping Allan variance σ² Re{[n(1 − φ²) − φ(1 − q)(3 − q)] / (n²(1 − φ)²)}, q = φⁿ, n = τ/τ0.
 
-    Zhang, "Allan variance of time series models for measurement data", Metrologia 45 (2008) 549, rearranged.
+    The formula is rearranged from Zhang, Metrologia 45 (2008) 549.
     """
     n = np.asarray(tau_s, np.float64) / tau0_s
     x = np.asarray(n * (decay * tau0_s), np.complex128)
@@ -53,14 +53,15 @@ def _avar(sigma: float, decay: complex, tau_s: Floats, tau0_s: float) -> Floats:
 
 
 def _closed(n: Floats, step: complex) -> Floats:
-    """Return the closed form for σ = 1."""
+    """Return the Allan variance of a process of variance 1 in closed form."""
     phi, d, u = np.exp(-step), -np.expm1(-step), -np.expm1(-n * step)
     return np.asarray(np.real((n * d * (1.0 + phi) - phi * u * (2.0 + u)) / (n * d) ** 2))
 
 
 def _series(n: Floats, x: NDArray[np.complex128]) -> Floats:
-    """Return the series about φ = 1 for σ = 1."""
-    # A correlation that decreases as k belongs to a random walk, one that decreases as k² to a slope of random size.
+    """Return the Allan variance of a process of variance 1, as a power series in 1 − φ."""
+    # If the correlation decreases linearly with the lag k, the first term (a random walk) dominates. If the correlation
+    # decreases with k², the second term (a slope of random size) dominates.
     return np.asarray(np.real(2.0 / 3.0 * x * (1.0 + 0.5 / n**2) - 0.5 * x**2 + 7.0 / 30.0 * x**3))
 
 

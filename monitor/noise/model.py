@@ -1,9 +1,10 @@
 """Noise model of an IMU: the effects of each axis in one object, for fit, simulation and comparison.
 
 Sources and leaks of an axis add up. Its transforms act on the sum in the order of ``TRANSFORM_ORDER``. ``avar`` and
-``psd`` describe the whole axis, including linear transforms and leaks. They use closed forms where these exist, and one
-integral after a filter. They are NaN if they depend on something that a model does not contain, such as temperature,
-the length of a recording, or the position of a rate between two quantisation steps.
+``psd`` describe the whole axis, including linear transforms and leaks. Closed forms are used where they exist. After a
+filter, the Allan variance is an integral over the spectrum. The result is NaN if it depends on a quantity that a model
+does not contain. Examples are the temperature, the length of a recording, and the position of a rate between two
+quantisation steps.
 
 ``model_file`` converts a model to text and back. ``simulation`` generates time series.
 """
@@ -21,7 +22,7 @@ from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
-from monitor.noise.model_file import error_location, format_model, format_table, parse_model
+from monitor.noise.model_file import error_location, format_display_table, format_model, parse_model
 from monitor.noise.simulation import ModelStream, check_effects
 from monitor.noise.spectrum import Spectrum, undefined_spectrum, zero_spectrum
 from monitor.noise.temperature import Temperature
@@ -80,8 +81,8 @@ class NoiseModel:
                 yield axis, effect
 
     def __add__(self, other: "NoiseModel") -> "NoiseModel":
-        """Return a model with the effects of both. Sample rate and temperature come from the first
-        model that has them."""
+        """Return a model with the effects of both models. Sample rate and temperature are those of the first model that
+        has them."""
         if not isinstance(other, NoiseModel):
             return NotImplemented
         added = {
@@ -92,11 +93,11 @@ class NoiseModel:
         return NoiseModel(added, self.sample_rate_hz or other.sample_rate_hz, self.temperature or other.temperature)
 
     def __str__(self) -> str:
-        return format_table(self.effects, self.sample_rate_hz, self.temperature)
+        return format_display_table(self.effects, self.sample_rate_hz, self.temperature)
 
     @property
-    def rate_ratio(self) -> float:
-        """Return the true sample rate divided by the stated one."""
+    def true_to_stated_rate(self) -> float:
+        """Return the true sample rate divided by the stated sample rate."""
         return self._clock.ratio
 
     @property
@@ -135,7 +136,7 @@ class NoiseModel:
         return self.spectrum(axis, tau0_s).density(np.asarray(f_hz, np.float64))
 
     def spectrum(self, axis: str, tau0_s: float) -> Spectrum:
-        """Return density, lines and slope of one axis as measured.
+        """Return the spectrum of one axis after leaks and transforms.
 
         Parameters
         ----------
@@ -144,7 +145,7 @@ class NoiseModel:
         tau0_s : float
             Stated sample interval, s.
         """
-        true_s = tau0_s / self.rate_ratio
+        true_s = tau0_s / self.true_to_stated_rate
         leaking: dict[str, float] = {}
         for effect in self.effects.get(axis, ()):
             if isinstance(effect, Leak):
@@ -152,7 +153,7 @@ class NoiseModel:
         total = self._own(axis, true_s)
         for source, coefficient in leaking.items():
             total += self._measured(source, self._own(source, true_s)).scaled(coefficient)
-        return self._clock.restated(self._measured(axis, total))
+        return self._clock.restate_spectrum(self._measured(axis, total))
 
     def _own(self, axis: str, tau0_s: float) -> Spectrum:
         """Return the spectrum of the axis' own sources."""
@@ -193,7 +194,7 @@ class NoiseModel:
         ConfigError
             If ``check_effects`` finds a mistake.
         """
-        check_effects(self.effects, rate_hz * self.rate_ratio, temperature)
+        check_effects(self.effects, rate_hz * self.true_to_stated_rate, temperature)
 
     def stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> ModelStream:
         """Return an endless series of six axes. The same rate and seed give the same series.
@@ -212,7 +213,7 @@ class NoiseModel:
         ConfigError
             If ``check_effects`` finds a mistake.
         """
-        return ModelStream(self.effects, self.temperature, rate_hz, self.rate_ratio, seed, temperature_c)
+        return ModelStream(self.effects, self.temperature, rate_hz, self.true_to_stated_rate, seed, temperature_c)
 
     def simulate(self, n: int, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> Floats:
         """Return the first ``n`` samples [n, 6] of ``stream``, in rad/s and m/s².

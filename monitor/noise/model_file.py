@@ -1,8 +1,8 @@
 """Model files: conversion of TOML text to effects and back, and a table for display.
 
 A model file has ``sample_rate`` (Hz), optionally ``[temperature]``, and one table per axis. Each axis has one table per
-effect, or an array of tables if an effect occurs twice. ``g*`` and ``a*`` stand for all axes of a kind. Every mistake
-gives one line of a ConfigError, which names the place in the file and the nearest known word.
+effect, or an array of tables if an effect occurs several times. ``g*`` and ``a*`` stand for all axes of a kind. A
+ConfigError has one line for each mistake. The line names the table and suggests the nearest known word.
 """
 
 import contextlib
@@ -12,12 +12,12 @@ from typing import Any, Final, TypeVar
 
 from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
-from drivers.quantities import RATE_HZ
+from drivers.number_ranges import RATE_HZ
 from drivers.sample import AXES
-from monitor.noise.effect import GYROS, Effect, ParameterTable, parameter_units, required_parameters
+from monitor.noise.effect import GYROS, Effect, ParameterTable, gyro_and_accel_units, required_parameters
 from monitor.noise.effects import EFFECTS
 from monitor.noise.temperature import Temperature
-from monitor.settings import toml_text
+from monitor.settings import toml_parser
 
 T = TypeVar("T", bound=ParameterTable)
 
@@ -29,7 +29,7 @@ TOP_LEVEL_KEYS: Final = ("sample_rate", "temperature")
 """Other keys of a model file."""
 
 AxisEffects = tuple[tuple[str, ...], tuple[Effect, ...]]
-"""Names of axes, and the effects that each of them has."""
+"""Names of axes, and the effects of each of these axes."""
 
 
 def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature | None]:
@@ -40,7 +40,7 @@ def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature
     ConfigError
         If the text is not valid, with one line for each mistake.
     """
-    tables = toml_text.parse_toml(text)
+    tables = toml_parser.parse_toml(text)
     mistakes: list[str] = []
     rate_hz = tables.pop("sample_rate", None)
     if rate_hz is not None:
@@ -89,12 +89,12 @@ def format_model(
     return "\n".join(lines).lstrip() + "\n"
 
 
-def format_table(
+def format_display_table(
     axis_effects: Mapping[str, tuple[Effect, ...]], sample_rate_hz: float | None, temperature: Temperature | None
 ) -> str:
     """Return a table for display, with one line per effect: axis, name, and parameters with units.
 
-    Sample rate and temperature stand above the table. The arguments are those of ``format_model``.
+    Sample rate and temperature are printed above the table. The arguments are those of ``format_model``.
     """
     head = [] if sample_rate_hz is None else [f"sample rate {sample_rate_hz:g} Hz"]
     if temperature is not None:
@@ -129,7 +129,7 @@ def _format_parameters(table: ParameterTable, axis: str = GYROS[0]) -> str:
     """Return the parameters of a table with their units on an axis."""
     texts = []
     for name, value in _set_fields(table):
-        unit = parameter_units(type(table))[name][axis not in GYROS]
+        unit = gyro_and_accel_units(type(table))[name][axis not in GYROS]
         number = value if isinstance(value, str) else format(value, "g")
         texts.append(f"{name} = {number}" + ("" if unit in ("1", "axis") else f" {unit}"))
     return ", ".join(texts)
@@ -169,8 +169,8 @@ def _parse_axis(axis: str, effects: Any, mistakes: list[str]) -> Iterator[Effect
 
 
 def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
-    """Return the effect or the temperature of one table."""
-    known = tuple(parameter_units(kind))
+    """Return the effect or the temperature model that one table describes."""
+    known = tuple(gyro_and_accel_units(kind))
     if not isinstance(parameters, dict):
         raise ConfigError(f"{place} must be a table with {', '.join(known)}")
     mistakes = [
@@ -178,7 +178,7 @@ def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
         for name in parameters
         if name not in known
     ]
-    # A misspelt parameter is also missing, but one line is enough.
+    # A misspelt parameter would otherwise be reported twice: as unknown and as missing.
     mistakes = mistakes or [
         f"{place}: {name} is missing" for name in required_parameters(kind) if name not in parameters
     ]

@@ -1,7 +1,7 @@
-"""Events at random samples: gaps and sizes that are drawn in batches, and returned by sample index.
+"""Events at random samples. Gaps and sizes of the events are drawn in batches.
 
-All batches have one length, so the events do not depend on the division into blocks. The first events are listed with
-their times for the truth of a simulation. All events are counted.
+All batches have the same length, so the events do not depend on the division into blocks. All events are counted. The
+times of the first events are stored for the truth file of a simulation.
 """
 
 from collections.abc import Callable
@@ -29,8 +29,8 @@ class RandomEvents:
     rate_hz : float
         Sample rate in Hz, for the times in ``truth``.
     before : float
-        Sample index at which the first gap begins. It is -1 if gaps are whole numbers and the first sample may be an
-        event.
+        Sample index at which the first gap begins. The value -1 allows an event at sample 0 if gaps are whole numbers
+        of at least 1.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class RandomEvents:
             self._listed.append(((self._first_index + float(when[one])) / self._rate_hz, float(size[one])))
         return np.ceil(when - (first - self._first_index)).astype(np.int64), size
 
-    def truth(self, size: str | None = None) -> dict[str, Any]:
+    def drawn_values(self, size: str | None = None) -> dict[str, Any]:
         """Return the number of events, and the times of the listed events in seconds since the start of the stream.
 
         If ``size`` is given, the sizes of the listed events are returned under this key.

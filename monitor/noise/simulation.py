@@ -1,10 +1,10 @@
 """Simulation of the time series of a noise model: endless, in blocks of any size, independent of the division into
 blocks.
 
-Blocks are simulated in pieces that fit the processor's cache. Within a piece, every axis sums its own sources. White
-noise comes first, because a noise step multiplies only white noise. Next, each axis that leaks into others is
-transformed by itself. Then the leaks are added, and the sums are transformed. Everything is simulated at the true
-sample rate.
+Blocks are simulated in pieces that fit the processor's cache. For each piece, the sources of every axis are added.
+White noise is added first, because a noise step multiplies only white noise. Next, the transforms are applied to each
+axis that leaks into other axes. The results are added to the other axes, and the transforms are applied to the sums.
+All effects are simulated at the true sample rate.
 
 Every effect of every axis has its own random generator. Its seed is formed from the seed of the stream, the names of
 axis and effect, and the number of earlier effects of the same name on the axis. Adding or removing an effect therefore
@@ -32,7 +32,7 @@ from monitor.noise.effect import (
     SampleBlockContext,
     Source,
     Transform,
-    first_sample,
+    first_sample_index,
 )
 from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
@@ -81,7 +81,9 @@ def check_effects(axis_effects: Mapping[str, tuple[Effect, ...]], true_hz: float
                 if isinstance(effect, NoiseStep) and not any(isinstance(one, AngleRandomWalk) for one in effects):
                     raise ConfigError(f"{axis} has no angle_random_walk to multiply")
                 if isinstance(effect, Source) and effect.uses_temperature and not temperature:
-                    raise ConfigError("no temperature: the model has no [temperature], and no recording gives one")
+                    raise ConfigError(
+                        "no temperature: neither the model has a table [temperature], nor does a recording provide one"
+                    )
 
 
 class ModelStream:
@@ -95,7 +97,7 @@ class ModelStream:
         Simulated temperature.
     rate_hz : float
         Stated sample rate, Hz.
-    rate_ratio : float
+    true_to_stated_rate : float
         True sample rate divided by the stated one.
     seed : int
         Seed of the random generators.
@@ -113,13 +115,13 @@ class ModelStream:
         axis_effects: Mapping[str, tuple[Effect, ...]],
         temperature: Temperature | None,
         rate_hz: float,
-        rate_ratio: float,
+        true_to_stated_rate: float,
         seed: int,
         temperature_c: Floats | None = None,
     ) -> None:
-        check_effects(axis_effects, rate_hz * rate_ratio, temperature_c is not None or temperature is not None)
+        check_effects(axis_effects, rate_hz * true_to_stated_rate, temperature_c is not None or temperature is not None)
         self._effects = {axis: axis_effects.get(axis, ()) for axis in AXES}
-        self._true_hz = rate_hz * rate_ratio
+        self._true_hz = rate_hz * true_to_stated_rate
         self._seed = seed
         self._count = 0  # number of samples drawn so far
         self._occurrences: Counter[tuple[str, str]] = Counter()
@@ -147,10 +149,10 @@ class ModelStream:
         return drawn
 
     def add(self, axis: str, effect: Effect) -> None:
-        """Add an effect from the next sample on, at a cost that does not depend on the samples drawn so far.
+        """Add an effect that begins at the next sample.
 
-        A parameter ``time`` still counts from the first sample of the stream. A random walk, a ramp or a transient
-        begins now.
+        A parameter ``time`` counts from the first sample of the stream. A random walk, a ramp or a transient begins at
+        zero.
 
         Parameters
         ----------
@@ -167,7 +169,7 @@ class ModelStream:
         if axis not in AXES:
             raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
         if isinstance(effect, SampleRateError):
-            raise ConfigError(f"{axis}.{effect.name}: the clock of a stream that runs cannot change")
+            raise ConfigError(f"{axis}.{effect.name}: the sample rate error of a running stream cannot change")
         with error_location(f"{axis}.{effect.name}"):
             effect.check_axis(axis)
         effects = self._effects | {axis: (*self._effects[axis], effect)}
@@ -175,15 +177,16 @@ class ModelStream:
         self._effects = effects
         self._begin(axis, effect)
 
-    def truth(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
-        """Return the randomly drawn values so far: axis -> effect -> one dictionary for each effect of that name.
+    def drawn_values(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
+        """Return the values that have been drawn at random so far, by axis and name of the effect.
 
-        The values are phases, counts, and times in s from the start, ready for JSON. Effects that their parameters
-        describe completely are left out.
+        The list of an effect has one dictionary for each occurrence of the effect on the axis. The values are phases,
+        numbers of events, and times in seconds from the start, ready for JSON. Effects that their parameters describe
+        completely are left out.
         """
         truths: dict[str, dict[str, list[dict[str, Any]]]] = {}
         for axis, effect, running in self._truths:
-            if truth := running.truth():
+            if truth := running.drawn_values():
                 truths.setdefault(axis, {}).setdefault(effect.name, []).append(truth)
         return truths
 
@@ -197,7 +200,7 @@ class ModelStream:
             (line.white if isinstance(effect, AngleRandomWalk) else line.others).append(series)
             self._truths.append((axis, effect, series))
         elif isinstance(effect, NoiseStep):
-            line.steps.append((first_sample(effect.time, self._true_hz), effect.ratio))
+            line.steps.append((first_sample_index(effect.time, self._true_hz), effect.ratio))
         elif isinstance(effect, Leak):
             line.leak(effect)
             self._axes[effect.source].leaks_out = True
@@ -207,7 +210,7 @@ class ModelStream:
             line.insert(TRANSFORM_ORDER.index(type(effect)), running)
             self._truths.append((axis, effect, running))
         else:
-            raise TypeError(f"{effect.name} is no source, leak, noise step or transform")
+            raise TypeError(f"{effect.name} is not a source, leak, noise step or transform")
 
     def _rng(self, axis: str, effect: str, occurrence: int) -> np.random.Generator:
         """Return the random generator of one effect."""
@@ -222,7 +225,11 @@ class ModelStream:
             temperature_c[:] = 0.0
             self._temperature.add(temperature_c, block)
         sums = {axis: line.sum(block, n) for axis, line in self._axes.items()}
-        alone = {axis: line.measure_alone(sums[axis]) for axis, line in self._axes.items() if line.alone}
+        alone = {
+            axis: line.measure_without_leaks(sums[axis])
+            for axis, line in self._axes.items()
+            if line.needs_leak_free_measurement
+        }
         for column, (axis, line) in enumerate(self._axes.items()):
             values[:, column] = line.measure(sums[axis], alone)
         self._count += n
@@ -239,12 +246,13 @@ class _AxisSimulator:
         self.leaks_out = False
         # Transforms with their positions in TRANSFORM_ORDER, sorted.
         self._chain: list[tuple[int, RunningTransform]] = []
-        # Copies that act on the sources of this axis only. They are used if other axes leak into this axis.
+        # Copies of the transforms for the measurement without leaks, if other axes leak into this axis.
         self._alone: list[tuple[int, RunningTransform]] = []
 
     @property
-    def alone(self) -> bool:
-        """True if the measurement without leaks is needed now, or may be needed later by transforms with a state."""
+    def needs_leak_free_measurement(self) -> bool:
+        """True if the measurement without leaks is needed. Transforms with a memory need the measurement in every
+        piece."""
         return self.leaks_out or bool(self.leaks)
 
     def insert(self, place: int, running: RunningTransform) -> None:
@@ -256,7 +264,7 @@ class _AxisSimulator:
         self._chain.sort(key=lambda one: one[0])
 
     def leak(self, leak: Leak) -> None:
-        """Add a leak into this axis. From now on, its measurement differs from its measurement without leaks."""
+        """Add a leak into this axis. From the next sample, the measurements with and without leaks differ."""
         if not self.leaks:
             self._alone = copy.deepcopy(self._chain)
         self.leaks.append(leak)
@@ -272,20 +280,19 @@ class _AxisSimulator:
             series.add(values, block)
         return values
 
-    def measure_alone(self, own: Floats) -> Floats:
-        """Return the measurement without leaks. It is computed in place if nothing leaks into the
-        axis, else on a copy."""
+    def measure_without_leaks(self, own: Floats) -> Floats:
+        """Return the measurement without leaks. If nothing leaks into the axis, ``own`` is changed in place."""
         if not self.leaks:
             return _apply_transforms(self._chain, own)
         return _apply_transforms(self._alone, own.copy())
 
     def measure(self, own: Floats, alone: dict[str, Floats]) -> Floats:
-        """Return the measurement of the axis with all leaks."""
+        """Return the measurement of the axis with the leaks from other axes."""
         if self.leaks:
             for leak in self.leaks:
                 own += leak.coefficient * alone[leak.source]
         elif self.leaks_out:
-            return own  # already transformed by ``measure_alone``
+            return own  # already transformed by ``measure_without_leaks``
         return _apply_transforms(self._chain, own)
 
 

@@ -1,18 +1,18 @@
-"""Second moments of one axis: density, lines and slope of its sampled series, and the Allan variance that follows.
+"""Spectrum of the sampled series of one axis, and the Allan variance that follows from the spectrum.
 
 A ``Spectrum`` is created from the closed forms of a source. Spectra can be added. A gain scales a spectrum. A filter
 multiplies its density and its lines, and does not change its slope. Without a filter, the Allan variance is the sum of
-the closed forms of the sources. After a filter, it is one integral over the density, plus the contributions of lines
-and slope.
+the closed forms of the sources. After a filter, the Allan variance is an integral over the density, plus the
+contributions of lines and slope.
 
 The integral, for samples τ0 apart with m = τ/τ0, is
 
     σ²(τ) = 4 ∫ S(f) sin⁴(πfτ) / (m² sin²(πfτ0)) df   from 0 to 1/(2 τ0).
 
-It is computed on a grid in log f, which is finer around narrow peaks. Below 0.1/τ the kernel is smooth, and the
-trapezoidal rule suffices. Above, sin⁴ = 3/8 − cos(2πfτ)/2 + cos(4πfτ)/8, and each cosine is integrated exactly against
-the piecewise linear remainder. No τ therefore needs a finer grid. Errors stay below 3·10⁻⁴ for the effects of this
-package.
+It is computed on a grid in log f, which is finer around narrow peaks. Below f = 0.1/τ the kernel is smooth, and the
+trapezoidal rule suffices. At higher frequencies, sin⁴(πfτ) is written as 3/8 − cos(2πfτ)/2 + cos(4πfτ)/8. The product
+of a cosine and the piecewise linear remainder is integrated exactly, so a long τ needs no finer grid. Errors stay below
+3·10⁻⁴ for the effects of this package.
 """
 
 from collections.abc import Callable
@@ -146,7 +146,7 @@ def undefined_spectrum(tau0_s: float) -> Spectrum:
 def allan_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float) -> Floats:
     """Return the Allan variance of a sampled sinusoid: A² sin⁴(πfτ)/(m² sin²(πfτ0)), A² = 2·mean square.
 
-    This is the sinusoidal noise of IEEE Std 952 annex C for samples.
+    The formula is the sampled form of the sinusoidal noise of IEEE Std 952 annex C.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ def allan_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float)
 
 
 def allan_of_density(density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[tuple[float, float], ...]) -> Floats:
-    """Return the Allan variance of a spectral density by the integral of the module's docstring.
+    """Return the Allan variance of a spectral density by numerical integration, see the module's docstring.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ def frequency_grid(lowest_hz: float, tau0_s: float, peaks: tuple[tuple[float, fl
         Centres and widths of narrow peaks, Hz.
     """
     nyquist = 0.5 / tau0_s
-    # The upper part is also linear, because the kernel at τ0 is curved there.
+    # The linear points are needed near half the sample rate, where the kernel of short τ varies fast.
     parts = [
         np.geomspace(lowest_hz, nyquist, max(2, round(POINTS_PER_DECADE * np.log10(nyquist / lowest_hz)))),
         np.linspace(0.1 * nyquist, nyquist, 2 * POINTS_PER_DECADE),
@@ -232,7 +232,7 @@ def _allan_variance_at(tau: float, f: Floats, rest: Floats, tau0_s: float) -> fl
 
 
 def _integrate_cosine(omega: float, f: Floats, rest: Floats, slopes: Floats) -> float:
-    """Return the integral of a piecewise linear function times cos(ωf) over the frequency f. The result is exact."""
+    """Return the exact integral over f of a piecewise linear function times cos(ωf)."""
     ends = rest[-1] * np.sin(omega * f[-1]) - rest[0] * np.sin(omega * f[0])
     return float(ends / omega + (slopes * np.diff(np.cos(omega * f))).sum() / omega**2)
 

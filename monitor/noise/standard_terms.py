@@ -1,7 +1,7 @@
 """Five noise terms of IEEE Std 952: their symbols, effects and Allan variances.
 
-The Allan variance of an axis is σ²(τ) = 3Q²/τ² + N²/τ + (2 ln 2/π) B² + K²τ/3 + R²τ²/2. Each effect holds the formula
-and the units of its term.
+The Allan variance of an axis is σ²(τ) = 3Q²/τ² + N²/τ + (2 ln 2/π) B² + K²τ/3 + R²τ²/2. The class of each effect has
+the formula and the units of the term.
 """
 
 from typing import Final

@@ -10,14 +10,14 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ConfigError
-from drivers.quantities import DURATION_S, TEMPERATURE_C
+from drivers.number_ranges import DURATION_S, TEMPERATURE_C
 from drivers.sample import Floats
-from monitor.noise.effect import FunctionSeries, NoiseSeries, ParameterTable, SampleBlockContext, parameter
+from monitor.noise.effect import NoiseSeries, ParameterTable, SampleBlockContext, StatelessSeries, parameter
 from monitor.noise.effects.ieee952.exponentially_correlated import ExponentiallyCorrelated
 from monitor.noise.effects.ieee952.sinusoidal import Sinusoidal
 
 PAIRS: Final = (("swing", "period"), ("wander", "wander_time"))
-"""Parameters that need each other."""
+"""Pairs of parameters that must be given together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Temperature(ParameterTable):
             for part in parts:
                 part.add(values, block)
 
-        return FunctionSeries(add)
+        return StatelessSeries(add)
 
 
 def recorded_temperature(temperature_c: Floats) -> NoiseSeries:
@@ -102,4 +102,4 @@ def recorded_temperature(temperature_c: Floats) -> NoiseSeries:
         index = np.arange(block.first, block.first + values.size)
         values += filled[np.minimum(index, filled.size - 1)]
 
-    return FunctionSeries(add)
+    return StatelessSeries(add)

@@ -1,4 +1,4 @@
-"""Formatting of coefficients for tables, in the units of the field."""
+"""Formatting of coefficients for tables, in the units of data sheets such as °/√h."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -9,21 +9,20 @@ from monitor.common.units import NO_VALUE, format_number, unit_of
 from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
 
 TEMPERATURE_MARK: Final = "†"
-TEMPERATURE_MEANS: Final = "its slow part is temperature"
-"""Meaning of TEMPERATURE_MARK, for a legend."""
+TEMPERATURE_MEANS: Final = "slow variance due to temperature"
 
 
 @dataclass(frozen=True, slots=True)
 class CoefficientText:
-    """Text of one coefficient of one axis in a table: value, interval and unit."""
+    """Value, interval and unit of one coefficient of one axis as text."""
 
-    value: str  # "0.516"; "≤ 2.10" for an upper bound; "—" if it is not estimated
-    interval: str  # "0.512 … 0.520", or "" if there is none
+    value: str  # "0.516"; "≤ 2.10" for an upper bound; "—" if there is no estimate
+    interval: str  # "0.512 … 0.520"; "" if there is no interval
     unit: str
 
 
 def format_coefficient(coefficients: Coefficients, symbol: str, axis: str, digits: int = 3) -> CoefficientText:
-    """Format one coefficient in the unit of the field.
+    """Format one coefficient in the unit of data sheets.
 
     Parameters
     ----------

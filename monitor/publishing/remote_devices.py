@@ -221,7 +221,7 @@ class DeviceStates:
             known = self._devices.get(device)
         return None if known is None else known.coefficients
 
-    def events(self) -> list[tuple[str, EventMessage]]:
+    def newest_events(self) -> list[tuple[str, EventMessage]]:
         """Return the newest events with the keys of their devices, oldest first."""
         with self._lock:
             return list(self._events)

@@ -13,7 +13,7 @@ from typing import Any, Final
 from drivers.sample import Event, Floats
 from monitor.common.health import Health
 from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate, concatenate_coefficients
 from monitor.publishing.messages.message import Message
@@ -57,7 +57,7 @@ class CompensatedRows:
 
 
 @dataclass(frozen=True, slots=True)
-class OverviewText:
+class DeviceTableText:
     """Table of all devices as Markdown. It belongs to no device, so the name of its device is empty."""
 
     text: str
@@ -128,13 +128,15 @@ RESULT_KINDS: Final = (
     ),
     ResultKind(Event, (EventMessage,), (Drawing("EventsPanel"),)),
     ResultKind(Health, (StatusMessage,), (Drawing("HealthPanel", keep_newest),)),
-    ResultKind(OverviewText, drawings=(Drawing("OverviewPanel", keep_newest),), size_bytes=lambda one: len(one.text)),
+    ResultKind(
+        DeviceTableText, drawings=(Drawing("DeviceTablePanel", keep_newest),), size_bytes=lambda one: len(one.text)
+    ),
     ResultKind(
         CompensatedRows,
         drawings=(Drawing("CompensatedPanel"),),
         size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes,
     ),
-    ResultKind(ThermalUpdate, (ThermalMessage,), (Drawing("ThermalPanel"),)),
+    ResultKind(ThermalIntervalResult, (ThermalMessage,), (Drawing("ThermalPanel"),)),
     ResultKind(DriftUpdate, drawings=(Drawing("DriftPanel"),)),
     ResultKind(SlowStatistics, (TotalMessage,)),
     ResultKind(

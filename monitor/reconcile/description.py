@@ -17,21 +17,21 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.diagnostics.null_distribution import AxisNull, score_findings
+from monitor.reconcile.diagnostics.null_distribution import AxisNull, measure_gaps
 from monitor.reconcile.likelihood.effect_terms import NATURAL_DIAGNOSTIC, SIZE_PARAMETERS, size
-from monitor.reconcile.likelihood.hypothesis import Hypothesis, shape_bounds, size_bounds
+from monitor.reconcile.likelihood.hypothesis import Hypothesis, shape_interval, size_interval
 from monitor.reconcile.result import (
+    AddedOrResizedEffect,
     AxisResult,
     Decision,
+    DiagnosticGap,
     DiagnosticSnapshot,
     Location,
     ParameterInterval,
-    ReconciliationStep,
     RunnerUp,
-    Score,
     StepKind,
 )
-from monitor.reconcile.search.search import Round, Search
+from monitor.reconcile.search.search import AxisSearchResult, SearchRound
 from monitor.reconcile.search.trials import RETUNE, Trial
 
 SHAPE_PARAMETERS: Final[dict[type[Effect], tuple[str, ...]]] = {
@@ -51,75 +51,75 @@ MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
 """Smallest confidence of an alternative effect that is reported."""
 
 
-def describe_axis(search: Search, null: AxisNull, final: AxisNull) -> AxisResult:
+def describe_axis(search: AxisSearchResult, null: AxisNull, final: AxisNull) -> AxisResult:
     """Return the result of one axis.
 
     Parameters
     ----------
-    search : Search
+    search : AxisSearchResult
         Search on the axis.
     null : AxisNull
         Null distributions under the model under test, which decided the search.
     final : AxisNull
         Null distributions under the extended model, which decide which differences are left over.
     """
-    looks = [DiagnosticSnapshot(score_findings(one.findings, null), one.plots) for one in search.rounds]
-    end = DiagnosticSnapshot(score_findings(search.findings, final), search.plots)
+    looks = [DiagnosticSnapshot(measure_gaps(one.findings, null), one.plots) for one in search.rounds]
+    end = DiagnosticSnapshot(measure_gaps(search.findings, final), search.plots)
     if search.before is None:
         looks.append(end)
     else:
         plots, findings = search.before
-        looks.append(DiagnosticSnapshot(score_findings(findings, null), plots))
+        looks.append(DiagnosticSnapshot(measure_gaps(findings, null), plots))
     steps = tuple(
         _describe_step(search, search.rounds[at], index, kind, looks[at], looks[at + 1])
         for at, index, kind in _remaining_changes(search)
     )
-    left_over = (*(score for score in end.scores if score.passes), *_noise_floor_score(search, end))
+    left_over = (*(score for score in end.gaps if score.is_significant), *_noise_floor_score(search, end))
     decision = _axis_decision(bool(steps), bool(left_over))
-    return AxisResult(search.state.axis.name, decision, looks[0], steps, left_over, end)
+    return AxisResult(search.hypothesis.axis.name, decision, looks[0], steps, left_over, end)
 
 
-def _remaining_changes(search: Search) -> list[tuple[int, int, StepKind]]:
+def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKind]]:
     """Return the changes that remain at the end: the index of the round, the index of the effect, and the kind."""
-    state = search.state
+    hypothesis = search.hypothesis
     found: list[tuple[int, int, StepKind]] = []
-    left = list(range(state.given, len(state.effects)))
+    left = list(range(hypothesis.given_count, len(hypothesis.effects)))
     resized: tuple[int, ...] = ()
     for at, one in enumerate(search.rounds):
-        last = one.state.effects[-1]
-        index = next((i for i in left if type(state.effects[i]) is type(last)), None)
-        if index is not None and one.state.found and one.trials[0].effect is not None:
+        last = one.hypothesis.effects[-1]
+        index = next((i for i in left if type(hypothesis.effects[i]) is type(last)), None)
+        if index is not None and one.hypothesis.added and one.trials[0].effect is not None:
             left.remove(index)
             found.append((at, index, "added"))
-        for noise in one.state.fit.noises:
-            if noise < state.given and noise not in resized and noise in state.fit.noises:
+        for noise in one.hypothesis.fit.fitted_noise:
+            if noise < hypothesis.given_count and noise not in resized and noise in hypothesis.fit.fitted_noise:
                 found.append((at, noise, "retuned"))
-        resized = one.state.fit.noises
+        resized = one.hypothesis.fit.fitted_noise
     return found
 
 
-def _noise_floor_score(search: Search, look: DiagnosticSnapshot) -> tuple[Score, ...]:
-    """Score the white noise floor after a low-pass filter that was found.
+def _noise_floor_score(search: AxisSearchResult, look: DiagnosticSnapshot) -> tuple[DiagnosticGap, ...]:
+    """DiagnosticGap the white noise floor after a low-pass filter that was found.
 
     No effect produces this noise. A noise floor that is larger than chance is reported as left over. Its gap is the gap
     that the low-pass filter alone would leave, and at most the gap without a low-pass filter.
     """
-    state, axis = search.state, search.state.axis
-    limit = next((effect for effect in state.found if isinstance(effect, BandwidthLimit)), None)
-    if limit is None or not state.fit.floor > 0.0:
+    hypothesis, axis = search.hypothesis, search.hypothesis.axis
+    limit = next((effect for effect in hypothesis.added if isinstance(effect, BandwidthLimit)), None)
+    if limit is None or not hypothesis.fit.noise_floor_variance > 0.0:
         return ()
-    without = axis.fit(state.effects, state.fit.held, floor=False)
+    without = axis.fit(hypothesis.effects, hypothesis.fit.fixed_noise, noise_floor=False)
     most = max(one.findings["psd"].gain for one in search.rounds)
-    gain = max(min(state.fit.log_likelihood - without.log_likelihood, most), 0.0)
+    gain = max(min(hypothesis.fit.log_likelihood - without.log_likelihood, most), 0.0)
     psd = _score_of("psd", look)
     place = Location(frequency=(limit.cutoff, 0.5 * axis.rate_hz))
-    score = Score("psd", place, (2.0 * gain) ** 0.5, psd.null95, psd.threshold)
-    return (score,) if score.passes else ()
+    score = DiagnosticGap("psd", place, (2.0 * gain) ** 0.5, psd.null95, psd.threshold)
+    return (score,) if score.is_significant else ()
 
 
-def _score_of(lens: str, look: DiagnosticSnapshot) -> Score:
+def _score_of(lens: str, look: DiagnosticSnapshot) -> DiagnosticGap:
     """Return the score of one diagnostic."""
-    return next(score for score in look.scores if score.lens == lens)
+    return next(score for score in look.gaps if score.lens == lens)
 
 
 def _axis_decision(steps: bool, left: bool) -> Decision:
@@ -130,21 +130,25 @@ def _axis_decision(steps: bool, left: bool) -> Decision:
 
 
 def _describe_step(
-    search: Search, done: Round, index: int, kind: StepKind, before: DiagnosticSnapshot, after: DiagnosticSnapshot
-) -> ReconciliationStep:
+    search: AxisSearchResult,
+    done: SearchRound,
+    index: int,
+    kind: StepKind,
+    before: DiagnosticSnapshot,
+    after: DiagnosticSnapshot,
+) -> AddedOrResizedEffect:
     """Return the result of one step of the search."""
-    effect, trial = search.state.effects[index], done.trials[0]
+    effect, trial = search.hypothesis.effects[index], done.trials[0]
     score = _triggering_score(effect, kind, before)
     later = _score_of(score.lens, after)
     confidence, others = _confidence_and_runners_up(effect.name if kind == "added" else RETUNE, done.trials)
     if kind == "retuned" and trial.name != RETUNE:  # the size changed together with an added effect
-        confidence, others = _resize_confidence(search.state, index), ()
+        confidence, others = _resize_confidence(search.hypothesis, index), ()
     held_out_before, held_out_after = _held_out_scores(done, score, later)
-    return ReconciliationStep(
-        found=score,
+    return AddedOrResizedEffect(
         kind=kind,
         effect=effect.name,
-        parameters=_parameters_with_bounds(search.state, index, trial, kind),
+        parameters=_parameters_with_bounds(search.hypothesis, index, trial, kind),
         confidence=confidence,
         runners_up=others,
         before=score,
@@ -153,27 +157,29 @@ def _describe_step(
         held_out_after=held_out_after,
         held_out_reason=done.validation.reason,
         because=_justification(effect, kind, score, later, others, trial),
-        look=after,
+        snapshot_after=after,
     )
 
 
-def _held_out_scores(done: Round, score: Score, later: Score) -> tuple[Score | None, Score | None]:
+def _held_out_scores(
+    done: SearchRound, score: DiagnosticGap, later: DiagnosticGap
+) -> tuple[DiagnosticGap | None, DiagnosticGap | None]:
     """Return the scores of the cross-validation before and after a step, or None without cross-validation."""
     validation = done.validation
     if validation.reason:
         return None, None
     return (
-        Score(score.lens, score.where, validation.before, score.null95, score.threshold),
-        Score(score.lens, score.where, validation.after, later.null95, later.threshold),
+        DiagnosticGap(score.lens, score.where, validation.before, score.null95, score.threshold),
+        DiagnosticGap(score.lens, score.where, validation.after, later.null95, later.threshold),
     )
 
 
-def _triggering_score(effect: Effect, kind: StepKind, before: DiagnosticSnapshot) -> Score:
+def _triggering_score(effect: Effect, kind: StepKind, before: DiagnosticSnapshot) -> DiagnosticGap:
     """Return the score that led to an effect.
 
     This is the natural diagnostic of the effect if it passes its threshold, otherwise the strongest diagnostic.
     """
-    passing = [score for score in before.scores if score.passes] or list(before.scores)
+    passing = [score for score in before.gaps if score.is_significant] or list(before.gaps)
     natural = NATURAL_DIAGNOSTIC.get(effect.name) if kind == "added" else "psd"
     for score in passing:
         if score.lens == natural:
@@ -189,7 +195,7 @@ def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[fl
     """
     best: dict[str, float] = {"": 0.0}
     for trial in trials:
-        best[trial.name] = max(best.get(trial.name, -inf), trial.value)
+        best[trial.name] = max(best.get(trial.name, -inf), trial.score)
     top = max(best.values())
     whole = sum(exp(value - top) for value in best.values())
     chances = {other: exp(value - top) / whole for other, value in best.items()}
@@ -202,50 +208,50 @@ def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[fl
     return chances.get(name, chances[max(best, key=lambda one: best[one])]), runners_up
 
 
-def _resize_confidence(state: Hypothesis, index: int) -> float:
+def _resize_confidence(hypothesis: Hypothesis, index: int) -> float:
     """Return the probability that the size of an effect differs from its size in the model.
 
     It follows from the distance of the logarithms of the two sizes, in standard errors.
     """
-    now, before = size(state.effects[index]), size(state.model[index])
-    error = state.fit.error(index)
+    now, before = size(hypothesis.effects[index]), size(hypothesis.model[index])
+    error = hypothesis.fit.size_error(index)
     if not (now > 0.0 and before > 0.0 and error > 0.0):
         return 1.0  # the effect vanished, or the model had none
     return erf(abs(log(now / before)) * now / error / 2.0**0.5)
 
 
 def _parameters_with_bounds(
-    state: Hypothesis, index: int, trial: Trial, kind: StepKind
+    hypothesis: Hypothesis, index: int, trial: Trial, kind: StepKind
 ) -> dict[str, ParameterInterval]:
     """Return the parameters of an effect with their 95 % intervals."""
-    effect = state.effects[index]
-    if kind == "added" and trial.bounds and trial.name == effect.name:
-        return dict(trial.bounds)
+    effect = hypothesis.effects[index]
+    if kind == "added" and trial.intervals and trial.name == effect.name:
+        return dict(trial.intervals)
     found: dict[str, ParameterInterval] = {}
     if isinstance(effect, Leak):
         found["source"] = ParameterInterval(effect.source)
     size_name = SIZE_PARAMETERS.get(type(effect))
     if size_name is not None:
-        found[size_name] = size_bounds(state.fit, index)
+        found[size_name] = size_interval(hypothesis.fit, index)
     if isinstance(effect, TemperatureBias):
         found["reference"] = ParameterInterval(effect.reference)
         if effect.quadratic is not None:
-            found["quadratic"] = _quadratic_bounds(state, index)
+            found["quadratic"] = _quadratic_bounds(hypothesis, index)
     for shape in SHAPE_PARAMETERS.get(type(effect), ()) if kind == "added" else ():
-        found[shape] = shape_bounds(state.fit, index, shape)
+        found[shape] = shape_interval(hypothesis.fit, index, shape)
     if isinstance(effect, BandwidthLimit):
         found["order"] = ParameterInterval(float(effect.order))
     if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
         # fitting the frequency as well doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
-        error = 2.0 * Z95 * state.fit.error(index) / effect.amplitude
+        error = 2.0 * Z95 * hypothesis.fit.size_error(index) / effect.amplitude
         found["phase"] = ParameterInterval(effect.phase, effect.phase - error, effect.phase + error)
     return found
 
 
-def _quadratic_bounds(state: Hypothesis, index: int) -> ParameterInterval:
+def _quadratic_bounds(hypothesis: Hypothesis, index: int) -> ParameterInterval:
     """Return the quadratic temperature coefficient with its 95 % interval."""
-    fitted = state.fit.fitted
-    column = next(place for at, place in state.fit.regressors if at == index).start + 1
+    fitted = hypothesis.fit.whittle
+    column = next(place for at, place in hypothesis.fit.regressor_slices if at == index).start + 1
     value = float(fitted.beta[column])
     error = Z95 * float(fitted.beta_covariance[column, column]) ** 0.5
     return ParameterInterval(value, value - error, value + error)
@@ -267,7 +273,12 @@ EVIDENCE_TEXT: Final = {
 
 
 def _justification(
-    effect: Effect, kind: StepKind, score: Score, after: Score, others: tuple[RunnerUp, ...], trial: Trial
+    effect: Effect,
+    kind: StepKind,
+    score: DiagnosticGap,
+    after: DiagnosticGap,
+    others: tuple[RunnerUp, ...],
+    trial: Trial,
 ) -> str:
     """Return the sentences that justify a step."""
     gaps = f"the gap is {score.gap:.1f}, and a true model stays below {score.threshold:.1f}"
@@ -276,8 +287,8 @@ def _justification(
         sentences.append(f"With another size of {effect.name}, which the model has, the gap is {after.gap:.1f}.")
         return " ".join(sentences)
     sentences.append(f"With {effect.name}, the gap is {after.gap:.1f}.")
-    if trial.events and trial.name == effect.name:
-        sentences.append(f"The number of detected events is {trial.events}.")
+    if trial.event_count and trial.name == effect.name:
+        sentences.append(f"The number of detected events is {trial.event_count}.")
     if others:
         phrase = _comparison_phrase(others[0].confidence)
         sentences.append(f"The effect {others[0].effect} explains the difference {phrase}.")
@@ -289,7 +300,7 @@ def _comparison_phrase(confidence: float) -> str:
     return "nearly as well" if confidence > 0.2 else "less well" if confidence > 0.01 else "clearly less well"
 
 
-def _location_text(score: Score) -> str:
+def _location_text(score: DiagnosticGap) -> str:
     """Return a phrase for the location of a score, or an empty string."""
     place = score.where
     if place.frequency is not None:

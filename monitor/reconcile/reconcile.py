@@ -28,30 +28,35 @@ from monitor.noise.effects import (
 from monitor.noise.model import NoiseModel
 from monitor.noise.standard_terms import UNIT_SOURCES
 from monitor.reconcile.description import describe_axis
-from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, null_distributions, run_diagnostics
+from monitor.reconcile.diagnostics.null_distribution import (
+    AxisNull,
+    Findings,
+    estimate_null_distributions,
+    run_diagnostics,
+)
 from monitor.reconcile.likelihood.axis import Axis, Effects, RegressorCache
 from monitor.reconcile.likelihood.effect_terms import with_size
-from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
+from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.recording import Recording, select_usable_axes
 from monitor.reconcile.result import (
+    AddedOrResizedEffect,
     AxisResult,
     Decision,
+    DiagnosticGap,
     Location,
     Reconciliation,
-    ReconciliationStep,
-    Score,
     combine_decisions,
 )
-from monitor.reconcile.search.axis_preparation import prepare_axes
+from monitor.reconcile.search.axis_repair import build_repaired_axes
 from monitor.reconcile.search.candidates import PENALTY_NATS
 from monitor.reconcile.search.sample_rate_error import (
     SAMPLE_RATE_PENALTY_NATS,
     SampleRateErrorEstimate,
+    convert_to_stated_time,
     detect_sample_rate_error,
-    in_stated_time,
 )
-from monitor.reconcile.search.search import Search, search_axis
+from monitor.reconcile.search.search import AxisSearchResult, search_axis
 
 SIMULATED_RECORDINGS: Final = 6
 """Number of simulated recordings that determine a null distribution. With six axes, each diagnostic has 36 gains."""
@@ -64,15 +69,15 @@ MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 @dataclass(frozen=True, slots=True)
-class RunContext:
+class RecordingContext:
     """Recording, with the seed and the cached regressors of one reconciliation."""
 
     recording: Recording
     seed: int
     regressors: RegressorCache
-    map: MapFunction  # distributes work over axes and simulated recordings
+    map_function: MapFunction  # distributes work over axes and simulated recordings
 
-    def prepare(self, recording: Recording, effects: Mapping[str, Effects], seed: int) -> dict[str, Axis]:
+    def build_repaired_axes(self, recording: Recording, effects: Mapping[str, Effects], seed: int) -> dict[str, Axis]:
         """Return the prepared axes of the measured recording or of a simulated one with the same temperature.
 
         Parameters
@@ -84,18 +89,18 @@ class RunContext:
         seed : int
             Seed of the draws that replace missing samples.
         """
-        return prepare_axes(recording, effects, self.regressors, np.random.default_rng(seed))
+        return build_repaired_axes(recording, effects, self.regressors, np.random.default_rng(seed))
 
 
 @dataclass(frozen=True, slots=True)
-class SearchResults:
+class _AxesSearchResult:
     """Results of the search on all axes of one recording."""
 
-    searches: dict[str, Search]
+    searches: dict[str, AxisSearchResult]
     sample_rate_error: SampleRateErrorEstimate | None
 
     @property
-    def extended(self) -> dict[str, Search]:
+    def searches_that_changed_model(self) -> dict[str, AxisSearchResult]:
         """Searches that changed the model."""
         return {name: search for name, search in self.searches.items() if search.rounds}
 
@@ -104,8 +109,8 @@ def reconcile(
     recording: Recording,
     model: NoiseModel | None,
     seed: int,
-    each: MapFunction = map,
-    tell: ProgressCallback = lambda _what: None,
+    map_function: MapFunction = map,
+    report_stage: ProgressCallback = lambda _what: None,
 ) -> Reconciliation:
     """Compare a recording with a model and find the effects that the model lacks.
 
@@ -117,9 +122,9 @@ def reconcile(
         Model under test. If None, the five classic terms are fitted first.
     seed : int
         Seed of all simulations and random draws. The same seed gives the same result.
-    each : callable, optional
+    map_function : callable, optional
         Function with the signature of ``map`` that distributes work over axes and simulated recordings.
-    tell : callable, optional
+    report_stage : callable, optional
         Function that is called with the name of each stage.
 
     Returns
@@ -134,23 +139,23 @@ def reconcile(
     """
     recording, notes = select_usable_axes(recording, model)
     regressors = RegressorCache(recording.samples, recording.rate_hz, recording.temperature_c)
-    run = RunContext(recording, seed, regressors, each)
+    run = RecordingContext(recording, seed, regressors, map_function)
     if model is None:
-        tell("fitting the five terms")
+        report_stage("fitting the five terms")
     tested = model or fit_five_terms(run)
-    tell("simulating the model")
+    report_stage("simulating the model")
     simulated = _diagnose_simulations(tested, run, seed, recording.values)
-    null = null_distributions(simulated, len(simulated))
-    tell("searching for missing effects")
+    null = estimate_null_distributions(simulated)
+    report_stage("searching for missing effects")
     found = _search_all_axes(run, tested, null)
     extended = _add_found_effects(tested, found)
     final = null
-    if found.extended or found.sample_rate_error:
-        tell("simulating the extended model")
-        changed = recording.values if found.sample_rate_error else found.extended
+    if found.searches_that_changed_model or found.sample_rate_error:
+        report_stage("simulating the extended model")
+        changed = recording.values if found.sample_rate_error else found.searches_that_changed_model
         simulated |= _diagnose_simulations(extended, run, seed + SIMULATED_RECORDINGS, changed)
-        final = null_distributions(simulated, len(simulated))
-    tell("describing the result")
+        final = estimate_null_distributions(simulated)
+    report_stage("describing the result")
     axes = {name: describe_axis(one, null[name], final[name]) for name, one in found.searches.items()}
     if found.sample_rate_error is not None:
         axes = _add_sample_rate_step(axes, found.sample_rate_error, null)
@@ -168,9 +173,9 @@ def reconcile(
     )
 
 
-def fit_five_terms(run: RunContext) -> NoiseModel:
+def fit_five_terms(run: RecordingContext) -> NoiseModel:
     """Fit the terms Q, N, B, K and R to each axis and keep the terms that the data support."""
-    axes = run.prepare(run.recording, dict.fromkeys(run.recording.values, ()), run.seed)
+    axes = run.build_repaired_axes(run.recording, dict.fromkeys(run.recording.values, ()), run.seed)
     return NoiseModel({name: _fit_terms(axis) for name, axis in axes.items()}, run.recording.rate_hz)
 
 
@@ -201,7 +206,7 @@ def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effec
 
 
 def _diagnose_simulations(
-    model: NoiseModel, run: RunContext, first_seed: int, names: Collection[str]
+    model: NoiseModel, run: RecordingContext, first_seed: int, names: Collection[str]
 ) -> dict[str, list[Findings]]:
     """Run the diagnostics on simulations of a model that have the axes, length and temperature of the recording.
 
@@ -213,44 +218,46 @@ def _diagnose_simulations(
     def diagnose(seed: int) -> dict[str, Findings]:
         drawn = model.simulate(template.samples, template.rate_hz, seed, template.temperature_c)
         simulated = replace(template, values={axis: drawn[:, AXES.index(axis)] for axis in template.values})
-        axes = run.prepare(simulated, effects, seed)
+        axes = run.build_repaired_axes(simulated, effects, seed)
         return {
-            name: run_diagnostics(whiten_axis(fit_with_given_sizes(axes[name], effects[name]).fit)) for name in names
+            name: run_diagnostics(whiten_axis(fit_with_fixed_noise(axes[name], effects[name]).fit)) for name in names
         }
 
-    findings = list(run.map(diagnose, range(first_seed, first_seed + SIMULATED_RECORDINGS)))
+    findings = list(run.map_function(diagnose, range(first_seed, first_seed + SIMULATED_RECORDINGS)))
     return {axis: [one[axis] for one in findings] for axis in names}
 
 
-def _search_all_axes(run: RunContext, model: NoiseModel, null: Mapping[str, AxisNull]) -> SearchResults:
+def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str, AxisNull]) -> _AxesSearchResult:
     """Search every axis for missing effects.
 
     The sample rate is tested first. If two axes each seem to leak into the other, the search is repeated on one of them
     without that source.
     """
     effects = _effects_by_axis(model, run.recording)
-    axes = run.prepare(run.recording, effects, run.seed)
+    axes = run.build_repaired_axes(run.recording, effects, run.seed)
     error = detect_sample_rate_error(axes, effects)
     if error is not None:
         ratio = float(error.ratio.value)
-        effects = {name: tuple(in_stated_time(effect, ratio) for effect in of) for name, of in effects.items()}
+        effects = {name: tuple(convert_to_stated_time(effect, ratio) for effect in of) for name, of in effects.items()}
 
-    def search(name: str) -> Search:
+    def search(name: str) -> AxisSearchResult:
         rng = np.random.default_rng([run.seed, AXES.index(name)])
         return search_axis(axes[name], effects[name], null[name], rng)
 
-    found = dict(zip(axes, run.map(search, axes), strict=True))
+    found = dict(zip(axes, run.map_function(search, axes), strict=True))
     for name, wrong in _reversed_leak_sources(found, null).items():
-        others = {source: one for source, one in axes[name].others.items() if source not in wrong}
-        axes[name] = replace(axes[name], others=others)
+        leak_sources = {source: one for source, one in axes[name].leak_sources.items() if source not in wrong}
+        axes[name] = replace(axes[name], leak_sources=leak_sources)
         found[name] = search(name)
-    return SearchResults(found, error)
+    return _AxesSearchResult(found, error)
 
 
-def _reversed_leak_sources(found: Mapping[str, Search], null: Mapping[str, AxisNull]) -> dict[str, frozenset[str]]:
+def _reversed_leak_sources(
+    found: Mapping[str, AxisSearchResult], null: Mapping[str, AxisNull]
+) -> dict[str, frozenset[str]]:
     """Return, for each axis, the sources of leaks that in fact have the opposite direction."""
     gains = {
-        (name, effect.source): step.trials[0].value
+        (name, effect.source): step.trials[0].score
         for name, one in found.items()
         for step in one.rounds
         if isinstance(effect := step.trials[0].effect, Leak)
@@ -266,14 +273,16 @@ def _reversed_leak_sources(found: Mapping[str, Search], null: Mapping[str, AxisN
     return back
 
 
-def _add_found_effects(model: NoiseModel, found: SearchResults) -> NoiseModel:
+def _add_found_effects(model: NoiseModel, found: _AxesSearchResult) -> NoiseModel:
     """Return the model with all effects that were found."""
     error = found.sample_rate_error
     ratio = float(error.ratio.value) if error else 1.0
     effects = dict(model.effects)
-    for name, search in found.extended.items():
+    for name, search in found.searches_that_changed_model.items():
         bias = tuple(effect for effect in model.effects.get(name, ()) if isinstance(effect, Bias))
-        effects[name] = bias + tuple(in_stated_time(effect, 1.0 / ratio) for effect in search.state.effects)
+        effects[name] = bias + tuple(
+            convert_to_stated_time(effect, 1.0 / ratio) for effect in search.hypothesis.effects
+        )
     if error is not None:
         effects[error.axis] = (*effects[error.axis], SampleRateError(ratio=ratio))
     return NoiseModel(effects, model.sample_rate_hz, model.temperature)
@@ -288,16 +297,17 @@ def _add_sample_rate_step(
     margin = 0.01 * abs(observed - stated)
     where = Location(frequency=(min(error.frequency) - margin, max(error.frequency) + margin))
     limit = null[error.axis]["lines"]
-    before = Score("lines", where, *(float(np.sqrt(2.0 * x)) for x in (error.gain, limit.null95, limit.threshold)))
-    step = ReconciliationStep(
-        found=before,
+    before = DiagnosticGap(
+        "lines", where, *(float(np.sqrt(2.0 * x)) for x in (error.gain, limit.null95, limit.threshold))
+    )
+    step = AddedOrResizedEffect(
         kind="added",
         effect=SampleRateError.name,
         parameters={"ratio": error.ratio},
         confidence=float(expit(error.gain - SAMPLE_RATE_PENALTY_NATS)),
         runners_up=(),
         before=before,
-        after=next(score for score in result.start.scores if score.lens == "lines"),
+        after=next(score for score in result.start.gaps if score.lens == "lines"),
         held_out_before=None,
         held_out_after=None,
         held_out_reason="the sample rate is common to the whole recording",
@@ -305,7 +315,7 @@ def _add_sample_rate_step(
             f"The feature of the model at {stated:.6g} Hz appears at {observed:.6g} Hz in the recording, and one ratio "
             f"of true to stated sample rate agrees with all axes."
         ),
-        look=result.start,
+        snapshot_after=result.start,
     )
     verdict: Decision = "partly_explained" if result.left_over else "explained"
     return {**axes, error.axis: replace(result, steps=(step, *result.steps), verdict=verdict)}

@@ -16,7 +16,14 @@ from typing import Any, Final
 import msgspec
 
 from drivers.sample import AXES
-from monitor.reconcile.result import AxisResult, Location, ParameterInterval, Reconciliation, ReconciliationStep, Score
+from monitor.reconcile.result import (
+    AddedOrResizedEffect,
+    AxisResult,
+    DiagnosticGap,
+    Location,
+    ParameterInterval,
+    Reconciliation,
+)
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
 """Name and version of the JSON schema."""
@@ -44,15 +51,15 @@ def _axis_entry(result: AxisResult) -> dict[str, Any]:
         "verdict": result.verdict,
         "steps": [_step_entry(step) for step in result.steps],
         "left_over": [_score_entry(score) for score in result.left_over],
-        "scores": [_score_entry(score) for score in result.start.scores],
+        "scores": [_score_entry(score) for score in result.start.gaps],
     }
 
 
-def _step_entry(step: ReconciliationStep) -> dict[str, Any]:
+def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
     """Return the report entry of one step."""
     held_out = _gap_entry(step.held_out_before, step.held_out_after)
     return {
-        "found": _score_entry(step.found),
+        "found": _score_entry(step.before),
         "kind": step.kind,
         "effect": step.effect,
         "parameters": {name: parameter_entry(bounds) for name, bounds in step.parameters.items()},
@@ -62,11 +69,11 @@ def _step_entry(step: ReconciliationStep) -> dict[str, Any]:
         "held_out_gap": held_out,
         **({} if held_out else {"held_out_reason": step.held_out_reason}),
         "because": step.because,
-        "scores": [_score_entry(score) for score in step.look.scores],
+        "scores": [_score_entry(score) for score in step.snapshot_after.gaps],
     }
 
 
-def _gap_entry(before: Score | None, after: Score | None) -> dict[str, float | None] | None:
+def _gap_entry(before: DiagnosticGap | None, after: DiagnosticGap | None) -> dict[str, float | None] | None:
     """Return the gaps before and after a step, or None if one of them is unknown."""
     if before is None or after is None:
         return None
@@ -78,7 +85,7 @@ def _gap_entry(before: Score | None, after: Score | None) -> dict[str, float | N
     }
 
 
-def _score_entry(score: Score) -> dict[str, Any]:
+def _score_entry(score: DiagnosticGap) -> dict[str, Any]:
     """Return the report entry of one score."""
     return {
         "lens": score.lens,
@@ -91,7 +98,7 @@ def _score_entry(score: Score) -> dict[str, Any]:
 
 def _where_entry(where: Location) -> dict[str, Any]:
     """Return the report entry of a location."""
-    found = where.found().items()
+    found = where.resolved_dimensions().items()
     return {name: place if isinstance(place, str) else [finite_or_none(end) for end in place] for name, place in found}
 
 

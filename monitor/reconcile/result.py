@@ -1,9 +1,8 @@
 """Result types of ``reconcile``, as used by the report, the JSON output and the viewer.
 
-A ``Reconciliation`` holds one ``AxisResult`` for each axis. An ``AxisResult`` holds one ``ReconciliationStep`` for each
-effect that was added or whose size was changed, and a ``Score`` for each difference that is left. A ``PlotData`` holds
-the data of one plot: the measurement of one axis and the expectation of the model under test. All values are in SI
-units of the axis. Times are in seconds from the start of the recording.
+A ``Reconciliation`` contains one ``AxisResult`` for each axis. An ``AxisResult`` contains one ``AddedOrResizedEffect``
+for each effect that was added or whose size was changed. It also contains one ``DiagnosticGap`` for each significant
+difference that remains. All values are in SI units. Times are in seconds from the start of the recording.
 """
 
 from collections.abc import Iterable, Mapping
@@ -30,14 +29,14 @@ class Location:
     value: tuple[float, float] | None = None  # of the axis, SI
     source: str | None = None  # another axis
 
-    def found(self) -> dict[str, tuple[float, float] | str]:
+    def resolved_dimensions(self) -> dict[str, tuple[float, float] | str]:
         """Return the dimensions that are known, by name."""
         names = ("frequency", "tau", "time", "temperature", "value", "source")
         return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
 
 
 @dataclass(frozen=True, slots=True)
-class Score:
+class DiagnosticGap:
     """Difference between measurement and model in one diagnostic, and the location of its maximum."""
 
     lens: str
@@ -47,7 +46,7 @@ class Score:
     threshold: float  # 99 of 100 recordings of a true model stay below it in all diagnostics, at all places and axes
 
     @property
-    def passes(self) -> bool:
+    def is_significant(self) -> bool:
         """True if the difference is larger than chance allows."""
         return self.gap > self.threshold
 
@@ -90,27 +89,26 @@ class PlotData:
 class DiagnosticSnapshot:
     """Scores and plot data of an axis, compared with one model."""
 
-    scores: tuple[Score, ...]  # one for each diagnostic
-    views: tuple[PlotData, ...]  # one for each diagnostic that has a plot
+    gaps: tuple[DiagnosticGap, ...]  # one for each diagnostic
+    plots: tuple[PlotData, ...]  # one for each diagnostic that has a plot
 
 
 @dataclass(frozen=True, slots=True)
-class ReconciliationStep:
+class AddedOrResizedEffect:
     """Effect that was added, or an effect of the model whose size was changed."""
 
-    found: Score  # difference that led to this step
     kind: StepKind
     effect: str
     parameters: Mapping[str, ParameterInterval]
     confidence: float
     runners_up: tuple[RunnerUp, ...]
-    before: Score
-    after: Score
-    held_out_before: Score | None
-    held_out_after: Score | None
+    before: DiagnosticGap  # difference that led to this step
+    after: DiagnosticGap
+    held_out_before: DiagnosticGap | None
+    held_out_after: DiagnosticGap | None
     held_out_reason: str  # why there is no held-out gap; empty if there is a held-out gap
     because: str  # one sentence of justification that a person can check
-    look: DiagnosticSnapshot  # comparison after the step
+    snapshot_after: DiagnosticSnapshot  # comparison after the step
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +118,8 @@ class AxisResult:
     axis: str
     verdict: Decision
     start: DiagnosticSnapshot  # comparison with the given model, or with the five terms
-    steps: tuple[ReconciliationStep, ...]
-    left_over: tuple[Score, ...]
+    steps: tuple[AddedOrResizedEffect, ...]
+    left_over: tuple[DiagnosticGap, ...]
     end: DiagnosticSnapshot  # comparison with the model that contains everything that was found
 
 

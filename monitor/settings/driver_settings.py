@@ -15,22 +15,22 @@ from pydantic import AfterValidator, Field, ValidationInfo
 
 import drivers.decoders
 import drivers.links
-from drivers import discovery, quantities
+from drivers import discovery, number_ranges
 from drivers.decoders.base import AddressFilter, Decoder
 from drivers.errors import ConfigError
 from drivers.links.base import AddressFilteringLink, Link, LinkSettings
-from drivers.quantities import format_value
+from drivers.number_ranges import format_value
 from drivers.settings_model import (
-    CheckedTable,
     Conflict,
     ListOf,
     Problem,
     SettingsModel,
+    TableCheckResult,
     TableError,
     check_table,
-    describe_keys,
+    fields_by_key,
 )
-from monitor.common.config_files import model_path
+from monitor.common.shipped_file_paths import model_path
 from monitor.settings.field_types import Duration
 
 VIRTUAL: Final = "virtual"
@@ -38,7 +38,7 @@ VIRTUAL: Final = "virtual"
 VIRTUAL_DECODER: Final = "vectornav_binary"
 """Default decoder of a simulated sensor."""
 
-Share = Annotated[float, quantities.FRACTION]
+Share = Annotated[float, number_ranges.FRACTION]
 
 
 class FaultsTable(SettingsModel):
@@ -48,18 +48,18 @@ class FaultsTable(SettingsModel):
     repeated: Share = Field(0.0, description="share of samples that are sent twice")
     flipped: Share = Field(0.0, description="share of samples with one flipped bit")
     cut: Share = Field(0.0, description="share of samples whose frame ends too early")
-    jitter: Annotated[float, quantities.JITTER_S] = Field(
+    jitter: Annotated[float, number_ranges.JITTER_S] = Field(
         0.0, description="longest random delay of a burst of bytes in s"
     )
     unplugged: Share = Field(0.0, description="probability at each sample that the cable is pulled before it")
     unplugged_for: Duration = Field(
         2.0, description="time in s, on the clock of the sensor, until the cable is plugged in again"
     )
-    clock: Annotated[float, quantities.CLOCK_RATIO] = Field(
+    clock: Annotated[float, number_ranges.CLOCK_RATIO] = Field(
         1.0, description="true sample rate divided by the rate that the sensor states"
     )
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         """Yield a conflict if the shares of faulty samples add up to more than 1."""
         if self.lost + self.repeated + self.flipped + self.cut > 1.0:
             text = "lost, repeated, flipped and cut are shares of all samples: their sum is at most 1"
@@ -81,14 +81,16 @@ class VirtualTable(LinkSettings):
     model: Annotated[str, AfterValidator(_model_file)] = Field(
         "consumer-mems", validate_default=True, description="path of a model file, or name of a shipped model"
     )
-    seed: Annotated[int, quantities.SEED] = Field(1, description="seed of the random numbers: same seed, same samples")
-    speed: Annotated[float, quantities.SIMULATION_SPEED] = Field(1.0, description="speed relative to real time")
+    seed: Annotated[int, number_ranges.SEED] = Field(
+        1, description="seed of the random numbers: same seed, same samples"
+    )
+    speed: Annotated[float, number_ranges.SIMULATION_SPEED] = Field(1.0, description="speed relative to real time")
     effect: ListOf[str] = Field(
         (),
         examples=[["gz.sinusoidal:amplitude=1e-3,frequency=17"]],
         description="effects that begin while the sensor runs",
     )
-    effect_at: Annotated[float, quantities.DELAY_S] = Field(
+    effect_at: Annotated[float, number_ranges.DELAY_S] = Field(
         90.0, description="time in s, on the clock of the sensor, at which the effects begin"
     )
     faults: FaultsTable = Field(FaultsTable(), description="faults of the transmission")
@@ -168,7 +170,7 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
     if problems or link is None or decoder is None:
         raise TableError(problems, link if isinstance(link, VirtualTable) else None)
     if isinstance(link, AddressFilteringLink) and isinstance(decoder, AddressFilter):
-        link.accept(decoder.addresses)
+        link.set_address_filter(decoder.addresses)
     return Driver(link, decoder, silence_s)
 
 
@@ -187,7 +189,7 @@ def _read_decoder(
         return None
     checked = check_table(module.Settings, options, folder)
     decoder: Decoder | None = _build(module, checked)
-    problems += (problem.below("decoder_options") for problem in checked.problems)
+    problems += (problem.nest_under("decoder_options") for problem in checked.problems)
     link_name, carrier = link
     if carrier and _carrier_of(module) not in ("", carrier):
         fitting = ", ".join(
@@ -198,11 +200,11 @@ def _read_decoder(
     return decoder
 
 
-def _build(module: ModuleType | None, checked: CheckedTable[Any]) -> Any:
+def _build(module: ModuleType | None, checked: TableCheckResult[Any]) -> Any:
     """Return the link or decoder of a module; None if its settings are wrong. Add the mistakes that ``build`` finds."""
     if checked.value is None or module is None:
         return None
-    keys = describe_keys(type(checked.value))
+    keys = fields_by_key(type(checked.value))
     if any(problem.place in keys and keys[problem.place].is_required() for problem in checked.problems):
         return None
     sound = not checked.problems
@@ -212,7 +214,7 @@ def _build(module: ModuleType | None, checked: CheckedTable[Any]) -> Any:
         for line in error.lines:
             place, _, text = line.partition(": ")
             if re.split(r"[.\[]", place)[0] in keys:
-                checked.add(place, text)
+                checked.add_problem(place, text)
             else:
                 checked.problems.append(Problem("", line))
         return None

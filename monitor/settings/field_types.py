@@ -9,7 +9,7 @@ from pydantic import BeforeValidator
 from drivers import file_access
 from drivers.discovery import format_choices
 from drivers.errors import ConfigError
-from drivers.quantities import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, format_value
+from drivers.number_ranges import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, format_value
 from drivers.settings_model import ReadAs, checked_by
 from monitor.common.topics import ENDPOINT
 
@@ -40,7 +40,7 @@ def seconds(value: float | str) -> float:
     return DURATION_S.check(float(_seconds(value)))
 
 
-def period(value: str, always: str) -> float:
+def parse_rate_as_period(value: str, always: str) -> float:
     """Return the time between two runs in s for a rate such as "10 Hz"; 0 for the word that means each time.
 
     Parameters
@@ -50,7 +50,7 @@ def period(value: str, always: str) -> float:
     always
         Word that means each time.
 
-    >>> period("10 Hz", "every sample"), period("every sample", "every sample")
+    >>> parse_rate_as_period("10 Hz", "every sample"), parse_rate_as_period("every sample", "every sample")
     (0.1, 0.0)
     """
     if value == always:
@@ -62,9 +62,9 @@ def period(value: str, always: str) -> float:
     return 1.0 / UPDATE_RATE_HZ.check(rate_hz)
 
 
-def period_or(always: str) -> ReadAs:
+def period_annotation(always: str) -> ReadAs:
     """Return the annotation of a period in s that is a rate in the file, or the word that means each time."""
-    return ReadAs(str, lambda value, folder: period(value, always))
+    return ReadAs(str, lambda value, folder: parse_rate_as_period(value, always))
 
 
 def check_memory(size: str) -> None:

@@ -18,7 +18,7 @@ MAX_SECRET_FILE_BYTES: Final = 1_000_000
 """Bytes at the start of a file that are searched for a secret."""
 
 
-def describe_write_access(path: Path) -> str:
+def explain_untrusted_file(path: Path) -> str:
     """Return why a file cannot be trusted, because other users can change or replace it; "" if it can be trusted."""
     real = real_path(path)
     if _others_may(real, stat.S_IWOTH):

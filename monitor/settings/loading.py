@@ -10,11 +10,11 @@ from typing import Any, Final
 
 from drivers import file_access
 from drivers.errors import ConfigError, format_one_line
-from drivers.settings_model import CheckedTable, Problem, check_table
-from drivers.zenoh.session import build_session_config, find_secret_files, format_error
-from monitor.settings import file_permissions, toml_text
+from drivers.settings_model import Problem, TableCheckResult, check_table
+from drivers.zenoh.session_config import build_session_config, find_secret_files, format_zenoh_error
+from monitor.settings import file_permissions, toml_parser
 from monitor.settings.driver_settings import Driver, FaultsTable, VirtualTable
-from monitor.settings.field_types import Metrics, check_viewer_mode, period, seconds
+from monitor.settings.field_types import Metrics, check_viewer_mode, parse_rate_as_period, seconds
 from monitor.settings.schema import (
     DEVICE_NAME,
     WINDOW_SAMPLES,
@@ -45,7 +45,7 @@ __all__ = [
     "ZenohTable",
     "check_viewer_mode",
     "load",
-    "period",
+    "parse_rate_as_period",
     "read",
     "seconds",
 ]
@@ -70,7 +70,7 @@ class Config:
 
 
 @dataclass(frozen=True, slots=True)
-class ModelUse:
+class ModelDependentSettings:
     """Parts of a device that depend on model files. They are checked even if other keys of the device are wrong."""
 
     device: str  # "device bench-1"
@@ -85,7 +85,7 @@ class Reading:
 
     config: Config | None  # None if the file has mistakes
     wrong: list[str]  # one line for each mistake, which begins with the file
-    models: tuple[ModelUse, ...] = ()
+    models: tuple[ModelDependentSettings, ...] = ()
 
 
 def load(path: Path, *, pipe: bool = False) -> Config:
@@ -135,7 +135,7 @@ def examine(path: Path, *, pipe: bool = False) -> Reading:
         True if a pipe may be read as well.
     """
     try:
-        table = toml_text.parse_toml(file_access.read_small_file(path, pipe=pipe).decode("utf-8"))
+        table = toml_parser.parse_toml(file_access.read_small_file(path, pipe=pipe).decode("utf-8"))
     except FileNotFoundError:
         return Reading(None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"])
     except (OSError, UnicodeDecodeError) as error:
@@ -145,11 +145,11 @@ def examine(path: Path, *, pipe: bool = False) -> Reading:
     checked = check_table(ConfigFile, table, path.resolve().parent)
     warnings = _check_zenoh_file(checked)
     wrong = [_format_problem(problem, table) for problem in checked.problems]
-    if line := file_permissions.describe_write_access(path):
+    if line := file_permissions.explain_untrusted_file(path):
         wrong.append(line)
     if line := file_permissions.describe_exposed_secret(path):
         warnings.insert(0, line)
-    models = _model_uses(checked, table)
+    models = _model_dependent_settings(checked, table)
     if wrong or checked.value is None:
         return Reading(None, [format_one_line(f"{path}: {line}") for line in wrong], models)
     config = _configuration(checked.value)
@@ -163,16 +163,16 @@ def _configuration(file: ConfigFile) -> Config:
     return Config(file.devices, file.zenoh, file.viewer, file.log, storage, file.hooks, file.metrics.listen)
 
 
-def _check_zenoh_file(checked: CheckedTable[ConfigFile]) -> list[str]:
+def _check_zenoh_file(checked: TableCheckResult[ConfigFile]) -> list[str]:
     """Check that zenoh accepts its file, and that nobody else can change it. Return warnings about readable secrets."""
     zenoh = checked.value.zenoh if checked.value else None
     if zenoh is None or zenoh.config is None or zenoh.mode == "none":
         return []
     path = zenoh.config
     if not os.path.exists(path):
-        checked.add("zenoh.config", f"{path}: no such file")
+        checked.add_problem("zenoh.config", f"{path}: no such file")
         return []
-    if line := file_permissions.describe_write_access(path):
+    if line := file_permissions.explain_untrusted_file(path):
         checked.problems.append(Problem("zenoh.config", line))
     secrets: tuple[Path, ...] = ()
     try:
@@ -197,7 +197,7 @@ def zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
     try:
         return find_secret_files(build_session_config({}, path))
     except zenoh.ZError as error:
-        text = format_error(error)
+        text = format_zenoh_error(error)
         raise ConfigError(text if text.startswith(str(path)) else f"{path}: {text}") from error
 
 
@@ -215,7 +215,9 @@ def _device_name(table: Mapping[str, Any], index: int) -> str:
     return f"device {name}" if isinstance(name, str) and DEVICE_NAME.fullmatch(name) else ""
 
 
-def _model_uses(checked: CheckedTable[ConfigFile], table: Mapping[str, Any]) -> tuple[ModelUse, ...]:
+def _model_dependent_settings(
+    checked: TableCheckResult[ConfigFile], table: Mapping[str, Any]
+) -> tuple[ModelDependentSettings, ...]:
     """Return what is to be checked against model files, as far as it is not wrong."""
     uses = []
     for i, device in enumerate(checked.value.devices if checked.value else ()):
@@ -224,5 +226,5 @@ def _model_uses(checked: CheckedTable[ConfigFile], table: Mapping[str, Any]) -> 
         virtual = device.link if checked.is_sound(f"{at}.driver") else checked.partial.get(f"{at}.driver")
         model = device.model if checked.is_sound(f"{at}.model") else None
         simulated = virtual if isinstance(virtual, VirtualTable) else None
-        uses.append(ModelUse(_device_name(table, i) or at, model, limits, simulated))
+        uses.append(ModelDependentSettings(_device_name(table, i) or at, model, limits, simulated))
     return tuple(uses)

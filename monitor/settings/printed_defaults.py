@@ -13,9 +13,9 @@ from pydantic.fields import FieldInfo
 import drivers.decoders
 from drivers import discovery
 from drivers.errors import ConfigError
-from drivers.quantities import Quantity
+from drivers.number_ranges import NumberRange
 from drivers.sample import AXES
-from drivers.settings_model import SettingsModel, describe_keys, find_model
+from drivers.settings_model import SettingsModel, fields_by_key, find_model
 from monitor.settings import driver_settings
 from monitor.settings.schema import ConfigFile, Device, Hook, Limit
 
@@ -36,14 +36,14 @@ def format_defaults() -> str:
     """Return a configuration file with the keys of all tables, links and decoders."""
     links = [name for name in driver_settings.link_names() if name != FIRST_LINK]
     decoders = [name for name in discovery.list_modules(drivers.decoders) if name != FIRST_DECODER]
-    top = {key: find_model(info.annotation) for key, info in describe_keys(ConfigFile).items()}
+    top = {key: find_model(info.annotation) for key, info in fields_by_key(ConfigFile).items()}
     blocks = [
         INTRODUCTION,
         _table(Device, "device", omit=("driver", "axes", "limit")),
         format_link(FIRST_LINK),
         format_decoder(FIRST_DECODER),
         "\n".join(
-            ["[device.axes]", *(_line(axis, axis, str(describe_keys(Device)["axes"].description)) for axis in AXES)]
+            ["[device.axes]", *(_line(axis, axis, str(fields_by_key(Device)["axes"].description)) for axis in AXES)]
         ),
         "# The other links. One of these tables takes the place of [device.driver] above.",
         *(_commented(format_link(name)) for name in links),
@@ -86,7 +86,7 @@ def format_decoder(name: str) -> str:
     if name not in known:
         raise ConfigError(f'"{name}"{discovery.format_choices(name, known)}')
     settings = discovery.import_module(drivers.decoders, name).Settings
-    lacking = "" if describe_keys(settings) else " has no keys"
+    lacking = "" if fields_by_key(settings) else " has no keys"
     return _table(settings, DECODER_TABLE, f'decoder = "{name}"{lacking}')
 
 
@@ -94,7 +94,7 @@ def _table(model: type[SettingsModel], name: str, about: str = "", omit: tuple[s
     """Return the header and the keys of a table. Optional keys are comments."""
     header = f"[[{name}]]" if name in LIST_TABLES else f"[{name}]"
     lines = [f"{header:<{COMMENT_COLUMN - 1}} # {about}" if about else header]
-    for key, info in describe_keys(model).items():
+    for key, info in fields_by_key(model).items():
         if key not in omit:
             default = "no default; " if info.is_required() else ""
             value = info.examples[0] if info.examples else info.default
@@ -117,15 +117,15 @@ def _line(key: str, value: object, comment: str) -> str:
 def _values(info: FieldInfo) -> str:
     """Return the possible words or the range of a key in parentheses."""
     parts = list(_find_parts((info.annotation, *info.metadata)))
-    words = [str(one) for one in parts if not isinstance(one, Quantity)]
-    ranges = [one.range_text() for one in parts if isinstance(one, Quantity)]
+    words = [str(one) for one in parts if not isinstance(one, NumberRange)]
+    ranges = [one.format_range() for one in parts if isinstance(one, NumberRange)]
     return f" ({' | '.join(words)})" if len(words) > 1 else "".join(f" ({one})" for one in ranges[:1])
 
 
 def _find_parts(types: Iterable[Any]) -> Iterator[object]:
     """Yield the words of the Literal types and the quantities in types."""
     for one in types:
-        if isinstance(one, Quantity):
+        if isinstance(one, NumberRange):
             yield one
         elif get_origin(one) is Literal:
             yield from get_args(one)

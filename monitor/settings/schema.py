@@ -12,15 +12,15 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, Strict, ValidationInfo, model_validator
 
-from drivers import discovery, file_access, quantities
+from drivers import discovery, file_access, number_ranges
 from drivers.decoders.base import Decoder
 from drivers.driver import AxisMap, parse_axis_map
 from drivers.errors import ConfigError
 from drivers.links.base import Link
-from drivers.quantities import DAY_S, Quantity
+from drivers.number_ranges import DAY_S, NumberRange
 from drivers.sample import AXES, EVENT_KINDS
 from drivers.settings_model import Conflict, ListOf, ReadAs, SettingsModel, WordOr, checked_by, one_of
-from monitor.common.config_files import model_path
+from monitor.common.shipped_file_paths import model_path
 from monitor.common.topics import ENDPOINT
 from monitor.settings.driver_settings import Driver, VirtualTable, read_driver
 from monitor.settings.field_types import (
@@ -32,7 +32,7 @@ from monitor.settings.field_types import (
     ZenohKey,
     check_memory,
     check_viewer_mode,
-    period_or,
+    period_annotation,
 )
 
 WINDOW_SAMPLES: Final = (100, 10_000_000)
@@ -41,12 +41,12 @@ MAX_WINDOW_S: Final = 40 * DAY_S
 """Longest window if the sample rate is not configured."""
 THERMAL_INTERVAL_SAMPLES: Final = 8
 """Minimum number of samples in a thermal interval. Their scatter gives the uncertainty of their mean."""
-THERMAL_INTERVAL_S: Final = Quantity("s", 1e-6, DAY_S)
-SEGMENT_LENGTH_S: Final = Quantity("s", 10.0, DAY_S)
+THERMAL_INTERVAL_S: Final = NumberRange("s", 1e-6, DAY_S)
+SEGMENT_LENGTH_S: Final = NumberRange("s", 10.0, DAY_S)
 DEVICE_NAME: Final = re.compile(r"[A-Za-z0-9_-]+")
 AXIS_PATTERNS: Final = (*AXES, "g*", "a*", "*")
 
-Coefficient = Annotated[float, quantities.COEFFICIENT]
+Coefficient = Annotated[float, number_ranges.COEFFICIENT]
 
 
 def select_axes(pattern: str, _: object = None) -> tuple[str, ...]:
@@ -73,7 +73,7 @@ class Limit(SettingsModel):
     below: Coefficient | None = Field(
         None, examples=[1.0e-5], description="lower bound in the SI unit of the coefficient, as in a model file"
     )
-    times_model: Annotated[float, quantities.NOISE_RATIO] | None = Field(
+    times_model: Annotated[float, number_ranges.NOISE_RATIO] | None = Field(
         None, examples=[1.5], description="instead of above: upper bound as a multiple of the model in force"
     )
     hold_s: Duration = Field(
@@ -83,7 +83,7 @@ class Limit(SettingsModel):
         description="time for which the coefficient must be beyond the bound, or within the bounds again",
     )
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         """Yield a conflict if there is no bound, or if the bounds exclude each other."""
         bounds = ("above", "below", "times_model")
         if self.above is None and self.below is None and self.times_model is None:
@@ -112,28 +112,28 @@ class Device(SettingsModel):
     driver: Annotated[Driver, ReadAs(dict[str, Any], read_driver)] = Field(
         examples=[{"link": "virtual"}], description="link and decoder"
     )
-    rate_hz: Annotated[float, quantities.RATE_HZ] | None = Field(
+    rate_hz: Annotated[float, number_ranges.RATE_HZ] | None = Field(
         None, alias="rate", examples=[100.0], description="nominal sample rate in Hz; absent: found from the data"
     )
     window_s: Duration = Field(3600.0, alias="window", examples=["1h"], description="length of the sliding window")
     tau: Annotated[
         Literal["octave", "decade10"] | tuple[float, ...],
-        WordOr({"octave": "octave", "decade10": "decade10"}, ListOf[Annotated[float, quantities.AVERAGING_TIME_S]]),
+        WordOr({"octave": "octave", "decade10": "decade10"}, ListOf[Annotated[float, number_ranges.AVERAGING_TIME_S]]),
     ] = Field("octave", description="averaging times: a grid, or a list of seconds")
-    refit_s: Annotated[float, period_or("every sample")] = Field(
+    refit_s: Annotated[float, period_annotation("every sample")] = Field(
         0.1,
         alias="refit",
         examples=["10 Hz"],
         description='rate at which the coefficients are fitted, or "every sample"',
     )
-    publish_s: Annotated[float, period_or("every block")] = Field(
+    publish_s: Annotated[float, period_annotation("every block")] = Field(
         0.1, alias="publish", examples=["10 Hz"], description='rate at which results are published, or "every block"'
     )
     motion: Literal["tell", "leave out"] = Field(
         "tell",
         description="tell: report motion; leave out: exclude motion from the noise, which delays samples by 0.5 s",
     )
-    alarms_per_day: Annotated[float, quantities.ALARMS_PER_DAY] = Field(
+    alarms_per_day: Annotated[float, number_ranges.ALARMS_PER_DAY] = Field(
         0.033, description="accepted false alarms of changed noise per day, of all axes together; 0 = no detection"
     )
     restart: bool = Field(True, description="true: the fit of an axis starts again after its noise has changed")
@@ -181,7 +181,7 @@ class Device(SettingsModel):
         """True if motion is excluded from the noise."""
         return self.motion == "leave out"
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         """Yield a conflict for each length that does not match the sample rate, and for a limit without a model."""
         if text := self._window_problem():
             yield Conflict("window", text, ("rate",))
@@ -240,7 +240,7 @@ class ZenohTable(SettingsModel):
             return table
         return {"mode": None, "listen": None, **table}
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         """Yield a conflict if a client does not know a router."""
         if self.mode == "client" and not self.connect and self.config is None:
             text = 'empty, but a client needs a router, e.g. ["tcp/127.0.0.1:7447"]'
@@ -260,8 +260,8 @@ class ViewerTable(SettingsModel):
     mode: Annotated[str, AfterValidator(_viewer_mode)] = Field(
         "auto", description="auto, native, web, none, or a file ending in .rrd"
     )
-    port: Annotated[int, quantities.PORT] = Field(9876, description="TCP port of the viewer's data, on loopback")
-    web_port: Annotated[int, quantities.PORT] = Field(9090, description="TCP port of the viewer's page, on loopback")
+    port: Annotated[int, number_ranges.PORT] = Field(9876, description="TCP port of the viewer's data, on loopback")
+    web_port: Annotated[int, number_ranges.PORT] = Field(9090, description="TCP port of the viewer's page, on loopback")
     memory: Annotated[str, checked_by(check_memory)] = Field(
         "256MiB", description="memory for past data; the oldest data are dropped first"
     )
@@ -288,12 +288,12 @@ class Storage(SettingsModel):
     keep_s: Duration = Field(
         30 * DAY_S, alias="keep", examples=["30d"], description="age at which segments are deleted"
     )
-    disk_share: Annotated[float, quantities.POSITIVE_SHARE] = Field(
+    disk_share: Annotated[float, number_ranges.POSITIVE_SHARE] = Field(
         0.9, description="used share of the disk above which the oldest segments are deleted"
     )
     history: bool = Field(True, description="keep results, events and status for years, thinned with age")
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         """Yield a conflict if segments are deleted before they are complete."""
         if self.keep_s < self.segment_s:
             text = f"{self.keep_s:g} s is shorter than a segment of {self.segment_s:g} s"
@@ -342,7 +342,7 @@ class Hook(SettingsModel):
         30.0, alias="timeout", examples=["30s"], description="time after which the command and its children are killed"
     )
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         """Yield a conflict if the hook has no action."""
         if not self.command and self.key is None:
             yield Conflict("", "nothing to do; add command or key", ("command", "key"))
@@ -376,7 +376,7 @@ class ConfigFile(SettingsModel):
     metrics: MetricsTable = Field(MetricsTable(), description="numbers for Prometheus")
     log: LogTable = Field(LogTable(), description="messages of the service")
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         """Yield the conflicts between tables."""
         names = [device.name for device in self.devices]
         places = tuple(f"device[{i}].name" for i in range(len(names)))

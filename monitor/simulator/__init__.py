@@ -1,7 +1,15 @@
-"""Simulated IMU that sends a real wire format over a real link: noise model, encoder, faults and link endpoint."""
+"""Simulated IMU that sends a real wire format over a real link, with a noise model and with faults."""
 
-from monitor.simulator.scheduled_effects import parse_effects
+from monitor.simulator.scheduled_effect_parser import parse_effects
 from monitor.simulator.sensor import AMBIENT_C, DEFAULT_RATE_HZ, WARM_UP_C, WARM_UP_S, SimulatedSensor
-from monitor.simulator.virtual_imu import VirtualImu
+from monitor.simulator.simulated_device import SimulatedDevice
 
-__all__ = ["AMBIENT_C", "DEFAULT_RATE_HZ", "WARM_UP_C", "WARM_UP_S", "SimulatedSensor", "VirtualImu", "parse_effects"]
+__all__ = [
+    "AMBIENT_C",
+    "DEFAULT_RATE_HZ",
+    "WARM_UP_C",
+    "WARM_UP_S",
+    "SimulatedDevice",
+    "SimulatedSensor",
+    "parse_effects",
+]

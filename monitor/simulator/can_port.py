@@ -1,15 +1,16 @@
-"""Port of a simulated sensor on a virtual CAN bus of python-can, whose random channel name no other program knows.
+"""Port of a simulated sensor on a virtual CAN bus of python-can.
 
-As on a real bus, disconnecting the sensor leaves the bus in place. The link detects it because no frames arrive.
+The channel of the bus has a random name, so no other program uses it. As on a real bus, the bus remains when the sensor
+is disconnected. The link then detects that no frames arrive.
 """
 
 import secrets
-import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
 from drivers.links import can_link
 from drivers.sample import EXTENDED_ID, Chunk
+from monitor.simulator.port import Port
 
 if TYPE_CHECKING:
     import can
@@ -20,20 +21,14 @@ CLASSIC_BYTES: Final = 8
 """Largest payload of a classic CAN frame; longer frames are CAN FD."""
 
 
-class CanPort:
-    """Port with a CAN controller on a bus of its own.
-
-    Parameters
-    ----------
-    silence_s : float
-        Time in seconds without frames after which the link counts as lost.
-    """
+class CanPort(Port):
+    """Port with a CAN controller on a separate bus. The link is lost after ``silence_s`` seconds without frames."""
 
     def __init__(self, silence_s: float) -> None:
         self._channel = f"imu-monitor-{secrets.token_hex(8)}"
-        self.link = can_link.build(can_link.Settings(interface="virtual", channel=self._channel, silence=silence_s))
+        settings = can_link.Settings(interface="virtual", channel=self._channel, silence=silence_s)
+        super().__init__(can_link.build(settings))
         self._bus: can.BusABC | None = None
-        self._plugging = threading.Lock()
 
     def plug(self) -> None:
         """Connect to the bus."""
@@ -50,8 +45,8 @@ class CanPort:
             if bus is not None:
                 bus.shutdown()
 
-    def send(self, chunks: Sequence[Chunk]) -> int:
-        """Send each chunk as one frame; return the number of sent chunks."""
+    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
+        """Send each chunk as one CAN frame; return the number of chunks that were sent."""
         import can
 
         with self._plugging:
@@ -67,7 +62,3 @@ class CanPort:
                     )
                 )
         return len(chunks)
-
-    def close(self) -> None:
-        """Disconnect from the bus permanently."""
-        self.unplug()

@@ -1,5 +1,6 @@
-"""Configuration of the ``demo`` command: the shipped configuration, with another sensor or further effects if
-requested.
+"""Configuration of the ``demo`` command.
+
+The configuration is the shipped one. Options select another sensor and add effects.
 """
 
 from collections.abc import Callable, Sequence
@@ -8,9 +9,9 @@ from pathlib import Path
 from typing import Final, ParamSpec, TypeVar
 
 from drivers.errors import ConfigError
-from monitor.common import config_files
-from monitor.common.config_files import CONFIG_FOLDER
-from monitor.noise.catalogue import read_model
+from monitor.common import shipped_file_paths
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.noise.model_catalogue import read_model
 from monitor.settings import loading
 from monitor.settings.loading import Config, VirtualTable
 from monitor.simulator import DEFAULT_RATE_HZ, parse_effects
@@ -37,14 +38,16 @@ def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_a
     Raises
     ------
     ConfigError
-        An option has an invalid value. The message of one line begins with the option.
+        If an option has an invalid value. The message begins with the name of the option.
     """
     config = loading.load(DEMO_CONFIG)
     (device,) = config.devices
     table = device.link
     assert isinstance(table, VirtualTable)
     given = {
-        "model": None if sensor is None else str(_for_option("--sensor", config_files.model_path, sensor, Path.cwd())),
+        "model": None
+        if sensor is None
+        else str(_for_option("--sensor", shipped_file_paths.model_path, sensor, Path.cwd())),
         "effect": tuple(effects) or None,
         "effect_at": effect_at_s,
     }
@@ -53,7 +56,7 @@ def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_a
     for text in effects:
         _for_option("--effect", parse_effects, text)
     window_s = min(device.window_s, loading.WINDOW_SAMPLES[1] / rate_hz)
-    # the sensor's own model is in force, so that the viewer shows when the sensor no longer agrees with it
+    # the viewer then shows when the sensor no longer agrees with the noise model
     driver = replace(device.driver, link=table)
     update = {"driver": driver, "rate_hz": rate_hz, "window_s": window_s, "model": Path(table.model)}
     device = device.model_copy(update=update)

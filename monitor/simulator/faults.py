@@ -1,11 +1,10 @@
-"""Random faults between a simulated sensor and its reader: lost, repeated, corrupted and truncated samples.
+"""Random faults between a simulated sensor and the reader: lost, repeated, corrupted and truncated samples.
 
-Each sample has at most one fault. The fault depends only on the number of the sample and on the seed, not on the bursts
-in which samples are sent. A sample of several chunks (CAN frames) has its fault in the last chunk. A CAN frame with a
-flipped bit does not arrive, because the checksum of the bus rejects it.
+Each sample has at most one fault. The fault depends only on the seed and on the number of the sample. It does not
+depend on the bursts in which samples are sent. If a sample has several chunks (CAN frames), the fault affects the last
+chunk. A CAN frame with a flipped bit does not arrive, because the checksum of the bus rejects the frame.
 
-``FaultCounts`` counts the faults, so that a test can compare them with the counts of the reader. The module does no
-input or output.
+A test can compare ``FaultCounts`` with the counts of the reader. The module does no input or output.
 """
 
 from dataclasses import dataclass, replace
@@ -22,11 +21,11 @@ from monitor.settings.loading import FaultsTable
 SPAWN_KEY: Final = crc32(b"faults")
 """Key of the random streams of the faults."""
 DRAWS_PER_SAMPLE: Final = 3
-"""Uniform random numbers for each sample: the fault, its position in the frame, and whether the cable is pulled."""
+"""Number of uniform random numbers per sample: kind of fault, position in the frame, and pulled cable."""
 
 
 class FaultKind(IntEnum):
-    """Fault of one sample, in the order in which the probabilities are added up."""
+    """Kind of fault of a sample, in the order in which the probabilities are added up."""
 
     LOST = 0
     REPEATED = 1
@@ -37,9 +36,9 @@ class FaultKind(IntEnum):
 
 @dataclass(slots=True)
 class FaultCounts:
-    """Counts of a simulated sensor. Samples made = sent + lost + flipped + cut + dropped."""
+    """Number of samples of a simulated sensor, by fault."""
 
-    sent: int = 0  # sent without corruption, including repeated samples
+    sent: int = 0  # samples sent without corruption; a repeated sample counts once
     lost: int = 0
     repeated: int = 0
     flipped: int = 0
@@ -49,22 +48,22 @@ class FaultCounts:
     held_s: float = 0.0  # longest delay of a burst
 
     @property
-    def made(self) -> int:
-        """Number of samples so far."""
+    def sample_count(self) -> int:
+        """Number of simulated samples: sent + lost + flipped + cut + dropped."""
         return self.sent + self.lost + self.flipped + self.cut + self.dropped
 
-    def count(self, kind: FaultKind, out: bool) -> None:
+    def count_sample(self, kind: FaultKind, all_sent: bool) -> None:
         """Count one sample.
 
         Parameters
         ----------
         kind : FaultKind
             Fault of the sample.
-        out : bool
-            True if all chunks that were to be sent have been sent.
+        all_sent : bool
+            True if all chunks of the sample were sent, except those that the fault removes.
         """
         match kind:
-            case _ if not out:
+            case _ if not all_sent:
                 self.dropped += 1
             case FaultKind.LOST:
                 self.lost += 1
@@ -85,12 +84,12 @@ class DrawnFaults:
     where: Floats  # [n] position of the fault in the frame, 0 to 1
     pulled: NDArray[np.bool_]  # [n] True if the cable is pulled before this sample
 
-    def kinds(self) -> list[FaultKind]:
+    def kind_per_sample(self) -> list[FaultKind]:
         """Return the fault of each sample."""
         return [FaultKind(kind) for kind in self.kind.tolist()]
 
     def __getitem__(self, rows: slice) -> "DrawnFaults":
-        """Return the faults of a part of the samples."""
+        """Return the faults of the selected samples."""
         return DrawnFaults(self.kind[rows], self.where[rows], self.pulled[rows])
 
 
@@ -104,7 +103,7 @@ class Faults:
     seed : int
         Seed of the sensor.
     carrier : str
-        Carrier of its wire format.
+        Carrier of the wire format.
     """
 
     def __init__(self, table: FaultsTable, seed: int, carrier: str) -> None:
@@ -112,12 +111,12 @@ class Faults:
         self._unplug_probability = table.unplugged
         self._has_checksum = carrier == "frames"
         self._jitter_s = table.jitter
-        # bursts have a generator of their own, because their number depends on the machine
+        # separate generators, because the number of bursts depends on the machine
         self._rng, self._delay_rng = (
             np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SPAWN_KEY, i))) for i in range(2)
         )
 
-    def draw(self, n: int) -> DrawnFaults:
+    def draw_faults(self, n: int) -> DrawnFaults:
         """Draw the faults of the next ``n`` samples."""
         u = self._rng.random((n, DRAWS_PER_SAMPLE))
         return DrawnFaults(np.searchsorted(self._edges, u[:, 0], "right"), u[:, 1], u[:, 2] < self._unplug_probability)
@@ -127,7 +126,7 @@ class Faults:
         return float(self._delay_rng.uniform(0.0, self._jitter_s)) if self._jitter_s else 0.0
 
     def apply_fault(self, kind: FaultKind, where: float, chunks: list[Chunk]) -> list[Chunk]:
-        """Apply a fault to the chunks of one sample, and return the chunks that are sent.
+        """Apply a fault to the chunks of one sample, and return the chunks to send.
 
         Parameters
         ----------
@@ -152,7 +151,7 @@ class Faults:
 
 
 def _flipped(chunk: Chunk, where: float) -> Chunk:
-    """Return the chunk with one bit flipped."""
+    """Return a copy of a chunk with one flipped bit."""
     at, bit = divmod(int(where * 8 * len(chunk.data)), 8)
     data = bytearray(chunk.data)
     data[at] ^= 1 << bit
@@ -160,5 +159,5 @@ def _flipped(chunk: Chunk, where: float) -> Chunk:
 
 
 def _cut(chunk: Chunk, where: float) -> Chunk:
-    """Return the chunk truncated: it keeps at least its first byte and loses at least its last."""
+    """Return a truncated chunk, with at least the first byte and without at least the last byte."""
     return replace(chunk, data=chunk.data[: 1 + int(where * (len(chunk.data) - 1))])

@@ -1,20 +1,29 @@
-"""Ports of simulated sensors: the far end of the link that the service reads, one module for each carrier.
+"""Ports of simulated sensors. A port is the sensor's end of the link that the service reads.
 
-``link`` is an ordinary link, as for a real sensor. The port exists from ``plug`` to ``unplug``. Both methods may be
-called from any thread, and repeated calls have no effect.
+Each carrier has a module with its port. ``Port.link`` is an ordinary link, as for a real sensor.
 """
 
+import threading
 from collections.abc import Sequence
-from typing import Protocol
 
 from drivers.links.base import Link
 from drivers.sample import Chunk
 
 
-class Port(Protocol):
-    """Interface of the port to which a simulated sensor sends."""
+class Port:
+    """Base class of the ports.
 
-    link: Link
+    Any thread may call ``plug`` and ``unplug``. Repeated calls have no effect.
+
+    Parameters
+    ----------
+    link : Link
+        Link that reads the data of the sensor.
+    """
+
+    def __init__(self, link: Link) -> None:
+        self.link = link
+        self._plugging = threading.Lock()
 
     def plug(self) -> None:
         """Connect the sensor.
@@ -22,17 +31,21 @@ class Port(Protocol):
         Raises
         ------
         LinkUnavailable
-            The port cannot be opened.
+            If the port cannot be opened.
         """
+        raise NotImplementedError
 
     def unplug(self) -> None:
-        """Disconnect the sensor, as a pulled cable does."""
+        """Disconnect the sensor, as if its cable was pulled."""
+        raise NotImplementedError
 
-    def send(self, chunks: Sequence[Chunk]) -> int:
-        """Send chunks without waiting for a reader; return the number of complete chunks, counted from the first."""
+    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
+        """Send chunks without waiting for a reader; return the number of chunks that were sent completely."""
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Disconnect the sensor permanently and remove all files of the port."""
+        """Disconnect the sensor permanently, and remove the files of the port."""
+        self.unplug()
 
 
 def create_port(carrier: str, silence_s: float) -> Port:

@@ -1,8 +1,7 @@
-"""Port of a simulated sensor on a pseudo-terminal: the sensor writes to the master side, the serial link reads the
-slave.
+"""Port of a simulated sensor on a pseudo-terminal.
 
-A symbolic link in a temporary folder keeps the name of the port the same across disconnections. Data that does not fit
-into the buffer of the terminal is dropped.
+The sensor writes to the master side, and the serial link reads from the slave side. A symbolic link in a temporary
+folder keeps the name of the port constant. Data that do not fit into the buffer of the terminal are dropped.
 """
 
 import contextlib
@@ -10,7 +9,6 @@ import os
 import select
 import shutil
 import tempfile
-import threading
 from collections.abc import Sequence
 from itertools import accumulate
 from pathlib import Path
@@ -18,26 +16,21 @@ from typing import Final
 
 from drivers.links import serial_link
 from drivers.sample import Chunk
+from monitor.simulator.port import Port
 
 WAIT_S: Final = 0.01
 """Longest wait for space in the buffer of the terminal."""
 
 
-class PtyPort:
-    """Serial port that exists while it is connected.
-
-    Parameters
-    ----------
-    silence_s : float
-        Time in seconds without data after which the link counts as lost.
-    """
+class PtyPort(Port):
+    """Serial port on a pseudo-terminal. The link is lost after ``silence_s`` seconds without data."""
 
     def __init__(self, silence_s: float) -> None:
         self._folder = Path(tempfile.mkdtemp(prefix="imu-monitor-"))
         self.path = self._folder / "tty"
-        self.link = serial_link.build(serial_link.Settings(port=str(self.path), baudrate=921600, silence=silence_s))
+        settings = serial_link.Settings(port=str(self.path), baudrate=921600, silence=silence_s)
+        super().__init__(serial_link.build(settings))
         self._master: int | None = None
-        self._plugging = threading.Lock()
 
     def plug(self) -> None:
         """Create the pseudo-terminal and the symbolic link to it."""
@@ -56,32 +49,26 @@ class PtyPort:
             self._master = master
 
     def unplug(self) -> None:
-        """Remove the port, as a pulled cable does."""
+        """Close the pseudo-terminal, and remove the symbolic link to it."""
         with self._plugging:
             master, self._master = self._master, None
             self.path.unlink(missing_ok=True)
             if master is not None:
                 os.close(master)
 
-    def send(self, chunks: Sequence[Chunk]) -> int:
-        """Write chunks; return the number of complete chunks, counted from the first.
-
-        Writing continues as long as the reader empties the buffer.
-        """
-        written = self._write(b"".join(chunk.data for chunk in chunks))
-        return sum(end <= written for end in accumulate(len(chunk.data) for chunk in chunks))
-
-    def close(self) -> None:
-        """Remove the port and its folder."""
-        self.unplug()
-        shutil.rmtree(self._folder, ignore_errors=True)
-
-    def _write(self, data: bytes) -> int:
-        """Write bytes until the buffer stays full; return the number of written bytes."""
+    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
+        """Write chunks while the reader empties the buffer; return the number of completely written chunks."""
+        data = b"".join(chunk.data for chunk in chunks)
         view = memoryview(data)
         with self._plugging, contextlib.suppress(BlockingIOError):
             while view and self._master is not None:
                 if not select.select([], [self._master], [], WAIT_S)[1]:
                     break
                 view = view[os.write(self._master, view) :]
-        return len(data) - len(view)
+        written = len(data) - len(view)
+        return sum(end <= written for end in accumulate(len(chunk.data) for chunk in chunks))
+
+    def close(self) -> None:
+        """Disconnect the sensor, and remove the folder of the symbolic link."""
+        self.unplug()
+        shutil.rmtree(self._folder, ignore_errors=True)

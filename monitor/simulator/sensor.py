@@ -1,7 +1,7 @@
-"""Simulated sensor: encoded samples of a noise model, with effects that begin while it runs.
+"""Simulated sensor: encoded samples of a noise model, with effects that begin while the sensor runs.
 
-The sensor's own time is the number of the sample divided by the rate of the model. Its counters and time stamps show
-this time, whatever its true rate is.
+The clock of the sensor shows the number of the sample divided by the sample rate of the model. Counters and time stamps
+follow this clock, even if the samples are sent at another rate.
 """
 
 import copy
@@ -14,11 +14,11 @@ import structlog
 
 from drivers.decoders.base import Decoder
 from drivers.errors import ConfigError
-from drivers.sample import NO_TICK, Chunk, CounterTiming, Floats, Ints, make_block
-from monitor.noise.catalogue import read_model
+from drivers.sample import NO_TICK, Chunk, CounterTimedFormat, Floats, Ints, make_block
+from monitor.noise.model_catalogue import read_model
 from monitor.noise.simulation import ModelStream
 from monitor.settings.loading import VirtualTable
-from monitor.simulator.scheduled_effects import parse_effects
+from monitor.simulator.scheduled_effect_parser import parse_effects
 
 DEFAULT_RATE_HZ: Final = 100.0
 """Sample rate if the model has none."""
@@ -27,7 +27,7 @@ AMBIENT_C: Final = 24.0
 WARM_UP_C: Final = 6.0
 """Rise of the die temperature after the start if the model has no temperature."""
 WARM_UP_S: Final = 300.0
-"""Time constant of this rise."""
+"""Time constant of the rise of the die temperature."""
 
 _log = structlog.get_logger("imu-monitor")
 
@@ -43,7 +43,7 @@ def check_sensor(table: VirtualTable) -> None:
     Raises
     ------
     ConfigError
-        The model or an effect is invalid. The message has one line for each mistake.
+        If the model or an effect is invalid. The message has one line for each mistake.
     """
     wrong: list[str] = []
     coming = []
@@ -70,7 +70,7 @@ def check_sensor(table: VirtualTable) -> None:
 
 
 class SimulatedSensor:
-    """Simulated sensor without its link.
+    """Simulated sensor without a link.
 
     Parameters
     ----------
@@ -84,7 +84,7 @@ class SimulatedSensor:
     Raises
     ------
     ConfigError
-        The model or an effect cannot be used.
+        If the model or an effect cannot be used.
     """
 
     def __init__(self, table: VirtualTable, decoder: Decoder, name: str) -> None:
@@ -92,27 +92,26 @@ class SimulatedSensor:
         self._model = read_model(Path(table.model))
         self.rate_hz = self._model.sample_rate_hz or DEFAULT_RATE_HZ
         self._pending_effects = [(text, axis, effect) for text in table.effect for axis, effect in parse_effects(text)]
-        self._effects_begin_at = round(
-            table.effect_at * self.rate_hz
-        )  # number of the sample at which the effects begin
+        # number of the sample at which the effects begin
+        self._effects_begin_at = round(table.effect_at * self.rate_hz)
         self._decoder = copy.deepcopy(decoder)
         self._stream = self._create_stream(table.seed)
         self._unix_ns = 0  # time of the first sample
         self._made = 0
-        self._add_effects(self._create_stream(table.seed))  # raises errors of the effects before the sensor starts
+        self._add_effects(self._create_stream(table.seed))  # reports errors of the effects before the sensor starts
 
-    def switch_on(self) -> None:
-        """Start the clock of the sensor. Kernels of the simulation are compiled before the first sample."""
+    def start_clock(self) -> None:
+        """Start the clock of the sensor, after the kernels of the simulation have been compiled."""
         trial = self._create_stream(0)
         self._add_effects(trial)
         trial.draw_with_temperature(1)
         self._unix_ns = time.time_ns()
 
-    def skip(self, n: int) -> None:
-        """Skip ``n`` samples that are never sent. The counter continues."""
+    def skip_samples(self, n: int) -> None:
+        """Skip ``n`` samples. The counter of the sensor continues."""
         self._made += n
 
-    def frames(self, n: int) -> list[list[Chunk]]:
+    def encode_next_samples(self, n: int) -> list[list[Chunk]]:
         """Return the chunks of each of the next ``n`` samples."""
         index = np.arange(self._made, self._made + n)
         values, temperature_c = self._measured(n)
@@ -121,14 +120,14 @@ class SimulatedSensor:
         t_ns = self._unix_ns + np.rint(index * (1e9 / self.rate_hz)).astype(np.int64)
         samples = make_block(t_ns, values, temperature_c, self._ticks(index))
         self._made += n
-        if self._decoder.carrier == "messages":  # each sample gets its own message, because each may have a fault
+        if self._decoder.carrier == "messages":  # one message per sample, because each sample may have a fault
             return [self._decoder.encode(samples[i : i + 1]) for i in range(n)]
         chunks = self._decoder.encode(samples)
         each = len(chunks) // n
         return [chunks[i * each : (i + 1) * each] for i in range(n)]
 
     def _measured(self, n: int) -> tuple[Floats, Floats]:
-        """Return values [n, 6] and temperature [n]; the effects begin at their sample."""
+        """Return values [n, 6] and temperature [n] of the next samples, with the effects from their start on."""
         before = max(self._effects_begin_at - self._made, 0)
         if not self._pending_effects or before >= n:
             drawn = self._stream.draw_with_temperature(n)
@@ -143,11 +142,11 @@ class SimulatedSensor:
         return np.concatenate([p.values for p in parts]), np.concatenate([p.temperature_c for p in parts])
 
     def _create_stream(self, seed: int) -> ModelStream:
-        """Create the random series of the model."""
+        """Create a random series of the noise model."""
         return self._model.stream(self.rate_hz, seed)
 
     def _add_effects(self, stream: ModelStream) -> None:
-        """Add the effects to a random series."""
+        """Add the effects that have not begun to a random series."""
         for text, axis, effect in self._pending_effects:
             try:
                 stream.add(axis, effect)
@@ -157,7 +156,7 @@ class SimulatedSensor:
     def _ticks(self, index: Ints) -> Ints:
         """Return the counter values of samples."""
         timing = self._decoder.timing
-        if not isinstance(timing, CounterTiming):
+        if not isinstance(timing, CounterTimedFormat):
             return np.full(index.size, NO_TICK, np.int64)
         ticks = index if timing.tick_s is None else np.rint(index / (self.rate_hz * timing.tick_s)).astype(np.int64)
         result: Ints = ticks % timing.modulus

@@ -1,16 +1,17 @@
-"""Port of a simulated sensor that publishes over zenoh on the loopback interface; its link connects only to this
-session.
+"""Port of a simulated sensor that publishes over zenoh on the loopback interface.
+
+The link connects only to the session of this port.
 """
 
 import socket
-import threading
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.errors import LinkUnavailable
 from drivers.links import zenoh_link
 from drivers.sample import Chunk
-from drivers.zenoh.session import build_session_config, format_error
+from drivers.zenoh.session_config import build_session_config, format_zenoh_error
+from monitor.simulator.port import Port
 
 if TYPE_CHECKING:
     import zenoh
@@ -19,30 +20,18 @@ KEY: Final = "imu-monitor/virtual/samples"
 """Key of the published samples."""
 
 
-class ZenohPort:
-    """Port that publishes over a zenoh session of its own while it is connected.
-
-    Parameters
-    ----------
-    silence_s : float
-        Time in seconds without messages after which the link counts as lost.
-    """
+class ZenohPort(Port):
+    """Port with a separate zenoh session. The link is lost after ``silence_s`` seconds without messages."""
 
     def __init__(self, silence_s: float) -> None:
         self._endpoint = f"tcp/127.0.0.1:{_free_port()}"
-        self.link = zenoh_link.build(zenoh_link.Settings(key=KEY, connect=(self._endpoint,), silence=silence_s))
+        settings = zenoh_link.Settings(key=KEY, connect=(self._endpoint,), silence=silence_s)
+        super().__init__(zenoh_link.build(settings))
         self._session: zenoh.Session | None = None
         self._publisher: Any = None
-        self._plugging = threading.Lock()
 
     def plug(self) -> None:
-        """Open the session.
-
-        Raises
-        ------
-        LinkUnavailable
-            Another program uses the network port.
-        """
+        """Open the session."""
         import zenoh
 
         with self._plugging:
@@ -52,7 +41,7 @@ class ZenohPort:
                 self._session = zenoh.open(build_session_config({"listen/endpoints": [self._endpoint]}))
                 self._publisher = self._session.declare_publisher(KEY)
             except zenoh.ZError as error:
-                raise LinkUnavailable(f"simulated sensor at {self._endpoint}: {format_error(error)}") from error
+                raise LinkUnavailable(f"simulated sensor at {self._endpoint}: {format_zenoh_error(error)}") from error
 
     def unplug(self) -> None:
         """Close the session."""
@@ -61,20 +50,14 @@ class ZenohPort:
             if session is not None:
                 session.close()  # type: ignore[no-untyped-call]
 
-    def send(self, chunks: Sequence[Chunk]) -> int:
-        """Publish each chunk as one message; return the number of published chunks. Zenoh drops messages for slow
-        readers.
-        """
+    def send_chunks(self, chunks: Sequence[Chunk]) -> int:
+        """Publish each chunk as one message; return the number of published chunks. Slow readers miss messages."""
         with self._plugging:
             if self._session is None:
                 return 0
             for chunk in chunks:
                 self._publisher.put(chunk.data, attachment=chunk.attachment or None)
         return len(chunks)
-
-    def close(self) -> None:
-        """Close the session permanently."""
-        self.unplug()
 
 
 def _free_port() -> int:

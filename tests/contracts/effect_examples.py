@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from monitor.noise.effect import Effect, parameter_units
+from monitor.noise.effect import Effect, gyro_and_accel_units
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, ExponentiallyCorrelated, RateRandomWalk, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature
@@ -81,7 +81,7 @@ EXAMPLES = {
 
 def example(name: str) -> Example:
     """The entry, or every parameter at 0.3: a value that is not one, so that a lost square shows."""
-    return EXAMPLES.get(name) or Example(dict.fromkeys(parameter_units(EFFECTS[name]), 0.3))
+    return EXAMPLES.get(name) or Example(dict.fromkeys(gyro_and_accel_units(EFFECTS[name]), 0.3))
 
 
 def effect(name: str) -> Effect:

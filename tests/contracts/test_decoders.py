@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from drivers.decoders.base import Decoder
 from drivers.sample import (
     NO_TICK,
-    ArrivalTiming,
+    ArrivalTimedFormat,
     Chunk,
-    CounterTiming,
+    CounterTimedFormat,
     SampleBlock,
-    SenderTiming,
+    SenderTimedFormat,
     concatenate_blocks,
     make_block,
 )
@@ -47,7 +47,7 @@ def made(decoder: Decoder, n: int = N, seed: int = 7) -> SampleBlock:
     rng = np.random.default_rng(seed)
     values = rng.normal(0.0, 0.5, (n, 6)) + np.array([0.0, 0.0, 0.0, 0.0, 0.0, 9.8])
     ticks = np.full(n, NO_TICK, np.int64)
-    if isinstance(decoder.timing, CounterTiming):
+    if isinstance(decoder.timing, CounterTimedFormat):
         step = 1 if decoder.timing.tick_s is None else max(round(5e-4 / decoder.timing.tick_s), 1)
         ticks = (decoder.timing.modulus - (n // 2) * step + np.arange(n) * step) % decoder.timing.modulus
     return make_block(np.arange(1, n + 1) * STEP_NS, values, rng.normal(25.0, 1.0, n), ticks)
@@ -129,13 +129,13 @@ def test_encode_then_feed_gives_back_the_samples_to_half_a_bit(example: Example,
         degrees = np.abs(got.temperature_c - samples.temperature_c).max()
         assert degrees <= 0.5 * example.temperature_step * (1 + 1e-6)
     assert got.lost == decoder.bad == 0
-    assert decoder.hint == ""
-    if isinstance(decoder.timing, CounterTiming):
+    assert decoder.recent_problem == ""
+    if isinstance(decoder.timing, CounterTimedFormat):
         assert got.ticks.tolist() == samples.ticks.tolist()
         assert np.diff(got.ticks).min() < 0, "the counter did not wrap"
-    if isinstance(decoder.timing, ArrivalTiming):
+    if isinstance(decoder.timing, ArrivalTimedFormat):
         assert (got.ticks == NO_TICK).all()
-    if isinstance(decoder.timing, SenderTiming):
+    if isinstance(decoder.timing, SenderTimedFormat):
         assert got.t_ns.tolist() == samples.t_ns.tolist()
 
 
@@ -159,7 +159,7 @@ def test_one_call_or_many_make_no_difference(example: Example, decoder: Decoder,
 def test_nothing_fed_gives_nothing(decoder: Decoder) -> None:
     assert decoder.feed([]) == []
     assert decoder.feed([Chunk(b"", 5)]) == []
-    assert decoder.hint == "" or decoder.carrier != "bytes"
+    assert decoder.recent_problem == "" or decoder.carrier != "bytes"
 
 
 # --- byte streams ------------------------------------------------------------------------------
@@ -266,7 +266,7 @@ def test_one_damaged_byte_costs_exactly_its_sample(example: Example, decoder: De
         assert seen(blocks)[0] == expected[:k] + expected[k + 1 :], f"byte {at} ^ {mask:#x}"
         assert [(len(b), b.lost) for b in blocks] == [(k, 0), (N - k - 1, 1)]
         assert fresh.bad == 1
-        assert fresh.hint != ""
+        assert fresh.recent_problem != ""
 
 
 @every_checked_stream
@@ -329,7 +329,7 @@ def test_garbage_raises_nothing_and_fills_no_memory(decoder: Decoder) -> None:
     after, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert after - before < 30_000
-    assert decoder.hint != ""
+    assert decoder.recent_problem != ""
     lines = b"\r\n" if decoder.encode(made(decoder, 1))[0].data.endswith(b"\r\n") else b""
     frames = bytes_of(chunks_of(decoder, made(decoder, 200)))
     got = seen(feed_bytes(decoder, lines + b"".join(frames)))
@@ -358,7 +358,7 @@ def test_a_damaged_chunk_costs_only_its_sample(example: Example, decoder: Decode
         assert got[0] == expected[:k] + expected[k + 1 :]
         assert got[3] == 1
         assert fresh.bad == 1
-        assert fresh.hint != ""
+        assert fresh.recent_problem != ""
 
 
 @every_frame

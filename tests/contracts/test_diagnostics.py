@@ -13,7 +13,7 @@ import pytest
 from scipy.stats import norm
 
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding
-from monitor.reconcile.diagnostics.null_distribution import null_distributions, run_diagnostics
+from monitor.reconcile.diagnostics.null_distribution import estimate_null_distributions, run_diagnostics
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, inverse_cosine_transform
 from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, N, axes, correlated, seen, time_s, walk, warmth, white
@@ -47,7 +47,9 @@ def all_nulls(name: str) -> np.ndarray:
     """Return null95 of a diagnostic in nats, from six recordings with three axes at a time."""
     found = findings(0, 108)
     parts = [found[at : at + 18] for at in range(0, 108, 18)]
-    each = [null_distributions({axis: part[k::3] for k, axis in enumerate(("gx", "gy", "gz"))}, 3) for part in parts]
+    each = [
+        estimate_null_distributions({axis: part[k::3] for k, axis in enumerate(("gx", "gy", "gz"))}) for part in parts
+    ]
     return np.array([null[axis][name].null95 for null in each for axis in null])
 
 
@@ -162,7 +164,7 @@ def test_finding_depends_only_on_the_input_and_the_input_is_not_changed(name):
     y = HIDDEN[name](white(n, rng))
     kept = y.copy()
     one, other = whitened_by_white_noise(y), whitened_by_white_noise(kept)
-    arrays = {field: getattr(one, field).copy() for field in ("whitened", "weight", "white", "fast")}
+    arrays = {field: getattr(one, field).copy() for field in ("coefficients", "weights", "series", "flat_series")}
     coefficients, samples = one.axis.coefficients.copy(), one.axis.repaired.copy()
     found = DIAGNOSTICS[name](one)
     assert DIAGNOSTICS[name](one) == found == DIAGNOSTICS[name](other)
@@ -182,7 +184,7 @@ def test_location_is_inside_the_recording(name):
         "time": (0.0, n / RATE_HZ),
         "temperature": (warmth(n).min() - 1e-9, warmth(n).max() + 1e-9),
     }
-    for kind, place in where.found().items():
+    for kind, place in where.resolved_dimensions().items():
         if kind in limits:
             assert limits[kind][0] <= place[0] <= place[1] <= limits[kind][1]
     if name == "other_axes":

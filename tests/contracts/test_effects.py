@@ -16,7 +16,7 @@ from scipy.signal import welch
 import monitor.noise.effects as folder
 from drivers.errors import ConfigError
 from drivers.sample import AXES
-from monitor.noise.effect import Effect, Leak, Source, Transform, parameter_units, required_parameters
+from monitor.noise.effect import Effect, Leak, Source, Transform, gyro_and_accel_units, required_parameters
 from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER, NoiseStep
 from monitor.noise.model import NoiseModel
 from tests.contracts.effect_examples import AXIS, RATE_HZ, effect, example, model, without
@@ -71,7 +71,7 @@ def test_says_what_it_is(name):
     assert kind.description.endswith(".")
     assert kind.description.count("\n") == 0
     assert kind.description[:-1].count(". ") == 0
-    assert all(gyro and accelerometer for gyro, accelerometer in parameter_units(kind).values())
+    assert all(gyro and accelerometer for gyro, accelerometer in gyro_and_accel_units(kind).values())
     assert inspect.getdoc(inspect.getmodule(kind))
     assert ">>>" in inspect.getdoc(kind)
     assert issubclass(kind, (Source, Leak, Transform, NoiseStep))
@@ -172,7 +172,7 @@ def test_is_read_back_as_it_was_written(name):
     assert NoiseModel.from_toml(written) == model(name)
     assert NoiseModel.from_toml(written).to_toml() == written
     assert name in str(model(name))
-    for parameter, (unit, _) in parameter_units(EFFECTS[name]).items():
+    for parameter, (unit, _) in gyro_and_accel_units(EFFECTS[name]).items():
         if getattr(effect(name), parameter) is not None and unit not in ("1", "axis"):
             assert f"{parameter} = " in str(model(name))
             assert unit in str(model(name))
@@ -190,13 +190,13 @@ def test_truth_is_ready_for_json_and_the_same_for_the_same_seed(name):
     def told() -> str:
         stream = model(name).stream(RATE_HZ, 4)
         stream.draw(500)
-        return json.dumps(stream.truth(), allow_nan=False)
+        return json.dumps(stream.drawn_values(), allow_nan=False)
 
     assert told() == told()
 
 
 def parameters(name: str, **changed: object) -> dict[str, object]:
-    return {**{key: example(name).parameters.get(key, 0.3) for key in parameter_units(EFFECTS[name])}, **changed}
+    return {**{key: example(name).parameters.get(key, 0.3) for key in gyro_and_accel_units(EFFECTS[name])}, **changed}
 
 
 NUMBERS = [(name, f.name) for name in NAMES for f in fields(EFFECTS[name]) if not f.metadata.get("axis")]

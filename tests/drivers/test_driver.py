@@ -369,11 +369,11 @@ def test_axes_are_mapped_with_their_signs():
 
 def test_axis_map_keeps_all_else():
     first = make_block(np.arange(3), np.arange(18.0).reshape(3, 6), np.ones(3), np.arange(3), 4)
-    mapped = parse_axis_map({"gx": "-gx"}).apply(first)
+    mapped = parse_axis_map({"gx": "-gx"}).map_axes(first)
     assert (mapped.lost, mapped.ticks.tolist(), mapped.temperature_c.tolist()) == (4, [0, 1, 2], [1.0] * 3)
     assert mapped.values[:, 0].tolist() == [-0.0, -6.0, -12.0]
     assert np.array_equal(mapped.values[:, 1:], first.values[:, 1:])
-    assert AxisMap().apply(first) is first
+    assert AxisMap().map_axes(first) is first
     assert parse_axis_map({}) == AxisMap()
 
 

@@ -15,11 +15,11 @@ from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.links import replay_link
 from drivers.recordings import load_samples, segment
 from drivers.recordings.writing import atomic_write_path
-from drivers.zenoh.session import build_session_config
+from drivers.zenoh.session_config import build_session_config
 from monitor.commands import thermal
-from monitor.common import config_files
+from monitor.common import shipped_file_paths
 from monitor.history import sqlite_store
-from monitor.noise.catalogue import read_model
+from monitor.noise.model_catalogue import read_model
 from monitor.publishing.zenoh.subscriber import client_configurations
 from monitor.settings import loading
 from tests.support.waiting import PATIENCE_S
@@ -111,7 +111,7 @@ def test_a_recording_in_a_folder_is_left_out_with_a_note(kind: str, tmp_path: Pa
 )
 def test_a_segment(kind: str, read: Callable[[Path], object], tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
-    path = tmp_path / segment.segment_name(1, 1.7e9)
+    path = tmp_path / segment.format_segment_name(1, 1.7e9)
     make(kind, path)
     with pytest.raises((RecordingError, OSError), match=KINDS[kind]):
         read(path)
@@ -123,9 +123,9 @@ def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
         part.write_text("x")
     assert (tmp_path / "a.csv").read_text() == "x"
     pytest.importorskip("pyarrow")
-    path = tmp_path / segment.segment_name(1, 1.7e9)
+    path = tmp_path / segment.format_segment_name(1, 1.7e9)
     os.mkfifo(path.with_name(path.name + ".part"))
-    segment.SegmentWriter(path, segment.SegmentMetadata("a", "samples")).close()
+    segment.SingleSegmentWriter(path, segment.SegmentMetadata("a", "samples")).close()
 
 
 @pytest.mark.parametrize(
@@ -133,7 +133,7 @@ def test_a_part_file_in_the_way_of_a_new_one(tmp_path: Path) -> None:
     [
         ("configuration", loading.load),
         ("model", read_model),
-        ("model name", lambda path: config_files.model_path(str(path), path.parent)),
+        ("model name", lambda path: shipped_file_paths.model_path(str(path), path.parent)),
         ("zenoh file", lambda path: client_configurations((), path)),
     ],
 )
@@ -167,7 +167,7 @@ def test_what_is_replayed(kind: str, suffix: str, tmp_path: Path) -> None:
 
 def test_a_segment_of_raw_bytes_that_is_replayed(tmp_path: Path) -> None:
     pytest.importorskip("pyarrow")
-    os.mkfifo(tmp_path / segment.segment_name(1, 1.7e9))
+    os.mkfifo(tmp_path / segment.format_segment_name(1, 1.7e9))
     link = replay_link.build(replay_link.Settings(path=str(tmp_path)))
     with pytest.raises(OSError, match="is a FIFO"):
         link.open()
@@ -233,10 +233,10 @@ def test_a_socket_or_device_on_the_command_line_is_status_2_and_one_line(command
 
 
 def test_a_configuration_and_a_model_from_a_pipe(tmp_path: Path) -> None:
-    text = (config_files.CONFIG_FOLDER / "demo.toml").read_text()
+    text = (shipped_file_paths.CONFIG_FOLDER / "demo.toml").read_text()
     done = finished(["check", "/dev/stdin"], input=text)
     assert (done.returncode, done.stderr) == (0, "")
-    model = (config_files.CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text()
+    model = (shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml").read_text()
     for name in ("/dev/stdin", "-"):
         done = finished(["export", name, "--format", "kalibr"], input=model)
         assert (done.returncode, done.stderr) == (0, "")

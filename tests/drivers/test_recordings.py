@@ -31,7 +31,7 @@ from drivers.recordings import (
     open_recording_writer,
     save_samples,
 )
-from drivers.recordings.arrow_messages import check_buffer_sizes, count_buffers, iter_batch_sizes
+from drivers.recordings.arrow_message_sizes import check_buffer_sizes, count_buffers, iter_batch_sizes
 from drivers.recordings.csv_format import MAX_LINE_BYTES, READ_BYTES
 from drivers.recordings.writing import atomic_write_path
 from drivers.sample import AXES, concatenate_blocks

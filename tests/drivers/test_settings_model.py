@@ -10,7 +10,7 @@ import pytest
 from pydantic import Field
 
 from drivers.errors import ConfigError
-from drivers.quantities import FRACTION, RATE_HZ
+from drivers.number_ranges import FRACTION, RATE_HZ
 from drivers.settings_model import (
     Conflict,
     FileOrName,
@@ -42,7 +42,7 @@ class Whole(SettingsModel):
     low: float = 0.0
     high: float = 1.0
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         if self.low >= self.high:
             yield Conflict("low", "must be less than high", ("high",))
 

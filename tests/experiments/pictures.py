@@ -35,15 +35,15 @@ import numpy as np
 from drivers.recordings import save_samples
 from drivers.sample import Floats
 from monitor.commands.reconcile import Request, run_reconciliation
-from monitor.common import config_files
+from monitor.common import shipped_file_paths
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.sqlite_store import FILE_NAME, HistoryStore
 from monitor.history.stored_events import StoredEvent
-from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
-from monitor.publishing.plots.diagnostic_figure import diagnostic_svg
+from monitor.noise.model_catalogue import read_model
+from monitor.publishing.plots.diagnostic_figure import compared_diagnostic_svg
 from monitor.publishing.rerun import sinks
 from monitor.publishing.rerun.fleet import FleetView
 from monitor.publishing.rerun.view import RerunView
@@ -56,7 +56,7 @@ from monitor.simulator.demo import demo_config
 from tests.monitor.publishing.made import estimate, true_coefficients
 
 SIZE = (1600, 1000)
-MODEL = config_files.CONFIG_FOLDER / "models" / "consumer-mems.toml"
+MODEL = shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml"
 T0 = 1_763_705_400.0  # Unix s of the first sample: 2025-11-21 06:10 UTC
 HOUR_S = 3600.0
 SPARE_S = 900.0  # of the recording beyond the hour, so that it still runs when the service is stopped
@@ -181,7 +181,7 @@ def temperature(out: Path, folder: Path) -> Path:
     """Show the tab Temperature of two days in which the bias of gz stepped once."""
     path = out / "viewer-temperature.png"
     source = folder / "warm.npz"
-    model = read_model(config_files.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
+    model = read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
     n = round(WARM_S * WARM_HZ)
     drawn = model.stream(WARM_HZ, 1).draw_with_temperature(n)
     save_samples(source, T0 + np.arange(n) / WARM_HZ, drawn.values, drawn.temperature_c)
@@ -202,7 +202,7 @@ def drift(out: Path, folder: Path) -> Path:
     n = round(TURNED_S * 100.0)
     t_s = np.arange(n) / 100.0
     values = (
-        read_model(config_files.CONFIG_FOLDER / "models" / "adis16470.toml")
+        read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "adis16470.toml")
         .stream(100.0, 1)
         .draw_with_temperature(n)
         .values.copy()
@@ -227,7 +227,7 @@ def compensation(out: Path, folder: Path) -> Path:
     path, source = out / "compensate.png", folder / "still.npz"
     n = 1_080_000
     values = (
-        read_model(config_files.CONFIG_FOLDER / "models" / "adis16470.toml")
+        read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "adis16470.toml")
         .stream(100.0, 2)
         .draw_with_temperature(n)
         .values
@@ -255,7 +255,8 @@ def fleet(out: Path, folder: Path) -> Path:
     """Show the overview of three devices."""
     path = out / "viewer-fleet.png"
     with window() as (port, shoot), serving(folder, FLEET, port) as service:
-        tail, wing = service.virtual["tail"], service.virtual["wing"]
+        simulated = {worker.name: worker.simulated for worker in service.workers}
+        tail, wing = simulated["tail"], simulated["wing"]
         wait_until(lambda: all(station.publisher.latest is not None for station in service.workers), 120.0)
         begun_s = time.monotonic()
         for at_s, act in (
@@ -299,9 +300,9 @@ def view(out: Path, folder: Path) -> Path:
                 lambda: all(station.publisher.latest is not None for one in daemons for station in one.workers), 120.0
             )
             time.sleep(PULLED_AGAIN_S)
-            daemons[0].virtual[MEMBERS[3]].unplug()
-            daemons[1].virtual[MEMBERS[4]].unplug()
-            daemons[2].stop()
+            daemons[0].workers[1].simulated.unplug()  # MEMBERS[3]
+            daemons[1].workers[1].simulated.unplug()  # MEMBERS[4]
+            daemons[2].request_stop()
             time.sleep(SETTLE_S)
             shoot(path)
         finally:
@@ -444,8 +445,8 @@ def reconcile_hidden_effects(folder: Path) -> AxisResult:
 
 def save_diagnostic_picture(result: AxisResult, when: str, path: Path) -> Path:
     """Draw spectrum, Allan deviation and tails of one axis with one model, as in the report."""
-    views = {view.lens: view for view in getattr(result, when).views}
-    drawn = [diagnostic_svg([("", views[lens])], result.axis, 5.2, 3.3) for lens in ("psd", "allan", "tails")]
+    views = {view.lens: view for view in getattr(result, when).plots}
+    drawn = [compared_diagnostic_svg([("", views[lens])], result.axis, 5.2, 3.3) for lens in ("psd", "allan", "tails")]
     page = path.with_suffix(".html")
     style = "body{margin:8px;display:flex;font-family:sans-serif;background:white}svg{width:520px;height:330px}"
     page.write_text(f"<meta charset=utf-8><style>{style}</style>{''.join(drawn)}")
@@ -543,7 +544,7 @@ def running(config: loading.Config) -> Iterator[Service]:
     try:
         yield service
     finally:
-        service.stop()
+        service.request_stop()
         thread.join(30.0)
 
 
@@ -558,7 +559,7 @@ def window() -> Iterator[tuple[int, Callable[[Path], None]]]:
         *("--bind", "127.0.0.1", "--port", str(port), "--headless", "--window-size", size, "--hide-welcome-screen")
     ])  # fmt: skip
     try:
-        wait_until(lambda: sinks.listens(port), 30.0)
+        wait_until(lambda: sinks.is_listening(port), 30.0)
         yield port, lambda path: ViewerClient(sinks.server_url(port)).save_screenshot(str(path))
     finally:
         child.end()
@@ -572,7 +573,7 @@ def page_server() -> Iterator[tuple[int, str]]:
         *("--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port))
     ])  # fmt: skip
     try:
-        wait_until(lambda: sinks.listens(port) and sinks.listens(web_port), 30.0)
+        wait_until(lambda: sinks.is_listening(port) and sinks.is_listening(web_port), 30.0)
         yield port, f"http://127.0.0.1:{web_port}/?url={quote(sinks.server_url(port), safe='')}"
     finally:
         child.end()
@@ -675,7 +676,7 @@ def browser() -> Iterator[Page]:
             env={**os.environ, "NO_PROXY": "127.0.0.1"},
         )
         try:
-            wait_until(lambda: sinks.listens(port), 30.0)
+            wait_until(lambda: sinks.is_listening(port), 30.0)
             with urllib.request.urlopen(f"http://127.0.0.1:{port}/json/list") as reply:
                 tabs = [tab for tab in json.load(reply) if tab["type"] == "page"]
             yield Page(tabs[0]["webSocketDebuggerUrl"])

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.recordings import save_samples
 from drivers.sample import Event, SampleBlock
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.common.units import format_utc
 from monitor.daemon.output import Output
 from monitor.daemon.service import Service
@@ -22,7 +22,7 @@ from monitor.history.reading import HistoryTable
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
-from monitor.noise.catalogue import read_model
+from monitor.noise.model_catalogue import read_model
 from monitor.publishing.messages.history import decode_history
 from monitor.settings import loading
 from tests.support.ports import free_endpoint
@@ -57,14 +57,14 @@ class Told(Output):
         self.events: list[tuple[float, Event]] = []
         self.received = 0
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         self.received = received
 
-    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         if isinstance(result, Estimate):
             self.estimates.append((unix_s, result))
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.events.append((unix_s, event))
 
 
@@ -96,7 +96,7 @@ def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, 
     # slow enough that each minute of the recording lasts seconds, in which a loaded machine publishes something
     service = Service(config(tmp_path, recording, speed=20.0), [told])
     service.run(PATIENCE_S)
-    assert service.states()["history"] == "ok"
+    assert service.output_states()["history"] == "ok"
     found = kept(tmp_path)
     minutes = found.start_s.tolist()
     assert set(minutes) <= {int(T0) + 60 * i for i in range(math.ceil(SECONDS / 60))}  # a busy machine skips some
@@ -133,7 +133,7 @@ def asked(tmp_path: Path, recording: Path) -> Iterator[tuple[Service, Any]]:
             wait_for(lambda: list(client.get("imu/bench-1/history", timeout=PATIENCE_S)))
             yield service, client
     finally:
-        service.stop()
+        service.request_stop()
         thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
@@ -174,6 +174,6 @@ def test_a_damaged_history_is_said_in_the_status_and_to_who_asks(asked: tuple[Se
     (reply,) = client.get("imu/bench-1/history", timeout=PATIENCE_S)
     assert "damaged" in json.loads(bytes(reply.err.payload))["error"]
     service.history.writer.put_event("bench-1", StoredEvent(T0, "moved", "once more"))
-    wait_for(lambda: "damaged" in service.states()["history"])
+    wait_for(lambda: "damaged" in service.output_states()["history"])
     (aside,) = path.parent.glob(f"{FILE_NAME}.aside-*Z")
     assert aside.read_bytes() == b"no more" * 1000

@@ -57,14 +57,14 @@ PROGRAM = """
                 if start % 1000 == 0:
                     one.get()
         if start == 8000:
-            gyro.identify()
+            gyro.identify_due_models()
     watch.flush()
     found = watch.take_events()
     for one in estimators:
         one.restart(2, 1000)
         while one.step_slow_statistics() is None:
             pass
-    gyro.error
+    gyro.bias_standard_error
     thermal_response.first_order_lag(values[:, 0].copy(), 0.5)
     print(json.dumps([before, compiled(), len(found)]))
 """

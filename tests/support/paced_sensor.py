@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import Final
 
 from drivers.driver import Driver
-from monitor.simulator import VirtualImu
+from monitor.simulator import SimulatedDevice
 from monitor.simulator.pty_port import PtyPort
 from monitor.simulator.zenoh_port import ZenohPort
 
@@ -24,7 +24,7 @@ def unlimited() -> float:
     return math.inf
 
 
-def is_open(imu: VirtualImu) -> bool:
+def is_open(imu: SimulatedDevice) -> bool:
     """Return True if a reader has opened the sensor's link, so that the next sample will reach it."""
     link, port = imu.link, imu.port
     if isinstance(port, ZenohPort):
@@ -32,14 +32,14 @@ def is_open(imu: VirtualImu) -> bool:
     return getattr(link, "_port" if isinstance(port, PtyPort) else "_bus") is not None
 
 
-def is_plugged(imu: VirtualImu) -> bool:
+def is_plugged(imu: SimulatedDevice) -> bool:
     """Return True if the sensor's cable is in."""
     port = imu.port
     name = {PtyPort: "_master", ZenohPort: "_session"}.get(type(port), "_bus")
     return getattr(port, name) is not None
 
 
-def follow_reader(imu: VirtualImu, driver: Driver, allowed: Callable[[], float] = unlimited) -> None:
+def follow_reader(imu: SimulatedDevice, driver: Driver, allowed: Callable[[], float] = unlimited) -> None:
     """Make a sensor that has not been started wait for its reader.
 
     The sensor keeps its own rate while the reader keeps up. It makes no sample before the link is open, and none while
@@ -65,8 +65,13 @@ def follow_reader(imu: VirtualImu, driver: Driver, allowed: Callable[[], float] 
         if not is_plugged(imu):
             return min(host_s - begun_s, (allowed() + 0.5) / imu._pace_hz)
         if is_open(imu):
-            waiting = imu.truth.sent + imu.truth.repeated - driver.counts.received - driver.clock.repeated_rows
-            limit = max(limit, min(imu.truth.made + AHEAD - waiting, allowed()))
+            waiting = (
+                imu.fault_counts.sent
+                + imu.fault_counts.repeated
+                - driver.counts.received
+                - driver.clock.dropped_repeated_rows
+            )
+            limit = max(limit, min(imu.fault_counts.sample_count + AHEAD - waiting, allowed()))
         return min(host_s - begun_s, (limit + 0.5) / imu._pace_hz)
 
     imu.now_s = now_s

@@ -17,7 +17,7 @@ from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.output import Output
 from monitor.daemon.service import Service
 from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.results import SlowStatistics
@@ -33,35 +33,35 @@ class Caught(Output):
         self.estimates: dict[str, Estimate] = {}
         self.totals: dict[str, SlowStatistics] = {}
         self.gaps: dict[str, ModelGap] = {}
-        self.thermals: dict[str, list[ThermalUpdate]] = {}
+        self.thermals: dict[str, list[ThermalIntervalResult]] = {}
         self.rates: dict[str, list[SampleBlock]] = {}
         self.drifts: dict[str, list[DriftUpdate]] = {}
         self.events: list[tuple[str, Event]] = []
         self.healths: dict[str, Health] = {}
 
-    def samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         self.blocks.setdefault(device, []).append(samples)
 
-    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         match result:
             case Estimate():
                 self.estimates[device] = result
             case ModelGap():
                 self.gaps[device] = result
-            case ThermalUpdate():
+            case ThermalIntervalResult():
                 self.thermals.setdefault(device, []).append(result)
             case DriftUpdate():
                 self.drifts.setdefault(device, []).append(result)
             case SlowStatistics():
                 self.totals[device] = result
 
-    def compensated(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
+    def publish_compensated_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:
         self.rates.setdefault(device, []).append(samples)
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.events.append((device, event))
 
-    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         self.healths[device] = health
 
     def values(self, device: str) -> np.ndarray:
@@ -84,7 +84,7 @@ class Running:
         return next(station for station in self.service.workers if station.name == name)
 
     def stop(self) -> None:
-        self.service.stop()
+        self.service.request_stop()
         self.join()
 
     def join(self) -> None:

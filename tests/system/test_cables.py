@@ -39,11 +39,11 @@ mode = "none"
 
 def pull_and_put_back(run: Running) -> None:
     """A few samples are sent into the air, and some come after it."""
-    imu, station = run.service.virtual["loose"], run.station("loose")
+    imu, station = run.station("loose").simulated, run.station("loose")
     imu.unplug()
     wait_for(lambda: station.driver.state == "lost", "the loss")
-    before = imu.truth.dropped
-    wait_for(lambda: imu.truth.dropped >= before + 3, "samples that find no cable")
+    before = imu.fault_counts.dropped
+    wait_for(lambda: imu.fault_counts.dropped >= before + 3, "samples that find no cable")
     received = station.driver.counts.received
     imu.plug()
     wait_for(lambda: station.driver.counts.received >= received + 3, "samples after the pause")
@@ -97,4 +97,4 @@ def test_fifty_pulled_cables_leave_nothing_behind(tmp_path: Path, monkeypatch: p
     loose, firm = (run.station(name).driver.counts for name in ("loose", "firm"))
     assert loose.lost >= 3 * (WARM_UP + CYCLES)
     # the simulated sensor drops what a reader does not fetch in time on a loaded machine; nothing else may be missing
-    assert firm.lost + firm.bad <= run.service.virtual["firm"].truth.dropped
+    assert firm.lost + firm.bad <= run.station("firm").simulated.fault_counts.dropped

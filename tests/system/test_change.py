@@ -47,8 +47,8 @@ class Kept(Caught):
         super().__init__()
         self.course: list[PerSampleCoefficients] = []
 
-    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        super().result(device, unix_s, received, result)
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        super().publish_result(device, unix_s, received, result)
         if isinstance(result, Estimate) and result.history is not None:
             self.course.append(result.history)
 
@@ -72,7 +72,7 @@ def walked(tmp_path_factory: pytest.TempPathFactory) -> Kept:
     )
     np.savez(folder / "jump.npz", fs=RATE_HZ, **dict(zip(AXES, values.T, strict=True)))
     with running(folder, CONFIG, kept := Kept()) as service:
-        wait_for(lambda: service.station("gyro").ended, "the recording's end")
+        wait_for(lambda: service.station("gyro").replay_finished, "the recording's end")
     return kept
 
 

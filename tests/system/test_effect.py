@@ -24,10 +24,10 @@ class Watching(Caught):
 
     service: Service | None = None
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        super().event(device, unix_s, received, event)
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        super().publish_event(device, unix_s, received, event)
         if event.kind == "noise_changed" and self.service is not None:
-            self.service.stop()
+            self.service.request_stop()
 
 
 def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
@@ -43,7 +43,7 @@ def test_an_effect_that_comes_is_announced_on_its_axis() -> None:
     caught = Watching()
     caught.service = service
     service.outputs.append(caught)
-    follow_reader(service.virtual["demo"], service.workers[0].driver)
+    follow_reader(service.workers[0].simulated, service.workers[0].driver)
     with capture_logs() as lines:
         service.run(PATIENCE_S)
     added = [line for line in lines if line["event"] == "effect added"]

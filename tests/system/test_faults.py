@@ -70,7 +70,7 @@ def healthy(folder: Path, text: str) -> Iterator[Running]:
     assert counts.received == number.size
     missing = number[-1] - number[0] + 1 - number.size
     # the simulated sensor drops what a reader does not fetch in time on a loaded machine; nothing else may be missing
-    assert missing <= run.service.virtual["healthy"].truth.dropped
+    assert missing <= run.station("healthy").simulated.fault_counts.dropped
     assert counts.lost + counts.bad == missing
     assert not any(event.kind == "clock_jumped" for device, event in run.caught.events if device == "healthy")
     assert run.station("healthy").ring.overflowed == 0
@@ -134,7 +134,7 @@ def test_a_frozen_viewer(tmp_path: Path) -> None:
         child.send_signal(signal.SIGSTOP)  # now for good: it must not hold up the end
         output_says(run, "viewer", lambda text: text.startswith("stalled"))
         goes_on(run)
-        run.service.stop()
+        run.service.request_stop()
         run.join()
         wait_for(lambda: not child.is_running(), "the end of the viewer")
 

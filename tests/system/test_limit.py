@@ -55,7 +55,7 @@ os.rename(sys.argv[1] + ".part", sys.argv[1])
 
 
 def pace(service: Service) -> None:
-    follow_reader(service.virtual["bench"], service.workers[0].driver)
+    follow_reader(service.workers[0].simulated, service.workers[0].driver)
 
 
 def test_noise_that_rises_past_a_limit_is_told_to_the_users_program(tmp_path: Path) -> None:

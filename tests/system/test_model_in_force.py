@@ -14,8 +14,8 @@ import zenoh
 from drivers.recordings import load_samples
 from drivers.sample import AXES, Event
 from monitor.common import topics
-from monitor.common.config_files import CONFIG_FOLDER
-from monitor.daemon.operations.live_reconcile import Reconciler
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.service import Service
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.settings.loading import Config, VirtualTable, ZenohTable
@@ -55,18 +55,18 @@ class Watching(Caught):
     told_s = 0.0  # of the sensor's time
     looked = 0  # samples that have been looked at
 
-    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
-        super().result(device, unix_s, received, result)
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        super().publish_result(device, unix_s, received, result)
         if isinstance(result, ModelGap):
             self.looked = result.samples
             if result.samples / RATE_HZ < AT_S:
                 self.before = result
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
-        super().event(device, unix_s, received, event)
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        super().publish_event(device, unix_s, received, event)
         if event.kind == "model_disagrees" and self.service is not None:
             self.told_s = self.looked / RATE_HZ  # the look that the event is of came just before
-            self.service.stop()
+            self.service.request_stop()
 
 
 def test_the_moment_a_sensor_stops_agreeing_with_its_model_is_an_event() -> None:
@@ -74,7 +74,7 @@ def test_the_moment_a_sensor_stops_agreeing_with_its_model_is_an_event() -> None
     caught = Watching()
     caught.service = service
     service.outputs.append(caught)
-    follow_reader(service.virtual["demo"], service.workers[0].driver, lambda: caught.looked + LOOK_SAMPLES)
+    follow_reader(service.workers[0].simulated, service.workers[0].driver, lambda: caught.looked + LOOK_SAMPLES)
     service.run(PATIENCE_S)
     assert caught.before is not None
     assert caught.before.agrees == dict.fromkeys(AXES, True)
@@ -112,7 +112,7 @@ def test_reconcile_is_asked_for_over_zenoh_and_holds_nothing_up(tmp_path: Path) 
     service = Service(watched(table), reconciler=Reconciler(stand_in(go, kept)))
     caught = Caught()
     service.outputs.append(caught)
-    follow_reader(service.virtual["demo"], service.workers[0].driver)
+    follow_reader(service.workers[0].simulated, service.workers[0].driver)
     thread = threading.Thread(target=service.run)
     thread.start()
     try:
@@ -137,7 +137,7 @@ def test_reconcile_is_asked_for_over_zenoh_and_holds_nothing_up(tmp_path: Path) 
             shown = wait_for(gaps.try_recv)
     finally:
         go.touch()
-        service.stop()
+        service.request_stop()
         thread.join(PATIENCE_S)
     assert not thread.is_alive()
     assert str(reply.ok.encoding) == topics.JSON

@@ -5,7 +5,7 @@ import pytest
 
 from monitor.reconcile.preparation.recording import Recording
 from monitor.reconcile.reconcile import reconcile
-from monitor.reconcile.result import Reconciliation, ReconciliationStep
+from monitor.reconcile.result import AddedOrResizedEffect, Reconciliation
 from tests.support.recordings import recordings
 
 pytestmark = pytest.mark.data
@@ -21,13 +21,13 @@ def compared(file: str, axis: str, begin: int = 0, end: int | None = None) -> Re
         return reconcile(Recording({axis: values}, float(held["fs"])), None, seed=1)
 
 
-def added(result: Reconciliation) -> dict[str, ReconciliationStep]:
+def added(result: Reconciliation) -> dict[str, AddedOrResizedEffect]:
     """By name, the last of a name."""
     (axis,) = result.axes.values()
     return {step.effect: step for step in axis.steps if step.kind == "added"}
 
 
-def size(step: ReconciliationStep, name: str) -> float:
+def size(step: AddedOrResizedEffect, name: str) -> float:
     return float(step.parameters[name].value)
 
 

@@ -155,7 +155,7 @@ mode = "none"
     keys = {topic.key("imu", "bench-1") for topic in wanted}
     listener = Listener(router)
     with running(tmp_path, config) as run:
-        imu = run.service.virtual["bench-1"]
+        imu = run.station("bench-1").simulated
         wait_for(lambda: listener.hears(lambda: "imu/bench-1/coefficients" in listener.heard), "coefficients")
         wait_for(lambda: listener.hears(lambda: listener.alive), "the token")
         assert listener.alive == [("imu/bench-1/alive", True)]

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Bytes, Decoder
 from drivers.decoders.dbc.database import Database
-from drivers.decoders.dbc.join import Message, Sample, SampleAssembler
+from drivers.decoders.dbc.join import Message, SampleAssembler, SampleFrames
 from drivers.decoders.dbc.settings import COLUMNS, Settings, SignalSettings
 from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock, Timing
 
@@ -56,10 +56,10 @@ class DbcDecoder:
         self._settings = settings
         self.timing: Timing = timing
         self.bad = 0
-        self.late = 0
-        self.late_hint = ""
+        self.dropped_late_samples = 0
+        self.late_frames_hint = ""
         self._left_out = 0  # number of samples left out, bad or late
-        self.hint = ""
+        self.recent_problem = ""
         self._two_senders_hint = ""  # hint that two senders are on the bus
         self._samples_since_reject = 0  # number of good samples since the last rejected sample
         self._builder = BlockBuilder()
@@ -77,7 +77,7 @@ class DbcDecoder:
     def reset(self) -> None:
         """Discard an open sample, the newest temperature and the selected sender."""
         self._assembler.reset()
-        self._builder.reset()
+        self._builder.forget_rejected_frames()
         self._source = self._settings.source
         self._two_senders_hint = ""
         self._cache.clear()
@@ -87,7 +87,7 @@ class DbcDecoder:
 
         ``t_ns`` is the arrival time of the last frame of each sample.
         """
-        done: list[Sample] = []
+        done: list[SampleFrames] = []
         for chunk in chunks:
             which = self._message_index(chunk.address)
             if which is None:
@@ -98,22 +98,22 @@ class DbcDecoder:
             size = self._messages[which].size
             if len(chunk.data) < size:
                 message = self._messages[which].name
-                self.hint = f"{message}: frames of {len(chunk.data)} bytes, but its signals need {size}"
+                self.recent_problem = f"{message}: frames of {len(chunk.data)} bytes, but its signals need {size}"
             self._assembler.add_frame(which, chunk.data[:size] if len(chunk.data) >= size else b"", chunk.t_ns, done)
         blocks = self._decode_samples(done)
         rejected = self._builder.bad != self._left_out
         self._samples_since_reject = 0 if rejected else self._samples_since_reject + len(done)
         if self._samples_since_reject >= HINT_FRAMES:
-            self.hint = self.late_hint = ""
-        if delay_ns := self._assembler.take_delay_ns():
+            self.recent_problem = self.late_frames_hint = ""
+        if delay_ns := self._assembler.take_late_frame_delay_ns():
             self._samples_since_reject = 0
-            self.hint = self.late_hint = (
+            self.recent_problem = self.late_frames_hint = (
                 f"frames of one sample arrive {delay_ns * 1e-6:.3g} ms apart, more than "
                 f"window = {self._settings.window:g} s: increase `window` in decoder_options"
             )
-        self.hint = self._two_senders_hint or self.hint
-        self._left_out, self.late = self._builder.bad, self._assembler.late
-        self.bad = self._left_out - self.late
+        self.recent_problem = self._two_senders_hint or self.recent_problem
+        self._left_out, self.dropped_late_samples = self._builder.bad, self._assembler.dropped_late_samples
+        self.bad = self._left_out - self.dropped_late_samples
         return blocks
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
@@ -181,7 +181,7 @@ class DbcDecoder:
         if len(data) >= self._slow.size:
             self._assembler.temperature = data[: self._slow.size]
 
-    def _decode_samples(self, done: Sequence[Sample]) -> list[SampleBlock]:
+    def _decode_samples(self, done: Sequence[SampleFrames]) -> list[SampleBlock]:
         """Return joined samples as blocks. Each signal is extracted from all samples at once."""
         n = len(done)
         table = np.full((n, len(COLUMNS)), np.nan)
@@ -200,8 +200,8 @@ class DbcDecoder:
         # ``BlockBuilder`` rejects a sample without any value and counts it as missing
         table[~valid] = np.nan
         if not valid.all():
-            self.hint = f"{self._settings.valid} is not 1: the sensor reports that its values are invalid"
-        return self._builder.build_blocks(
+            self.recent_problem = f"{self._settings.valid} is not 1: the sensor reports that its values are invalid"
+        return self._builder.build_plausible_blocks(
             np.array([s.t_ns for s in done], np.int64),
             np.ascontiguousarray(table[:, : len(AXES)]),
             table[:, len(AXES)].copy(),
@@ -211,7 +211,7 @@ class DbcDecoder:
         )
 
 
-def _stack_frames(done: Sequence[Sample], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
+def _stack_frames(done: Sequence[SampleFrames], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
     """Return the frames [n, size] of one message, and a mask [n] of the frames that exist."""
     frames = [s.temperature if which < 0 else s.frames[which] for s in done]
     empty = bytes(size)
@@ -234,4 +234,4 @@ def build(settings: Settings) -> Decoder:
         Some settings are wrong, one line for each.
     """
     database = Database(settings)
-    return DbcDecoder(database.messages(), settings, database.timing())
+    return DbcDecoder(database.messages, settings, database.timing)

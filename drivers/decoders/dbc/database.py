@@ -18,7 +18,7 @@ from drivers.decoders.dbc.settings import COLUMNS, TEMPERATURE, Settings, Signal
 from drivers.discovery import format_suggestion
 from drivers.errors import ConfigError
 from drivers.extras import check_extra
-from drivers.sample import ArrivalTiming, CounterTiming, Timing
+from drivers.sample import ArrivalTimedFormat, CounterTimedFormat, Timing
 
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
 SHIPPED_PREFIX: Final = "shipped:"
@@ -44,7 +44,8 @@ class Database:
         self._settings = settings
         self._errors: list[str] = []
         self._used: dict[str, Message] = {}
-        self._timing: Timing = ArrivalTiming()
+        self.timing: Timing = ArrivalTimedFormat()
+        """Timing of the samples."""
         with self._collecting():
             self._path = _locate(settings.file)
             self._messages: dict[str, Any] = {m.name: m for m in _load(self._path).messages}
@@ -52,13 +53,10 @@ class Database:
         if self._errors:
             raise ConfigError(*self._errors)
 
+    @property
     def messages(self) -> list[Message]:
-        """Return the messages with the configured signals. A message that contains only a counter comes first."""
+        """Messages with the configured signals, beginning with the message that contains only the counter."""
         return sorted(self._used.values(), key=lambda m: not m.only_counter)
-
-    def timing(self) -> Timing:
-        """Return the timing of the samples."""
-        return self._timing
 
     @contextlib.contextmanager
     def _collecting(self) -> Iterator[None]:
@@ -93,7 +91,7 @@ class Database:
                 )
             bits = self._signal_bits(message, signal)
             self._register_message(message, bits).counter = bits
-            self._timing = CounterTiming(1 << int(signal.length), s.tick)
+            self.timing = CounterTimedFormat(1 << int(signal.length), s.tick)
 
     def _find_counters(self) -> list[tuple[Any, Any]]:
         """Return message and signal of each counter."""

@@ -79,7 +79,7 @@ class Message:
 
 
 @dataclass(slots=True)
-class Sample:
+class SampleFrames:
     """Frames of one sample. None stands for a frame that has not arrived, and b"" for a frame that is too short."""
 
     frames: list[bytes | None]
@@ -114,14 +114,14 @@ class SampleAssembler:
         self._counter_message = next((i for i, m in enumerate(messages) if m.only_counter), None)
         self._window_ns = round(settings.window * 1e9) or (1 << 62)
         self._partial = settings.partial
-        self.late = 0
+        self.dropped_late_samples = 0
         """Number of samples left out because some of their frames arrived after the window."""
         self._delay_ns = 0  # from the first frame of a sample to its late frame; 0 = no frame has been late
         self.reset()
 
     def reset(self) -> None:
         """Discard the open sample, the order of the messages and the synchronization."""
-        self._open: Sample | None = None
+        self._open: SampleFrames | None = None
         self._synchronized = False
         self._missing = 0
         self._count_before = NO_TICK  # count of the previous sample
@@ -135,7 +135,7 @@ class SampleAssembler:
         missing, self._missing = self._missing, 0
         return missing
 
-    def take_delay_ns(self) -> int:
+    def take_late_frame_delay_ns(self) -> int:
         """Return the delay of the newest late frame after the first frame of its sample.
 
         The delay is 0 if no frame has been late since the last call.
@@ -143,7 +143,7 @@ class SampleAssembler:
         delay_ns, self._delay_ns = self._delay_ns, 0
         return delay_ns
 
-    def add_frame(self, which: int, data: bytes, t_ns: int, done: list[Sample]) -> None:
+    def add_frame(self, which: int, data: bytes, t_ns: int, done: list[SampleFrames]) -> None:
         """Add one frame to the sample to which it belongs.
 
         Parameters
@@ -166,7 +166,7 @@ class SampleAssembler:
         while self._undecided and self._assign_frame(*self._undecided[0], done):
             self._undecided.popleft()
 
-    def _assign_frame(self, which: int, data: bytes, t_ns: int, done: list[Sample]) -> bool:
+    def _assign_frame(self, which: int, data: bytes, t_ns: int, done: list[SampleFrames]) -> bool:
         """Add a frame to its sample. Return False if the sample is not known yet."""
         count = self._read_count(which, data)
         sample = self._open
@@ -185,7 +185,7 @@ class SampleAssembler:
                 self._note_late(sample, which, data, done)
                 return True
         if sample is None:
-            sample = self._open = Sample([None] * self._n, t_ns, t_ns, NO_TICK)
+            sample = self._open = SampleFrames([None] * self._n, t_ns, t_ns, NO_TICK)
         sample.frames[which] = data
         sample.t_ns = t_ns
         if count != NO_TICK:
@@ -195,7 +195,7 @@ class SampleAssembler:
             self._open = None
         return True
 
-    def _note_late(self, sample: Sample, which: int, data: bytes, done: list[Sample]) -> None:
+    def _note_late(self, sample: SampleFrames, which: int, data: bytes, done: list[SampleFrames]) -> None:
         """Note a late frame of the open sample."""
         if data:
             sample.late.add(which)
@@ -212,7 +212,7 @@ class SampleAssembler:
             return NO_TICK
         return int(bits.extract_raw(np.frombuffer(data, np.uint8)[None, :])[0])
 
-    def _begins_next(self, sample: Sample, which: int, count: int, delay_ns: int) -> bool | None:
+    def _begins_next(self, sample: SampleFrames, which: int, count: int, delay_ns: int) -> bool | None:
         """Return True if a frame starts the next sample; None if the order of the messages must be known first."""
         if sample.frames[which] is not None or which in sample.late or which == self._counter_message:
             return True
@@ -228,7 +228,7 @@ class SampleAssembler:
         # the sum of the pauses before all messages is the sample period
         return which == first or delay_ns >= sum(pauses)
 
-    def _finish(self, sample: Sample, done: list[Sample]) -> None:
+    def _finish(self, sample: SampleFrames, done: list[SampleFrames]) -> None:
         """Finish a sample as good, late or bad."""
         self._count_before = sample.count
         whole = sample.complete and b"" not in sample.frames
@@ -239,7 +239,7 @@ class SampleAssembler:
             done.append(sample)
         elif sample.late and b"" not in sample.frames and sample.frames.count(None) == len(sample.late):
             self._synchronized = True
-            self.late += 1
+            self.dropped_late_samples += 1
             self._missing += 1
         elif self._synchronized or sample.complete:
             self._missing += 1

@@ -7,7 +7,7 @@ from pydantic import BeforeValidator, Field
 
 from drivers.decoders.base import DecoderSettings
 from drivers.errors import ConfigError
-from drivers.quantities import DELAY_S, SCALE, SOURCE_ADDRESS, TICK_S, format_value
+from drivers.number_ranges import DELAY_S, SCALE, SOURCE_ADDRESS, TICK_S, format_value
 from drivers.sample import AXES
 from drivers.settings_model import Conflict, FileOrName, SettingsModel, one_of
 
@@ -75,7 +75,7 @@ class Settings(DecoderSettings):
         description="values in the top 2/256 of their range are not measured; absent: true for J1939 messages only",
     )
 
-    def conflicts(self) -> Iterator[Conflict]:
+    def find_conflicts(self) -> Iterator[Conflict]:
         """Yield a conflict if no axis is measured, or if samples are joined by a counter that is missing."""
         if not self.signals:
             yield Conflict("signals", 'empty; it maps axes to signals: gz = "Message.Signal"')

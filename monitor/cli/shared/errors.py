@@ -25,8 +25,8 @@ MAX_CAUSE_CHARACTERS: Final = 300
 """Maximum length of the text of an unexpected error. Libraries may write pages."""
 
 
-def explain(error: Exception) -> tuple[str, int]:
-    """Return the line for standard error and the exit status of an error that ended a command."""
+def message_and_status(error: Exception) -> tuple[str, int]:
+    """Return the message and the exit status for an error that ended a command."""
     match error:
         case TyperException():
             return format_one_line(_usage(error)), WRONG
@@ -42,7 +42,7 @@ def explain(error: Exception) -> tuple[str, int]:
             return format_one_line(_system_error(error)), FAILED
         case MemoryError():
             why = f" ({cause})" if (cause := _cause(error)) else ""
-            return f"not enough memory{why}; read less at once, e.g. the end of a recording with --last 1h", FAILED
+            return f"not enough memory{why}; read less data, e.g. the end of a recording with --last 1h", FAILED
     return (
         f"internal error: {type(error).__name__}: {_cause(error)}; please report it with the output of the same "
         f"command with {DEBUG}",
@@ -57,12 +57,12 @@ def _cause(error: Exception) -> str:
 
 
 def _system_error(error: OSError) -> str:
-    """Return the text of a system error; a missing working directory gets its own message."""
+    """Return the text of a system error. A missing working directory has a special message."""
     if error.filename is None:
         try:
             os.getcwd()
         except OSError:
-            return f"the current folder is gone or cannot be read ({error.strerror}); change to another folder"
+            return f"the current folder has been removed or cannot be read ({error.strerror}); change to another folder"
     return str(error)
 
 

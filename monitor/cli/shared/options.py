@@ -1,4 +1,5 @@
-"""Options of the commands, and parsers for arguments with a structure. A ConfigError names the option."""
+"""Command-line options that several commands share, and parsers for option values such as durations. Error messages
+name the option."""
 
 import sys
 from collections.abc import Callable
@@ -8,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Final, overload
 import typer
 
 from drivers.errors import ConfigError, format_one_line
-from drivers.quantities import (
+from drivers.number_ranges import (
     AVERAGING_TIME_S,
     DURATION_S,
     INFLATION,
@@ -16,7 +17,7 @@ from drivers.quantities import (
     RUN_TIME_S,
     SEED,
     Number,
-    Quantity,
+    NumberRange,
 )
 
 if TYPE_CHECKING:
@@ -28,13 +29,13 @@ MAX_AVERAGING_TIMES: Final = 1000
 """Largest number of averaging times in a list."""
 
 
-def within(quantity: Quantity) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
-    """Return a typer callback that checks the number of an option against a quantity.
+def range_callback(quantity: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
+    """Return a typer callback that checks the value of an option against the range of a quantity.
 
     Raises
     ------
     ConfigError
-        The number is outside the supported range. The text begins with the name of the option.
+        If the value is outside the supported range. The message begins with the name of the option.
     """
 
     def check(option: typer.CallbackParam, value: Number | None) -> Number | None:
@@ -60,31 +61,45 @@ ZenohFile = Annotated[
 Rate = Annotated[
     float | None,
     typer.Option(
-        metavar="HZ", help="Sample rate for a recording that has neither times nor a rate.", callback=within(RATE_HZ)
+        metavar="HZ",
+        help="Sample rate for a recording that has neither times nor a rate.",
+        callback=range_callback(RATE_HZ),
     ),
 ]
 ModelRate = Annotated[
     float | None,
-    typer.Option(metavar="HZ", help="Sample rate; by default that of the model.", callback=within(RATE_HZ)),
+    typer.Option(metavar="HZ", help="Sample rate; by default that of the model.", callback=range_callback(RATE_HZ)),
 ]
-Seconds = Annotated[float | None, typer.Option(metavar="S", help="Stop after S seconds.", callback=within(RUN_TIME_S))]
+Seconds = Annotated[
+    float | None, typer.Option(metavar="S", help="Stop after S seconds.", callback=range_callback(RUN_TIME_S))
+]
 SimulationSeed = Annotated[
-    int, typer.Option(metavar="N", help="Seed of the random numbers: same seed, same recording.", callback=within(SEED))
+    int,
+    typer.Option(
+        metavar="N", help="Seed of the random numbers: same seed, same recording.", callback=range_callback(SEED)
+    ),
 ]
 ReportSeed = Annotated[
-    int, typer.Option(metavar="N", help="Seed of the random numbers: same seed, same report.", callback=within(SEED))
+    int,
+    typer.Option(
+        metavar="N", help="Seed of the random numbers: same seed, same report.", callback=range_callback(SEED)
+    ),
 ]
 Inflation = Annotated[
-    float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=within(INFLATION))
+    float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=range_callback(INFLATION))
 ]
 TimeStep = Annotated[
     float | None,
-    typer.Option(metavar="S", help="kalman: time step; by default the sample period.", callback=within(DURATION_S)),
+    typer.Option(
+        metavar="S", help="kalman: time step; by default the sample period.", callback=range_callback(DURATION_S)
+    ),
 ]
 CorrelationTime = Annotated[
     float | None,
     typer.Option(
-        metavar="S", help="kalman: correlation time of the process that represents B.", callback=within(DURATION_S)
+        metavar="S",
+        help="kalman: correlation time of the process that represents B.",
+        callback=range_callback(DURATION_S),
     ),
 ]
 Last = Annotated[
@@ -92,13 +107,13 @@ Last = Annotated[
 ]
 
 
-def tau(text: str) -> "TauGrid":
+def parse_averaging_times(text: str) -> "TauGrid":
     """Parse averaging times: the name of a grid, or a list of seconds.
 
     Raises
     ------
     ConfigError
-        The text is neither the name of a grid nor a list of seconds, or a time is outside the supported range.
+        If the text is neither the name of a grid nor a list of seconds, or if a time is outside the supported range.
     """
     if text in ("octave", "decade10"):
         return text  # type: ignore[return-value]
@@ -117,12 +132,12 @@ def tau(text: str) -> "TauGrid":
 
 
 @overload
-def duration(option: str, text: str) -> float: ...
+def parse_duration(option: str, text: str) -> float: ...
 @overload
-def duration(option: str, text: None) -> None: ...
+def parse_duration(option: str, text: None) -> None: ...
 @overload
-def duration(option: str, text: str | None) -> float | None: ...
-def duration(option: str, text: str | None) -> float | None:
+def parse_duration(option: str, text: str | None) -> float | None: ...
+def parse_duration(option: str, text: str | None) -> float | None:
     """Parse a duration such as "90", "30min" or "1h", and return seconds.
 
     Parameters
@@ -135,7 +150,7 @@ def duration(option: str, text: str | None) -> float | None:
     Raises
     ------
     ConfigError
-        The text is not a duration.
+        If the text is not a duration.
     """
     from monitor.settings.loading import seconds
 
@@ -145,13 +160,13 @@ def duration(option: str, text: str | None) -> float | None:
         raise ConfigError(f"{option}: {error}") from None
 
 
-def order(text: str | None) -> "Order | None":
+def parse_arma_order(text: str | None) -> "Order | None":
     """Parse the orders p and q of an ARMA model.
 
     Raises
     ------
     ConfigError
-        The text is not a supported order.
+        If the text is not a supported order.
     """
     from monitor.drift.compensation.arma import ORDERS
 
@@ -163,14 +178,13 @@ def order(text: str | None) -> "Order | None":
     raise ConfigError(f'--order: "{text}"; possible are {" ".join(f"{p},{q}" for p, q in ORDERS)}')
 
 
-def noise(source: Path) -> "NoiseCoefficients":
-    """Read noise parameters from a model or from the JSON of ``analyze``. JSON begins with a brace, and a model does
-    not.
+def read_noise_coefficients(source: Path) -> "NoiseCoefficients":
+    """Read noise coefficients from a model file or from the JSON output of ``analyze``.
 
     Raises
     ------
     ConfigError
-        The file cannot be read, or its content is invalid.
+        If the file cannot be read, or if its content is invalid.
     """
     from drivers import file_access
     from monitor.noise.model import NoiseModel

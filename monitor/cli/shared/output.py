@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from monitor.estimation.analysis import Analysis
 
 ProgressCallback = Callable[[str, float | None], None]
-"""Progress callback: receives the current step and its completed share, 0 to 1, or None if unknown."""
+"""Progress callback with two arguments: the current step, and its completed share from 0 to 1, or None if unknown."""
 
 
-def check_place(option: str, path: Path | None) -> None:
-    """Check before the work begins that ``write`` can create a file.
+def check_output_folder(option: str, path: Path | None) -> None:
+    """Check that the folder of an output file exists, before the work begins.
 
     Parameters
     ----------
@@ -28,13 +28,13 @@ def check_place(option: str, path: Path | None) -> None:
     Raises
     ------
     ConfigError
-        The folder does not exist.
+        If the folder does not exist.
     """
     if path is not None and path != Path("-") and not path.parent.is_dir():
         raise ConfigError(f"{option}: {path}: cannot be written: there is no folder {path.parent}")
 
 
-def write(option: str, path: Path, data: bytes) -> None:
+def write_bytes(option: str, path: Path, data: bytes) -> None:
     """Write bytes to a file, or to standard output if the path is ``-``.
 
     Parameters
@@ -49,7 +49,7 @@ def write(option: str, path: Path, data: bytes) -> None:
     Raises
     ------
     ConfigError
-        The file cannot be written.
+        If the file cannot be written.
     """
     if path == Path("-"):
         sys.stdout.buffer.write(data)
@@ -62,8 +62,8 @@ def write(option: str, path: Path, data: bytes) -> None:
 
 
 @contextlib.contextmanager
-def progress() -> Iterator[ProgressCallback]:
-    """Show a progress bar on a terminal, or nothing if the output is piped; yield the callback that updates it."""
+def show_progress() -> Iterator[ProgressCallback]:
+    """Show a progress bar if the output is a terminal, and yield the callback that updates the bar."""
     from rich.console import Console
     from rich.progress import Progress
 
@@ -76,7 +76,7 @@ def progress() -> Iterator[ProgressCallback]:
         yield lambda what, share: bar.update(task, description=what, total=share and 1.0, completed=share or 0.0)
 
 
-def compile_kernels(tell: ProgressCallback) -> None:
+def compile_analysis_kernels(tell: ProgressCallback) -> None:
     """Compile the kernels for the analysis of recordings in parallel, if they are not in the cache on disk."""
     from monitor.daemon.kernels import kernel_compilation, kernel_parts
 

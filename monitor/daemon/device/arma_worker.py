@@ -19,16 +19,16 @@ class ArmaWorker:
     ----------
     name : str
         Name of the threads.
-    at_once : bool
+    synchronous : bool
         True if the model is identified in the calling thread. A replayed recording can wait for it.
     """
 
-    def __init__(self, name: str, at_once: bool) -> None:
+    def __init__(self, name: str, synchronous: bool) -> None:
         self._name = name
-        self._at_once = at_once
+        self._at_once = synchronous
         self._work: _Identification | None = None
 
-    def update(self, live: LiveCompensation) -> None:
+    def adopt_and_start_models(self, live: LiveCompensation) -> None:
         """Adopt a model that has been identified, and start the identification of the next axis that is due."""
         if self._work is not None:
             if self._work.thread.is_alive():
@@ -42,7 +42,7 @@ class ArmaWorker:
                 self._work = work
                 work.thread.start()
                 return
-            work.run()
+            work.identify_model()
             live.set_model(axis, work.found)
 
 
@@ -52,10 +52,10 @@ class _Identification:
     def __init__(self, of: Compensator, axis: int, name: str) -> None:
         self.of, self.axis = of, axis
         self.found: ArmaModel | None = None
-        self._window: tuple[Floats, float] = of.identification_data(axis)
-        self.thread = threading.Thread(target=self.run, name=name, daemon=True)
+        self._window: tuple[Floats, float] = of.identification_means_and_variance(axis)
+        self.thread = threading.Thread(target=self.identify_model, name=name, daemon=True)
 
-    def run(self) -> None:
+    def identify_model(self) -> None:
         """Identify the model; ``found`` stays None if the data do not allow it."""
         try:
             self.found = fit_arma(*self._window)

@@ -31,7 +31,7 @@ class DeviceStatus:
         self._restore = restore
         self._started_s = time.monotonic()
 
-    def health(self, states: dict[str, str], memory_bytes: int) -> Health:
+    def build_health(self, states: dict[str, str], memory_bytes: int) -> Health:
         """Return the present status of the device.
 
         Parameters
@@ -56,11 +56,11 @@ class DeviceStatus:
             outputs=dict(states),
             text=self._text(),
             uptime_s=time.monotonic() - self._started_s,
-            repeated=clock.repeated_rows,
-            late=clock.late_rows + driver.counts.late,
+            repeated=clock.dropped_repeated_rows,
+            late=clock.dropped_late_rows + driver.counts.late,
             moving=signal_monitor is not None and signal_monitor.moving,
             moved=signal_monitor.moved_samples if signal_monitor is not None else 0,
-            crossed=self._publisher.limits.crossed,
+            crossed=self._publisher.limits.limits_crossed_now,
         )
 
     def _text(self) -> str:
@@ -70,14 +70,14 @@ class DeviceStatus:
             if self._restore.active and ready.all.is_set():
                 return "the window is being rebuilt from the recording; no sample is lost"
             if ready.progress:
-                lacking = "" if self._pipeline.can_fit else "no coefficients yet, "
+                lacking = "" if self._pipeline.fit_kernels_ready else "no coefficients yet, "
                 return f"{ready.progress}; {lacking}no sample is lost"
-            if not self._pipeline.can_fit:
+            if not self._pipeline.fit_kernels_ready:
                 return "compiling the estimator; no coefficients yet, no sample is lost"
         lacking = self._missing_estimate_text() if driver.state in ("running", "ended") else ""
         if driver.text or driver.state != "running":
             return f"{driver.text.rstrip('.')}; {lacking}" if lacking else driver.text
-        return lacking or driver.late_hint or self._publisher.timeline.offset_text()
+        return lacking or driver.late_frames_hint or self._publisher.timeline.host_clock_offset_text()
 
     def _missing_estimate_text(self) -> str:
         """Return the reason why there are no coefficients; empty if there are coefficients, or will be."""

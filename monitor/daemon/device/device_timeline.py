@@ -56,7 +56,7 @@ class DeviceTimeline:
 
     # --- present time
 
-    def set_newest(self, t_ns: int) -> None:
+    def set_newest_sample_time(self, t_ns: int) -> None:
         """Set the time of the newest sample that was taken from the ring buffer."""
         self._newest_ns, self._taken_ns = t_ns, time.monotonic_ns()
 
@@ -120,7 +120,7 @@ class DeviceTimeline:
     def slew_to_host(self) -> None:
         """Slew the Unix times towards the host clock, and queue an event if the host clock was set."""
         now_ns = time.monotonic_ns()
-        step_s = self._clock.slew_to(now_ns, time.time_ns()) / 1e9
+        step_s = self._clock.slew_and_return_host_step(now_ns, time.time_ns()) / 1e9
         if abs(step_s) < MIN_CLOCK_STEP_S or self._driver.times_are_unix:
             return
         text = (
@@ -129,7 +129,7 @@ class DeviceTimeline:
         )
         self._events.append(Event("clock_jumped", now_ns, text))
 
-    def offset_text(self) -> str:
+    def host_clock_offset_text(self) -> str:
         """Return a message about the offset of the sample times from the host clock; empty if the offset is small."""
         behind_s = 0.0 if self._driver.times_are_unix else self._clock.behind_ns / 1e9
         if abs(behind_s) < MIN_CLOCK_STEP_S:

@@ -1,14 +1,14 @@
 """Worker of one device: reader thread, ring buffer, processing pipeline and publication of the results.
 
-``DeviceWorker.work`` is one round of the main loop for the device. It takes the new samples, advances the pipeline
-(``DevicePipeline``) and publishes the results that are due (``ResultPublisher``). ``DeviceTimeline`` converts the times
-of the samples, ``DeviceStatus`` reports the status, and ``WindowRestore`` fills the window after a restart.
+In each round, the main loop calls ``DeviceWorker.process_new_samples``. This method takes the new samples, advances the
+pipeline (``DevicePipeline``) and publishes the results that are due (``ResultPublisher``). ``DeviceTimeline`` converts
+the times of the samples, ``DeviceStatus`` reports the status, and ``WindowRestore`` fills the window after a restart.
 """
 
 import threading
 import time
 from collections.abc import Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from drivers.driver import Driver
 from drivers.links.base import Link
@@ -27,6 +27,9 @@ from monitor.daemon.result_publisher import ResultPublisher
 from monitor.daemon.storage.recorder import Recorder
 from monitor.estimation.window_snapshot import WindowSnapshot
 from monitor.settings.loading import Device, VirtualTable
+
+if TYPE_CHECKING:
+    from monitor.simulator import SimulatedDevice
 
 RING_S: Final = 10.0
 """Capacity of the ring buffer, in seconds of samples, within the bounds of RING_SAMPLES_RANGE."""
@@ -61,6 +64,8 @@ class DeviceWorker:
         Flags of the compiled kernels. Samples wait in order until the kernels that the device needs are compiled.
     recorder : Recorder, optional
         Records samples and raw bytes, and provides the samples from before a restart.
+    simulated : SimulatedDevice, optional
+        Simulated sensor that sends to the link. It is started and stopped with the reader thread.
 
     Raises
     ------
@@ -76,6 +81,7 @@ class DeviceWorker:
         wake: threading.Event,
         ready: KernelReadiness,
         recorder: Recorder | None = None,
+        simulated: "SimulatedDevice | None" = None,
     ) -> None:
         self.device = device
         self.name = device.name
@@ -98,6 +104,7 @@ class DeviceWorker:
         self.timeline = self.publisher.timeline
         self.restore = WindowRestore(device, self.pipeline, self.clock, self.timeline)
         self.status = DeviceStatus(self.publisher, self.ring, self.restore)
+        self.simulated = simulated
         self._recorder = recorder
         self._wake = wake
         self._thread = threading.Thread(target=self.driver.run, name=f"reader of {device.name}", daemon=True)
@@ -107,20 +114,24 @@ class DeviceWorker:
 
     def start(self) -> None:
         """Start the reader thread; if the recording ended less than a window ago, resume from its end."""
+        if self.simulated is not None:
+            self.simulated.start()
         if self._recorder is not None and not self._replayed:
-            self.restore.resume(self._recorder.tail(self.name))
+            self.restore.resume_from(self._recorder.find_recording_tail(self.name))
             if self.restore.active:  # the next restart may come before a new estimate exists
-                self._recorder.set_state(self.name, self.restore.state())
+                self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
         self._thread.start()
 
-    def rebuild(self) -> None:
+    def rebuild_window(self) -> None:
         """Fill the window from the recording while new samples wait in the ring buffer; call it in a thread."""
-        self.restore.rebuild()
+        self.restore.rebuild_window()
         self._wake.set()
 
     def stop(self) -> None:
-        """Stop the reader thread. Samples in the ring buffer stay there until ``work`` processes them."""
+        """Stop the reader thread. The samples in the ring buffer stay there until the next ``process_new_samples``."""
         self.driver.stop()
+        if self.simulated is not None:
+            self.simulated.stop()
 
     def join(self, timeout_s: float) -> bool:
         """Wait for the reader thread; return False if it does not end within ``timeout_s`` seconds."""
@@ -129,11 +140,11 @@ class DeviceWorker:
         return not self._thread.is_alive()
 
     @property
-    def ended(self) -> bool:
+    def replay_finished(self) -> bool:
         """True if a replay has ended and all its samples have been processed."""
         if self.driver.state != "ended" or self._thread.is_alive() or not self.pipeline.ready.all.is_set():
             return False
-        return not self.pipeline.waiting and (self.ring.empty or self.clock.rate_hz is None)
+        return not self.pipeline.awaits_thermal_model and (self.ring.empty or self.clock.rate_hz is None)
 
     @property
     def read_attempts(self) -> int | None:
@@ -146,7 +157,7 @@ class DeviceWorker:
 
     # --- one round
 
-    def work(self, now_s: float, drain: bool = False) -> None:
+    def process_new_samples(self, now_s: float, drain: bool = False) -> None:
         """Process the new samples and publish the results that are due.
 
         Parameters
@@ -157,49 +168,49 @@ class DeviceWorker:
             True if all samples are to be processed and all results published now, because the device stops.
         """
         self.publisher.schedule.begin_round(now_s, drain)
-        with self.pipeline.interpreted(self.clock.rate_hz):
-            self._work(drain)
+        with self.pipeline.kernel_context(self.clock.rate_hz):
+            self._process_new_samples(drain)
 
-    def _work(self, drain: bool) -> None:
+    def _process_new_samples(self, drain: bool) -> None:
         """Process the new samples in the context in which the kernels can be called."""
         events = self.driver.take_events()
         if self.restore.active:  # until the window is rebuilt, the rebuilding thread owns the pipeline
-            self.publisher.events(self.timeline.take_events() + events)
+            self.publisher.publish_events(self.timeline.take_events() + events)
             return
         blocks = self._take() if drain or self._can_take() else []
         events = self.timeline.take_events() + events  # only now is the time of the first sample known
         self.pipeline.advance(blocks, self.clock.rate_hz, drain)
         if drain:
-            self.pipeline.flush()
+            self.pipeline.process_held_samples()
         if self.pipeline.thermal is not None and any(event.kind == "link_back" for event in events):
             self.pipeline.thermal.learn_new_offset()
-        published = self.publisher.samples(blocks)
-        self.publisher.events(events + self.pipeline.take_events())
-        self.publisher.thermal_intervals()
+        published = self.publisher.publish_samples_if_due(blocks)
+        self.publisher.publish_events(events + self.pipeline.take_events())
+        self.publisher.publish_thermal_intervals()
         self._select_thermal_model()
         self._check_rate(drain)
-        published |= self.publisher.estimate()
-        self.publisher.slow_statistics()
+        published |= self.publisher.publish_estimate_if_due()
+        self.publisher.advance_total_and_hadamard()
         if published:
-            self.status.latency.published()
+            self.status.latency.note_publication()
 
     def _can_take(self) -> bool:
         """Return True if samples may be taken; they wait in the ring buffer until rate and kernels are available."""
         pipeline = self.pipeline
-        if pipeline.waiting or self.restore.active:
+        if pipeline.awaits_thermal_model or self.restore.active:
             return False
         if pipeline.estimator is not None or pipeline.refusal_reason:
             return True
         if self.clock.rate_hz is None:  # samples are published even if their times do not show a rate
             return self.ring.room < self.ring.capacity // 2
-        return pipeline.can_begin(self.clock.rate_hz)
+        return pipeline.required_kernels_ready(self.clock.rate_hz)
 
     def _take(self) -> list[SampleBlock]:
         """Take all samples from the ring buffer."""
-        self.status.latency.samples_taken()
+        self.status.latency.note_samples_taken()
         blocks = self.ring.take()
         if blocks:
-            self.timeline.set_newest(int(blocks[-1].t_ns[-1]))
+            self.timeline.set_newest_sample_time(int(blocks[-1].t_ns[-1]))
         return blocks
 
     def _select_thermal_model(self) -> None:
@@ -219,7 +230,7 @@ class DeviceWorker:
     def _check_rate(self, drain: bool) -> None:
         """Withhold the coefficients while the configured rate is contradicted by the data, or is not checked yet."""
         if drain:
-            self.clock.end()
+            self.clock.compare_rates_at_end()
         doubts = (self.clock.contradicted_hz is not None, self.clock.rate_check_pending)
         if doubts != self._rate_doubts:
             self._rate_doubts = doubts
@@ -231,18 +242,18 @@ class DeviceWorker:
         """Pass the best known sample rate to the pipeline."""
         rate_hz = self.clock.rate_hz
         if rate_hz is not None and not self.restore.active:
-            self.pipeline.set_rate(rate_hz)
+            self.pipeline.refine_rate(rate_hz)
 
     # --- commands and status
 
-    def reset(self) -> None:
+    def empty_window(self) -> None:
         """Empty the window, unless it is being rebuilt."""
         if not self.restore.active:
-            self.pipeline.reset()
+            self.pipeline.empty_window()
 
-    def window_snapshot(self) -> tuple[WindowSnapshot, Floats] | None:
+    def copy_window_and_temperature(self) -> tuple[WindowSnapshot, Floats] | None:
         """Return a copy of the window and its temperature, float64 [n] in °C; None if the window is empty."""
-        return None if self.restore.active else self.pipeline.window_snapshot()
+        return None if self.restore.active else self.pipeline.copy_window_and_temperature()
 
     def set_limits(self, device: Device) -> None:
         """Replace the limits by those of new settings. Limits that both settings have keep their state.
@@ -253,7 +264,7 @@ class DeviceWorker:
             If a limit is relative to a coefficient that the model in force does not have.
         """
         limits = LimitMonitor(device.limits, self.model)
-        limits.take_over(self.publisher.limits)
+        limits.copy_states_from(self.publisher.limits)
         self.device, self.publisher.limits = device, limits
 
     def publish_event(self, kind: str, text: str) -> None:
@@ -269,9 +280,9 @@ class DeviceWorker:
             Message of the event.
         """
         self.timeline.add_event_now(kind, text)
-        self.publisher.events(self.timeline.take_events())
+        self.publisher.publish_events(self.timeline.take_events())
 
-    def publish_status(self, states: dict[str, str], memory_bytes: int) -> Health:
+    def slew_and_publish_status(self, states: dict[str, str], memory_bytes: int) -> Health:
         """Publish the status of the device, and slew its times towards the host clock.
 
         Parameters
@@ -287,13 +298,13 @@ class DeviceWorker:
             The published status.
         """
         self.timeline.slew_to_host()
-        self.publisher.events(self.timeline.take_events())
+        self.publisher.publish_events(self.timeline.take_events())
         self._update_rate()
         if self._recorder is not None:
-            self._recorder.set_state(self.name, self.restore.state())
-        health = self.status.health(states, memory_bytes)
+            self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
+        health = self.status.build_health(states, memory_bytes)
         for output in self.publisher.outputs:
-            output.health(self.name, self.timeline.now_unix_s(), health)
+            output.publish_health(self.name, self.timeline.now_unix_s(), health)
         return health
 
     # --- called by the reader thread
@@ -301,7 +312,7 @@ class DeviceWorker:
     def _record_chunks(self, chunks: Sequence[Chunk]) -> None:
         """Record raw bytes."""
         if self._recorder is not None and chunks:
-            self._recorder.chunks(self.name, chunks, self.timeline.offset_ns(chunks[0].t_ns))
+            self._recorder.queue_chunks(self.name, chunks, self.timeline.offset_ns(chunks[0].t_ns))
 
     def _push(self, samples: SampleBlock) -> None:
         """Record decoded samples and put them into the ring buffer.
@@ -311,14 +322,14 @@ class DeviceWorker:
         """
         if self._recorder is not None:
             if self.pipeline.estimator is None:  # the program may crash before the first status is published
-                self._recorder.set_state(self.name, self.restore.state())
-            self._recorder.samples(self.name, samples, self.timeline.offsets_ns(samples))
+                self._recorder.set_estimate_state(self.name, self.restore.state_to_record())
+            self._recorder.queue_samples(self.name, samples, self.timeline.offsets_ns(samples))
             while self._replayed and self._recorder.is_queue_filling(self.name):
                 time.sleep(REPLAY_PAUSE_S)
         while self._replayed and self.ring.room < len(samples) < self.ring.capacity:
             time.sleep(REPLAY_PAUSE_S)
         self.ring.push(samples)
-        self.status.latency.samples_arrived()
+        self.status.latency.note_samples_arrived()
         self._wake.set()
 
 

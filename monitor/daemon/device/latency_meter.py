@@ -8,7 +8,7 @@ import numpy as np
 class LatencyMeter:
     """Latency of the published results of one device.
 
-    ``samples_arrived`` is called by the reader thread, and all other methods are called by the main loop.
+    ``note_samples_arrived`` is called by the reader thread, and all other methods are called by the main loop.
     """
 
     def __init__(self) -> None:
@@ -16,16 +16,16 @@ class LatencyMeter:
         self._taken_ns = 0  # arrival of the oldest sample that was taken and not published; 0 if there is none
         self._latencies_s: list[float] = []
 
-    def samples_arrived(self) -> None:
+    def note_samples_arrived(self) -> None:
         """Note that samples have been put into the ring buffer."""
         self._arrived_ns = self._arrived_ns or time.monotonic_ns()
 
-    def samples_taken(self) -> None:
+    def note_samples_taken(self) -> None:
         """Note that all samples have been taken from the ring buffer."""
         arrived_ns, self._arrived_ns = self._arrived_ns, 0
         self._taken_ns = self._taken_ns or arrived_ns
 
-    def published(self) -> None:
+    def note_publication(self) -> None:
         """Note that results with all taken samples have been published."""
         if self._taken_ns:
             self._latencies_s.append((time.monotonic_ns() - self._taken_ns) / 1e9)

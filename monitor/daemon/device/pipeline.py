@@ -4,7 +4,7 @@ Blocks of samples enter in order. The latest results are in ``estimator``, ``the
 ``signal_monitor``. Detections are taken as events.
 
 The pipeline publishes nothing and reads no clock. Its owner decides when it may advance and what is published. After a
-restart of the program, ``replay`` passes the end of the recording through the pipeline without events.
+restart of the program, ``replay_samples`` passes the end of the recording through the pipeline without events.
 """
 
 from collections import deque
@@ -20,7 +20,7 @@ from monitor.common.compiled import interpreted
 from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import LiveCompensation
-from monitor.drift.thermal.live_thermal import LiveThermal, ThermalUpdate
+from monitor.drift.thermal.live_thermal import LiveThermal, ThermalIntervalResult
 from monitor.estimation.detection.model_gap import PreparedModel
 from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import Estimator
@@ -73,7 +73,7 @@ class DevicePipeline:
         """Time in nanoseconds of the first sample in the window of an axis that was restarted, else None."""
         self.newest_ns = 0
         """Time of the newest sample that entered the pipeline, in nanoseconds; 0 before the first."""
-        self.arma_worker = ArmaWorker(f"drift of {device.name}", at_once=replayed)
+        self.arma_worker = ArmaWorker(f"drift of {device.name}", synchronous=replayed)
         self._device = device
         self._model = model
         self.ready = ready
@@ -82,33 +82,33 @@ class DevicePipeline:
         self._live = live
         self._interprets = False
         self._temperatures: TemperatureRing | None = None  # of the samples in the window
-        self._thermal_intervals: list[ThermalUpdate] = []  # thermal intervals that were not taken yet
+        self._thermal_intervals: list[ThermalIntervalResult] = []  # thermal intervals that were not taken yet
         self._handled = 0  # last seen value of ``signal_monitor.orientation_changes``
         self._pieces: deque[SampleBlock] = deque()  # samples of a recording that wait for the thermal model
         self._replaying = False
 
-    def can_begin(self, rate_hz: float) -> bool:
+    def required_kernels_ready(self, rate_hz: float) -> bool:
         """Return True if the kernels that the pipeline needs to begin are compiled or can be interpreted."""
         if not self._interprets and not self._needs.is_set():
             self._interprets = self._live and self.ready.reserve_interpreter(rate_hz)
         return self._interprets or self._needs.is_set()
 
     @property
-    def can_fit(self) -> bool:
+    def fit_kernels_ready(self) -> bool:
         """True if the kernels of the noise coefficients can be called."""
         return self._interprets or self.ready.fit.is_set()
 
     @property
-    def fits_slowly(self) -> bool:
+    def fit_is_interpreted(self) -> bool:
         """True if the kernels of the fit are interpreted. A fit then takes about 0.1 s."""
         return self._interprets and not self.ready.fit.is_set()
 
     @property
-    def can_detect(self) -> bool:
+    def detection_kernels_ready(self) -> bool:
         """True if the kernels of the motion and change detection can be called."""
         return self._interprets or self.ready.all.is_set()
 
-    def interpreted(self, rate_hz: float | None) -> AbstractContextManager[None]:
+    def kernel_context(self, rate_hz: float | None) -> AbstractContextManager[None]:
         """Return the context in which the kernels are to be called.
 
         Parameters
@@ -117,11 +117,11 @@ class DevicePipeline:
             Sample rate; None if it is unknown. No kernel is called before it is known.
         """
         if rate_hz is not None and self.estimator is None:
-            self.can_begin(rate_hz)
+            self.required_kernels_ready(rate_hz)
         return interpreted() if self._interprets and not self.ready.all.is_set() else nullcontext()
 
     @property
-    def waiting(self) -> bool:
+    def awaits_thermal_model(self) -> bool:
         """True while samples wait for the selection of a thermal model."""
         return bool(self._pieces)
 
@@ -141,7 +141,7 @@ class DevicePipeline:
             self.newest_ns = int(blocks[-1].t_ns[-1])
         if self.estimator is None and (rate_hz is None or not self._create_estimator(rate_hz)):
             return
-        if self.signal_monitor is None and self.can_detect:
+        if self.signal_monitor is None and self.detection_kernels_ready:
             self._create_detectors()
         self._pieces += [
             samples[at : at + MAX_PIECE_SAMPLES]
@@ -154,7 +154,7 @@ class DevicePipeline:
             self._restart_changed_axes()
             self._update_thermal()
 
-    def flush(self) -> None:
+    def process_held_samples(self) -> None:
         """Process the samples that the motion detector still holds back, after the last sample has arrived."""
         self._update_estimator(self.signal_monitor.flush() if self.signal_monitor is not None else [])
         self._restart_changed_axes()
@@ -166,9 +166,9 @@ class DevicePipeline:
         if live is None or not self.ready.all.is_set():  # another thread identifies the models and would compile
             return
         if live.compensator.samples_to_interval_end == live.compensator.interval_samples:
-            self.arma_worker.update(live)
+            self.arma_worker.adopt_and_start_models(live)
 
-    def replay(self, samples: SampleBlock, rate_hz: float) -> None:
+    def replay_samples(self, samples: SampleBlock, rate_hz: float) -> None:
         """Process a recorded block without events, to rebuild the window after a restart.
 
         The events of these samples were published before the restart. The start of each axis is known from the
@@ -188,18 +188,18 @@ class DevicePipeline:
         if live is not None and np.isfinite(samples.values[:, :3]).any():
             for at in range(0, len(samples), MAX_PIECE_SAMPLES):
                 live.update(samples[at : at + MAX_PIECE_SAMPLES])
-            self.arma_worker.update(live)
-            live.take()
+            self.arma_worker.adopt_and_start_models(live)
+            live.take_updates()
         self.take_events()
         self.take_thermal_intervals()
 
-    def reset(self) -> None:
+    def empty_window(self) -> None:
         """Empty the window."""
         if self.estimator is not None:
             self.estimator.reset()
             self.since_ns = [self.newest_ns + 1] * len(AXES)
 
-    def set_rate(self, rate_hz: float) -> None:
+    def refine_rate(self, rate_hz: float) -> None:
         """Set the sample rate to a more accurate value."""
         if self.estimator is None or rate_hz == self.estimator.rate_hz:
             return
@@ -208,7 +208,7 @@ class DevicePipeline:
             if one is not None:
                 one.set_rate(rate_hz)
 
-    def window_snapshot(self) -> tuple[WindowSnapshot, Floats] | None:
+    def copy_window_and_temperature(self) -> tuple[WindowSnapshot, Floats] | None:
         """Return a copy of the window and its temperature, float64 [n] in °C; None if the window is empty."""
         if self.estimator is None or self._temperatures is None or not self.estimator.samples_in_window:
             return None
@@ -223,7 +223,7 @@ class DevicePipeline:
         ]
         return [event for events in found for event in events]
 
-    def take_thermal_intervals(self) -> list[ThermalUpdate]:
+    def take_thermal_intervals(self) -> list[ThermalIntervalResult]:
         """Return the thermal intervals that were completed since the last call."""
         intervals, self._thermal_intervals = self._thermal_intervals, []
         return intervals
@@ -232,7 +232,7 @@ class DevicePipeline:
 
     def _create_estimator(self, rate_hz: float) -> bool:
         """Create the estimator for a sample rate; return False if it cannot be created yet, or not at all."""
-        if self.refusal_reason or not self.can_begin(rate_hz):
+        if self.refusal_reason or not self.required_kernels_ready(rate_hz):
             return False
         device = self._device
         try:

@@ -32,7 +32,7 @@ class WindowRestore:
     device : Device
         Settings of the device.
     pipeline : DevicePipeline
-        Pipeline to fill. While ``active`` is True, only ``rebuild`` may use the pipeline.
+        Pipeline to fill. While ``active`` is True, only ``rebuild_window`` may use the pipeline.
     clock : SampleClock
         Sample clock of the device. It counts the samples since the end of the recording as missing.
     timeline : DeviceTimeline
@@ -49,10 +49,10 @@ class WindowRestore:
 
     @property
     def active(self) -> bool:
-        """True from ``resume`` to the end of ``rebuild``."""
+        """True from ``resume_from`` to the end of ``rebuild_window``."""
         return self._tail is not None
 
-    def resume(self, tail: RecordingTail | None) -> None:
+    def resume_from(self, tail: RecordingTail | None) -> None:
         """Continue after the end of the recording, if there is one that ended less than one window ago."""
         if tail is None:
             return
@@ -69,7 +69,7 @@ class WindowRestore:
         self._clock.resume(LastSample(t_ns, int(newest.ticks[-1]), rate_hz, state.tick_step))
         self._tail, self._state_before = tail, state
 
-    def rebuild(self) -> None:
+    def rebuild_window(self) -> None:
         """Fill the window from the recording while new samples wait in the ring buffer; call it in a thread."""
         tail = self._tail
         if tail is None:
@@ -79,18 +79,18 @@ class WindowRestore:
             text = self._replay(tail, offset_ns)
         except (ImuError, OSError) as error:
             text = f"the window could not be rebuilt from the recording: {error}"
-            self._pipeline.reset()
+            self._pipeline.empty_window()
         finally:
             t_ns = int(tail.newest.samples.t_ns[-1]) - offset_ns
             self._timeline.add_event(Event("window_rebuilt", t_ns, text))
             self._tail = None
 
-    def state(self) -> DaemonState:
+    def state_to_record(self) -> DaemonState:
         """Return the state of the estimate that is to be recorded with the samples now."""
         before, estimator = self._state_before, self._pipeline.estimator
         if self.active:
             return before
-        tick_step = self._clock.tick_step or before.tick_step
+        tick_step = self._clock.ticks_per_sample or before.tick_step
         if estimator is None:
             return msgspec.structs.replace(before, rate=self._clock.rate_hz or before.rate, tick_step=tick_step)
         offset_ns = self._timeline.offset_ns(self._pipeline.newest_ns)
@@ -108,7 +108,7 @@ class WindowRestore:
             samples = piece.samples
             counted += _count_since_restart(samples, state)
             t_ns = samples.t_ns - offset_ns
-            pipeline.replay(make_block(t_ns, samples.values, samples.temperature_c, lost=samples.lost), rate_hz)
+            pipeline.replay_samples(make_block(t_ns, samples.values, samples.temperature_c, lost=samples.lost), rate_hz)
         if pipeline.estimator is None:
             return pipeline.refusal_reason or "the recording holds no samples for the window"
         for axis, unix_s in enumerate(state.since):

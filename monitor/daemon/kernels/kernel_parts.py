@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.extras import missing_packages
+from drivers.extras import find_missing_packages
 from drivers.sample import SampleBlock, make_block
 from monitor.drift.compensation.arma import fit_arma
 from monitor.drift.compensation.compensator import Compensator
@@ -62,9 +62,9 @@ def _call_change_detection() -> None:
 def _call_compensation() -> None:
     compensator = Compensator(100.0)
     compensator.compensate(1e-3 * np.random.default_rng(0).standard_normal((6000, 6)))
-    compensator.set_model(0, fit_arma(*compensator.identification_data(0), [(2, 1)]))
+    compensator.set_model(0, fit_arma(*compensator.identification_means_and_variance(0), [(2, 1)]))
     compensator.compensate(np.zeros((1, 6)), lost=1)
-    _ = compensator.error
+    _ = compensator.bias_standard_error
 
 
 def _call_slow_statistics() -> None:
@@ -124,7 +124,7 @@ SERVICE: Final = KernelGroup(
 _ANALYSIS: Final = KernelPart("analysis of recordings", _call_analysis)
 _RECONCILIATION: Final = KernelPart("reconciliation", _call_reconciliation)
 COMMANDS: Final = KernelGroup(
-    "commands", (_ANALYSIS,) if missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION)
+    "commands", (_ANALYSIS,) if find_missing_packages("reconcile") else (_ANALYSIS, _RECONCILIATION)
 )
 """Parts that only the commands on recordings need. A few kernels of rare cases are compiled at their first call."""
 GROUPS: Final = (SERVICE, COMMANDS)

@@ -100,7 +100,7 @@ class Hooks(Output):
             return "; ".join(filter(None, [f"{self._last_error} ({self._failed} failed since the start)", held_back]))
         return f"ok, but {held_back}" if held_back else "ok"
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Run the hooks that match an event; see ``Output`` for the parameters."""
         wanted = [one for one in self.hooks if _matches(one, device, event.kind)]
         if not wanted:
@@ -224,14 +224,14 @@ def _wait_for_end(
     """Wait for the end of a command, or kill it; return "" or a description of the error."""
     until_s = time.monotonic() + timeout_s
     while process.poll() is None:
-        pipes.move()
+        pipes.transfer_pipe_data()
         if ending():
             return "killed because the service ended"
         if time.monotonic() > until_s:
             return f"killed after {timeout_s:g} s"
     if process.returncode == 0:
         return ""
-    pipes.drain()
+    pipes.read_rest_of_pipe()
     how = f"signal {-process.returncode}" if process.returncode < 0 else f"exit status {process.returncode}"
     return f"{how}{pipes.last_line()}"
 
@@ -258,7 +258,7 @@ class _Pipes:
         for pipe in (self._in, self._out):
             pipe.close()
 
-    def move(self) -> None:
+    def transfer_pipe_data(self) -> None:
         """Transfer the data that can be transferred within POLL_S."""
         for key, _ in self._selector.select(POLL_S):
             if key.fileobj is self._in:
@@ -266,7 +266,7 @@ class _Pipes:
             else:
                 self._read()
 
-    def drain(self) -> None:
+    def read_rest_of_pipe(self) -> None:
         """Read what is left in the pipe after the command has ended, within limits: its child processes may go on
         writing.
         """

@@ -23,8 +23,8 @@ from monitor.common.distributions import Z95
 from monitor.common.units import COEFFICIENT_NAMES, sensor_kind, unit_of
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
-from monitor.noise.catalogue import read_model
 from monitor.noise.model import NoiseModel
+from monitor.noise.model_catalogue import read_model
 from monitor.publishing.exporters.noise import from_model
 from monitor.settings.loading import Device, Limit
 
@@ -98,16 +98,16 @@ class LimitMonitor:
         self.states = {bound: _State() for bound in make_bounds(limits, model)}
 
     @property
-    def crossed(self) -> tuple[str, ...]:
+    def limits_crossed_now(self) -> tuple[str, ...]:
         """Limits that are crossed now, for example ``gz N``."""
         return tuple(bound.place for bound, state in self.states.items() if state.crossed)
 
-    def take_over(self, other: "LimitMonitor") -> None:
+    def copy_states_from(self, other: "LimitMonitor") -> None:
         """Copy the states of the limits that ``other`` has as well."""
         for bound in self.states:
             self.states[bound] = other.states.get(bound, self.states[bound])
 
-    def update(self, estimate: Estimate) -> list[Event]:
+    def check_estimate(self, estimate: Estimate) -> list[Event]:
         """Test all limits against a new estimate, and return the resulting events."""
         events = (self._test_bound(bound, state, estimate) for bound, state in self.states.items())
         return [event for event in events if event is not None]

@@ -23,7 +23,7 @@ from monitor.common.health import Health
 from monitor.daemon.output import Output
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS
-from monitor.noise.effect import parameter_units
+from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.standard_terms import STANDARD_TERMS
 from monitor.settings.loading import Metrics
 
@@ -46,7 +46,7 @@ MISSING_LIBRARY_TEXT: Final = 'prometheus-client is not installed: pip install "
 STATES: Final = ("running", "waiting", "lost", "ended")
 """States of a device."""
 _GYRO_UNITS: Final = ", ".join(
-    f"{symbol} {parameter_units(term)[symbol][0]}" for symbol, term in STANDARD_TERMS.items()
+    f"{symbol} {gyro_and_accel_units(term)[symbol][0]}" for symbol, term in STANDARD_TERMS.items()
 )
 UNITS: Final = f"gyroscopes {_GYRO_UNITS}; accelerometers with m/s for rad"
 """Text about the units of the coefficients."""
@@ -99,20 +99,20 @@ class MetricsOutput(Output):
 
     # --- called by the main loop
 
-    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         """Keep the newest estimate of a device."""
         if isinstance(result, Estimate):
             self._estimates[device] = result
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Count an event."""
         self._events[device, event.kind] += 1
 
-    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Keep the newest health of a device."""
         self._healths[device] = health
 
-    def device_removed(self, device: str) -> None:
+    def remove_device(self, device: str) -> None:
         """Remove the values of a device."""
         self._healths.pop(device, None)
         self._estimates.pop(device, None)

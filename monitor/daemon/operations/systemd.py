@@ -46,7 +46,7 @@ class SystemdNotifier:
         self._watchdog_s = watchdog_s
         self._stuck_s = stuck_s or max(MIN_STUCK_S, 0.5 * (watchdog_s or 0.0))
         self._said = ""
-        self._ready = False
+        self.ready_sent = False
         self._next_beat_s = 0.0
         self._turns: dict[str, tuple[int, float]] = {}  # read attempts of each reader, and the time of the last change
 
@@ -70,14 +70,9 @@ class SystemdNotifier:
         """True if the watchdog of systemd is on."""
         return self._watchdog_s is not None
 
-    @property
-    def ready_sent(self) -> bool:
-        """True if readiness has been sent."""
-        return self._ready
-
     def ready(self) -> None:
         """Report that the service has started or has finished a reload."""
-        self._ready = True
+        self.ready_sent = True
         self._send("READY=1")
 
     def status(self, sentence: str) -> None:

@@ -6,7 +6,7 @@ segments by age, and while the disk is too full. A slow disk therefore delays no
 
 A full or read-only disk stops the recording, and an event reports it. The rest of the service continues. The recorder
 tries again every few seconds. After a crash, the newest segment can be read up to its last complete batch
-(``Recorder.tail``), so that the daemon resumes from there.
+(``Recorder.find_recording_tail``), so that the daemon resumes from there.
 
 Only one process at a time records into a folder (``FolderLock``). While another process holds the lock, nothing is
 written or deleted, and ``state`` names that process. When it ends, this process continues. Rows that the other process
@@ -26,7 +26,7 @@ from typing import Final
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings import segment
-from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentWriter
+from drivers.recordings.segment import DaemonState, SegmentMetadata, SingleSegmentWriter
 from drivers.sample import AXES, Chunk, Ints, SampleBlock, make_block
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
 from monitor.daemon.storage import retention
@@ -60,7 +60,9 @@ class Recorder:
         Opens a segment. Tests pass functions that simulate slow and broken disks.
     """
 
-    def __init__(self, storage: Storage, origins: Sequence[SegmentMetadata], opening: Opening = SegmentWriter) -> None:
+    def __init__(
+        self, storage: Storage, origins: Sequence[SegmentMetadata], opening: Opening = SingleSegmentWriter
+    ) -> None:
         self._storage = storage
         self._opening = opening
         self._events: deque[RecorderEvent] = deque(maxlen=1000)
@@ -79,15 +81,15 @@ class Recorder:
         self._lock_failed_s = 0.0  # monotonic time of the last attempt to take the lock
         self._other_process = False  # True if another process holds the lock
         self._note = ""  # message about the last change of a file by another program
-        self.add(origins)
+        self.add_recordings(origins)
 
-    def add(self, origins: Sequence[SegmentMetadata]) -> None:
+    def add_recordings(self, origins: Sequence[SegmentMetadata]) -> None:
         """Start to record further devices."""
         more = [RecordingTrack(one, self._storage, self._opening, self._events, self._finished) for one in origins]
         with self._lock:
             self._tracks = {**self._tracks, **{(track.origin.device, track.origin.kind): track for track in more}}
 
-    def remove(self, device: str) -> None:
+    def remove_device(self, device: str) -> None:
         """Stop recording a device after its queue has been written. ``is_recording`` then returns False."""
         for track in self._tracks.values():
             track.leaving |= track.origin.device == device
@@ -129,7 +131,7 @@ class Recorder:
         if self._thread.is_alive():
             self._thread.join(timeout_s)
 
-    def tail(self, device: str) -> RecordingTail | None:
+    def find_recording_tail(self, device: str) -> RecordingTail | None:
         """Return the end of a device's recording from before this start, or None if there is nothing to resume from.
 
         This method must be called before anything is written.
@@ -143,7 +145,7 @@ class Recorder:
 
     # --- called by the reader threads
 
-    def samples(self, device: str, samples: SampleBlock, offset_ns: Ints | int) -> None:
+    def queue_samples(self, device: str, samples: SampleBlock, offset_ns: Ints | int) -> None:
         """Queue a block of samples for the recording.
 
         Parameters
@@ -163,7 +165,7 @@ class Recorder:
             samples = make_block(t_ns, samples.values, samples.temperature_c, samples.ticks, samples.lost)
         track.enqueue([samples], not self._other_process)
 
-    def chunks(self, device: str, chunks: Sequence[Chunk], offset_ns: int) -> None:
+    def queue_chunks(self, device: str, chunks: Sequence[Chunk], offset_ns: int) -> None:
         """Queue received bytes for the recording.
 
         Parameters
@@ -180,7 +182,7 @@ class Recorder:
             moved = [replace(one, t_ns=one.t_ns + offset_ns) if offset_ns else one for one in chunks]
             track.enqueue(moved, not self._other_process)
 
-    def set_state(self, device: str, state: DaemonState) -> None:
+    def set_estimate_state(self, device: str, state: DaemonState) -> None:
         """Set the state of the estimate that is recorded with the rows of a device from now on.
 
         Parameters
@@ -195,7 +197,7 @@ class Recorder:
     def is_queue_filling(self, device: str) -> bool:
         """Return True if a replayed recording should wait, because the queue of its device is filling up."""
         track = self._tracks.get((device, "samples"))
-        return track is not None and not self._lock_failure and track.filling
+        return track is not None and not self._lock_failure and track.is_queue_filling_up
 
     # --- writer thread
 
@@ -208,8 +210,8 @@ class Recorder:
             for key, track in self._tracks.items():
                 leaving = track.leaving  # read before the queue: nothing is added after it has been set
                 if locked:
-                    self._note = track.end_if_changed() or self._note
-                    track.write(self._states.get(track.origin.device, DaemonState()), self._disk_full)
+                    self._note = track.close_if_file_changed() or self._note
+                    track.write_queued_rows(self._states.get(track.origin.device, DaemonState()), self._disk_full)
                 if leaving:
                     self._remove_track(key)
             if locked and not closing:
@@ -217,12 +219,12 @@ class Recorder:
                 self._delete_old()
                 self._pack()
         for track in self._tracks.values():
-            track.end()
+            track.close_segment()
         self._folder_lock.release()
 
     def _remove_track(self, key: tuple[str, str]) -> None:
         """Close the file of a removed device and delete its track."""
-        self._tracks[key].end()
+        self._tracks[key].close_segment()
         with self._lock:
             self._tracks = {other: track for other, track in self._tracks.items() if other != key}
 
@@ -250,7 +252,7 @@ class Recorder:
         for track in self._tracks.values():
             track.suspend()
             if not self._lock_failure:
-                track.report("recording_stopped", reason)
+                track.queue_event("recording_stopped", reason)
         self._lock_failure, self._lock_failed_s = reason, time.monotonic()
 
     def _resume(self) -> None:
@@ -258,7 +260,7 @@ class Recorder:
         for track in self._tracks.values():
             if self._other_process:
                 track.drop_recorded_rows()
-            track.report_recovery()
+            track.report_continuation()
         self._lock_failure, self._other_process = "", False
 
     def _sync(self) -> None:
@@ -288,13 +290,13 @@ class Recorder:
         self._delete_checked_s = time.monotonic()
         folders = [track.folder for track in self._tracks.values()]
         try:
-            retention.delete_old(folders, self._storage.keep_s, self._storage.segment_s)
+            retention.delete_old_segments(folders, self._storage.keep_s, self._storage.segment_s)
             self._disk_full = retention.delete_until_free(self._storage.folder, folders, self._storage.disk_share)
         except OSError as error:
             self._disk_full = stopped_text(self._storage.folder, error)
 
 
-def origin(
+def segment_metadata(
     device: str, axes: AxisMap, kind: segment.Kind = "samples", carrier: str = "", decoder: str = ""
 ) -> SegmentMetadata:
     """Return the description of a device's segments.

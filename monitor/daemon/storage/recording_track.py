@@ -17,9 +17,9 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.file_access import check_folder
+from drivers.file_access import check_folder_or_absent
 from drivers.recordings import segment
-from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentWriter
+from drivers.recordings.segment import DaemonState, SegmentMetadata, SingleSegmentWriter
 from drivers.recordings.table import PARTIAL_SUFFIX
 from drivers.sample import NO_TICK, Chunk, SampleBlock
 from monitor.settings.loading import Storage
@@ -40,7 +40,7 @@ CHUNK_OVERHEAD_BYTES: Final = 100
 RAW_FOLDER: Final = "raw"
 """Name of the folder for raw bytes, inside the folder of a device."""
 
-Opening = Callable[[Path, SegmentMetadata], SegmentWriter]
+Opening = Callable[[Path, SegmentMetadata], SingleSegmentWriter]
 """Function that opens a new segment."""
 
 
@@ -105,7 +105,7 @@ class RecordingTrack:
         self._queue_bytes = 0
         self._dropped = 0  # rows that were dropped before the oldest in the queue, missing samples included
         self._taken: list[SampleBlock | Chunk] = []  # taken from the queue and being written
-        self._writer: SegmentWriter | None = None
+        self._writer: SingleSegmentWriter | None = None
         self._begin_s = 0.0  # Unix time of the open segment's first row
         self._number: int | None = None  # of the newest segment; None until the folder has been searched
         self._rows = 0  # rows or chunks in the open segment
@@ -115,12 +115,12 @@ class RecordingTrack:
     # --- queue
 
     @property
-    def waiting(self) -> bool:
+    def has_unwritten_rows(self) -> bool:
         """True if rows are not written yet."""
         return bool(self._queue or self._taken)
 
     @property
-    def filling(self) -> bool:
+    def is_queue_filling_up(self) -> bool:
         """True if the queue is filling up."""
         return self._queue_bytes > MAX_QUEUE_BYTES // 4
 
@@ -189,7 +189,7 @@ class RecordingTrack:
 
     # --- segment file
 
-    def write(self, state: DaemonState, disk_full: str) -> None:
+    def write_queued_rows(self, state: DaemonState, disk_full: str) -> None:
         """Append the queue to the segment. If that fails, the rows wait, as far as the queue has space.
 
         Parameters
@@ -213,12 +213,12 @@ class RecordingTrack:
             self._report_failure(str(error))
         except OSError as error:
             self._report_failure(stopped_text(self.folder, error))
-            self.end()
+            self.close_segment()
         else:
             self._taken = []
             if self.trouble:
                 self.trouble = ""
-                self.report_recovery()
+                self.report_continuation()
 
     def sync(self) -> None:
         """Flush the open segment to disk."""
@@ -226,12 +226,12 @@ class RecordingTrack:
             return
         self._unsynced = False
         try:
-            self._writer.sync()
+            self._writer.flush_to_disk()
         except OSError as error:
             self._report_failure(stopped_text(self.folder, error))
-            self.end()
+            self.close_segment()
 
-    def end(self, pack: bool = True) -> None:
+    def close_segment(self, pack: bool = True) -> None:
         """Close the open segment, and queue it for packing if ``pack`` is True."""
         writer, self._writer = self._writer, None
         if writer is None:
@@ -245,35 +245,35 @@ class RecordingTrack:
 
     def suspend(self) -> None:
         """Close the open segment, because another process may create segments in the folder."""
-        self.end(pack=False)
+        self.close_segment(pack=False)
         self._number = None
 
-    def end_if_changed(self) -> str:
+    def close_if_file_changed(self) -> str:
         """Close a file that another program has changed; return a message about the change, or "".
 
         The next row begins a new file.
         """
         writer = self._writer
-        change = "" if writer is None else writer.external_change()
+        change = "" if writer is None else writer.describe_external_change()
         if writer is None or not change:
             return ""
         self._writer = None
         try:
-            writer.abandon()
+            writer.close_changed_file()
         except OSError as error:
             change = f"{change} ({error.strerror or error})"
         known = segment.list_segments(self.folder)  # files of another program may be among them, and are not packed
-        self._number = max(self._number or 0, segment.segment_number(known[-1]) if known else 0)
+        self._number = max(self._number or 0, segment.parse_segment_number(known[-1]) if known else 0)
         note = f"{writer.path} {change} during recording, with {self._rows} rows in it; a new file is begun"
-        self.report("recording_stopped", note)
-        self.report("recording_back", "recording continues in a new file")
+        self.queue_event("recording_stopped", note)
+        self.queue_event("recording_back", "recording continues in a new file")
         return note
 
     def _append(self, state: DaemonState) -> None:
         """Append the taken rows to the open segment, and begin a new segment if the present one has its full length."""
         begin_s = _time_s(self._taken[0])
         if self._writer is not None and begin_s - self._begin_s >= self._segment_s:
-            self.end()
+            self.close_segment()
         writer = self._writer or self._begin(begin_s)
         if self.origin.kind == "samples":
             blocks = [one for one in self._taken if isinstance(one, SampleBlock)]
@@ -284,17 +284,17 @@ class RecordingTrack:
             self._rows += len(self._taken)
         self._unsynced = True
 
-    def _begin(self, begin_s: float) -> SegmentWriter:
+    def _begin(self, begin_s: float) -> SingleSegmentWriter:
         """Open the next segment."""
-        check_folder(self.folder)
+        check_folder_or_absent(self.folder)
         self.folder.mkdir(parents=True, exist_ok=True)
         if self._number is None:
             known = segment.list_segments(self.folder)
-            self._number = segment.segment_number(known[-1]) if known else 0
+            self._number = segment.parse_segment_number(known[-1]) if known else 0
             self._finished.extend(known)
             for part in self.folder.glob(f"*{PARTIAL_SUFFIX}"):
                 part.unlink()
-        path = self.folder / segment.segment_name(self._number + 1, begin_s)
+        path = self.folder / segment.format_segment_name(self._number + 1, begin_s)
         self._writer = self._opening(path, self.origin)
         self._number += 1
         self._begin_s, self._rows = begin_s, 0
@@ -302,7 +302,7 @@ class RecordingTrack:
 
     # --- events
 
-    def report(self, kind: str, text: str) -> None:
+    def queue_event(self, kind: str, text: str) -> None:
         """Queue an event of the device.
 
         Parameters
@@ -314,14 +314,14 @@ class RecordingTrack:
         """
         self._events.append(RecorderEvent(self.origin.device, kind, text))
 
-    def report_recovery(self) -> None:
+    def report_continuation(self) -> None:
         """Queue an event that the recording continues."""
-        self.report("recording_back", f"recording continues; {self.missed} rows are missing in it")
+        self.queue_event("recording_back", f"recording continues; {self.missed} rows are missing in it")
 
     def _report_failure(self, reason: str) -> None:
         """Store the reason why recording has stopped, and queue an event if it had worked until now."""
         if not self.trouble:
-            self.report("recording_stopped", reason)
+            self.queue_event("recording_stopped", reason)
         self.trouble = reason
         self._stopped_s = time.monotonic()
 

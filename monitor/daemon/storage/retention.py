@@ -13,7 +13,7 @@ MIN_KEPT_SEGMENTS: Final = 2
 """Number of newest segments in a folder that are never deleted, because the window is rebuilt from them."""
 
 
-def delete_old(folders: Sequence[Path], keep_s: float, segment_s: float) -> None:
+def delete_old_segments(folders: Sequence[Path], keep_s: float, segment_s: float) -> None:
     """Delete segments that ended more than ``keep_s`` before the newest of their folder began.
 
     Two measures of age must agree: the times in the file names, and the number of later segments times ``segment_s``.
@@ -32,7 +32,7 @@ def delete_old(folders: Sequence[Path], keep_s: float, segment_s: float) -> None
     for folder in folders:
         known = segment.list_segments(folder)
         for at, (path, after) in enumerate(pairwise(known[: 1 - MIN_KEPT_SEGMENTS])):
-            by_name_s = segment.segment_start_s(known[-1]) - segment.segment_start_s(
+            by_name_s = segment.parse_segment_start_s(known[-1]) - segment.parse_segment_start_s(
                 after
             )  # a segment ends where the next begins
             by_number_s = (len(known) - 1 - at) * segment_s
@@ -40,8 +40,8 @@ def delete_old(folders: Sequence[Path], keep_s: float, segment_s: float) -> None
                 _delete(path)
 
 
-def delete_until_free(folder: Path, folders: Sequence[Path], share: float) -> str:
-    """Delete the oldest segments while more than ``share`` of the disk is in use.
+def delete_until_free(folder: Path, folders: Sequence[Path], max_used_share: float) -> str:
+    """Delete the oldest segments while more than ``max_used_share`` of the disk is in use.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def delete_until_free(folder: Path, folders: Sequence[Path], share: float) -> st
         Folder whose disk is measured. Nothing is done if it does not exist.
     folders : sequence of Path
         Folders of segments.
-    share : float
+    max_used_share : float
         Largest share of the disk that may be in use, 0 to 1.
 
     Returns
@@ -60,14 +60,14 @@ def delete_until_free(folder: Path, folders: Sequence[Path], share: float) -> st
     if not folder.is_dir():
         return ""
     olds: deque[Path] | None = None
-    while (taken := used_disk_share(folder)) > share:
+    while (taken := used_disk_share(folder)) > max_used_share:
         if olds is None:
             every = [path for one in folders for path in segment.list_segments(one)[:-MIN_KEPT_SEGMENTS]]
-            olds = deque(sorted(every, key=segment.segment_start_s))
+            olds = deque(sorted(every, key=segment.parse_segment_start_s))
         if not olds:
             return (
-                f"{folder}: the disk is {100 * taken:.4g} % full, disk_share allows {100 * share:.4g} %, and no older "
-                f"segment is left to delete; recording stopped"
+                f"{folder}: the disk is {100 * taken:.4g} % full, disk_share allows {100 * max_used_share:.4g} %, "
+                f"and no older segment is left to delete; recording stopped"
             )
         _delete(olds.popleft())
     return ""

@@ -2,9 +2,10 @@
 
     x_k = φ1 x_{k−1} + φ2 x_{k−2} + a_k + θ1 a_{k−1},    z_k = μ + x_k + v_k
 
-z are means over intervals. v is the remaining white noise of a mean. Its variance is known beforehand from the scatter
-within the intervals. It is 0 if z is the process itself, as in the paper on which this is based. The state-space form
-uses Green's function (Pandit & Wu 1983; Yuan et al. 2010). The state holds the process and its one-step prediction:
+The values z are means over intervals, and v is the white noise of a mean. The variance of v is known from the scatter
+within the intervals. A variance of zero means that the process x is measured directly, as in Yuan et al. (2010). The
+state-space form uses Green's function (Pandit & Wu 1983). The state consists of the process and its one-step
+prediction:
 
     X_k = [x_k, x̂_{k+1|k}],  X_k = A X_{k−1} + B a_k,  A = [[0, 1], [φ2, φ1]],  B = [G0, G1]ᵀ,  G0 = 1, G1 = φ1 + θ1
 
@@ -37,9 +38,9 @@ MIN_VALUES: Final = 30
 MAX_PARTIAL_AUTOCORRELATION: Final = 0.99999
 """Largest absolute value of a partial autocorrelation."""
 MAX_COEFFICIENTS: Final = 3
-"""Number of coefficients of the highest order. With fewer coefficients, a root cannot nearly cancel θ in two ways."""
+"""Number of coefficients of the highest order. Only this order can have several maxima of the likelihood."""
 MIN_MAXIMA_DISTANCE: Final = 0.1
-"""Smallest difference of the partial autocorrelations of two distinct maxima of the likelihood."""
+"""Smallest difference of the partial autocorrelations between two maxima that are treated as distinct."""
 BISECTION_STEPS: Final = 6
 """Bisections of the last step of a search for the end of a confidence interval."""
 START_PARTIAL_AUTOCORRELATIONS: Final = {
@@ -51,7 +52,7 @@ START_PARTIAL_AUTOCORRELATIONS: Final = {
 START_THETAS: Final = (-0.9, -0.5, 0.0, 0.5)
 """Start values of the partial autocorrelation of the moving-average part."""
 START_VARIANCE_SHARES: Final = (1e-3, 0.03, 0.5)
-"""Start values of the variance of a, as shares of the variance of z. They are used if a part of z is white noise."""
+"""Start values of the innovation variance, as shares of the variance of z, if z contains white noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,10 +108,10 @@ def fit_arma(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS, in
     """
     known = z[np.isfinite(z)]
     if known.size < MIN_VALUES:
-        raise NotReady(f"{known.size} values; {MIN_VALUES} are needed to identify a drift")
+        raise NotReady(f"{known.size} values; at least {MIN_VALUES} are needed to identify a drift")
     origin, scale = float(np.median(known)), float(known.std())
     if not scale > 0.0:
-        raise NotReady("all values are the same")
+        raise NotReady("all values are equal")
     unit = (z - origin) / scale
     share = white / scale**2
     best = min((_fit_order(unit, share, order) for order in orders), key=lambda one: one[0])
@@ -135,7 +136,7 @@ def _propagate_covariance(
 
 @compiled
 def stationary_covariance(phi1: float, phi2: float, theta: float) -> _Triple:
-    """Return the stationary covariance of the state for a of variance 1, as its elements p11, p12, p22.
+    """Return the elements p11, p12, p22 of the stationary covariance of the state, for innovations of variance 1.
 
     Parameters
     ----------
@@ -154,7 +155,7 @@ def stationary_covariance(phi1: float, phi2: float, theta: float) -> _Triple:
 def run_kalman_filter(
     z: Floats, phi1: float, phi2: float, theta: float, variance: float, white: float
 ) -> tuple[int, float, float, float]:
-    """Run the exact Kalman filter and return the sums of the likelihood.
+    """Run the exact Kalman filter, and return the sums from which the likelihood follows.
 
     Parameters
     ----------
@@ -206,8 +207,8 @@ _OrderFit = tuple[float, Order, Floats]  # BIC, order, search parameters
 def _fit_order(z: Floats, white: float, order: Order) -> _OrderFit:
     """Return the most likely parameters of one order.
 
-    The search uses atanh of the partial autocorrelations and of θ. The logarithm of the variance is added if v is not
-    zero.
+    The search parameters are atanh of the partial autocorrelations and of θ. If the variance of v is positive, the
+    logarithm of the innovation variance is one more parameter.
     """
     count = int(np.isfinite(z).sum())
     free = sum(order) + (white > 0.0 and order != (0, 0))
@@ -237,7 +238,7 @@ def _start_parameters(white: float, order: Order) -> list[Floats]:
 
 
 def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
-    """Return the log likelihood, maximised over the mean and, if v is zero, over the variance."""
+    """Return the log-likelihood, maximised over the mean and, without white noise, over the innovation variance."""
     phi1, phi2, theta, variance = _model_coefficients(order, u, white)
     count, logs, square, _ = run_kalman_filter(z, phi1, phi2, theta, variance, white)
     if white > 0.0 and order != (0, 0):
@@ -247,7 +248,7 @@ def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
 
 
 def _model_coefficients(order: Order, u: Floats, white: float) -> tuple[float, float, float, float]:
-    """Return φ1, φ2, θ1 and the variance of a; the variance is 1 if the likelihood determines it directly."""
+    """Return φ1, φ2, θ1 and the innovation variance. The variance is 1 if it is not a search parameter."""
     partial = [
         max(min(tanh(one), MAX_PARTIAL_AUTOCORRELATION), -MAX_PARTIAL_AUTOCORRELATION)
         for one in u[: order[0] + order[1]].tolist()
@@ -263,7 +264,7 @@ def _model_coefficients(order: Order, u: Floats, white: float) -> tuple[float, f
 
 
 def _to_model(z: Floats, white: float, origin: float, scale: float, best: _OrderFit) -> ArmaModel:
-    """Return the fitted order as a model in the units of the measurement."""
+    """Return the fitted model in the units of the measurement."""
     bic, order, u = best
     phi1, phi2, theta, variance = _model_coefficients(order, u, white)
     seen = white if order != (0, 0) else 0.0
@@ -287,9 +288,9 @@ def _to_model(z: Floats, white: float, origin: float, scale: float, best: _Order
 def _confidence_intervals(z: Floats, white: float, order: Order, u: Floats) -> tuple[_Triple, _Triple]:
     """Return the 95 % intervals of φ1, φ2 and θ1 by the profile likelihood.
 
-    An interval ends where the likelihood, maximised over all other parameters, has fallen by half of the quantile of
-    χ²(1). If a root nearly cancels θ, the likelihood has a long ridge or two maxima. Its curvature is then no measure
-    of the uncertainty, and the interval covers both maxima.
+    At the ends of an interval, the log-likelihood, maximised over all other parameters, is lower than its maximum by
+    half of the 95 % quantile of χ²(1). If a root of φ nearly cancels θ, the likelihood has a long ridge or two maxima.
+    The curvature of the likelihood then underestimates the uncertainty. The interval covers both maxima.
     """
     there = (order[0] > 0, order[0] > 1, order[1] > 0)
     tops = _likelihood_maxima(z, white, order, u)
@@ -301,7 +302,8 @@ def _confidence_intervals(z: Floats, white: float, order: Order, u: Floats) -> t
 
 
 def _likelihood_maxima(z: Floats, white: float, order: Order, u: Floats) -> list[Floats]:
-    """Return the maxima of the likelihood that are nearly as high as the highest, with the fitted one first."""
+    """Return the positions of all maxima that lie within the 95 % limit of the likelihood. The fitted maximum is the
+    first."""
     found = [u]
     if sum(order) == MAX_COEFFICIENTS:
         for start in _start_parameters(white, order):
@@ -316,7 +318,8 @@ def _likelihood_maxima(z: Floats, white: float, order: Order, u: Floats) -> list
 
 
 def _interval_ends(z: Floats, white: float, order: Order, u: Floats, which: int, top: float) -> tuple[float, float]:
-    """Return both ends of the interval of one coefficient about one maximum; ``top`` is the highest log likelihood."""
+    """Return the ends of the confidence interval of one coefficient around one maximum. ``top`` is the highest
+    log-likelihood."""
     value = _model_coefficients(order, u, white)[which]
     limits = (
         (-MAX_PARTIAL_AUTOCORRELATION, MAX_PARTIAL_AUTOCORRELATION)

@@ -11,7 +11,7 @@ from monitor.drift.compensation.compensator import DriftInterval
 
 @dataclass(frozen=True, slots=True)
 class AxisCompensation:
-    """Compensation of one gyro axis, evaluated at rest on samples that were not used for learning before."""
+    """Compensation of one gyro axis, evaluated on samples at rest that had not been used for learning."""
 
     model: ArmaModel | None  # last identified model of the drift; None if there was too little rest
     uncompensated: RestScore  # without compensation, minus the mean of the first third

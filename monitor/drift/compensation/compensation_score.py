@@ -1,8 +1,9 @@
-"""Quality of a compensated rate at rest, by one measure for all methods.
+"""Quality of a compensated rate at rest. All methods are evaluated in the same way.
 
-The evaluated samples must not have been used for learning. A filter that uses only past samples fulfils this condition.
-A method that learns from a whole recording is evaluated on another part of it. The rate before compensation is
-corrected by its mean over the learning part, so that no method is credited with the removal of a constant.
+Samples that a method has used for learning are not evaluated. A method that learns from a whole recording therefore
+learns from one part and is evaluated on another part. A filter that uses only past samples needs no separate part. The
+mean of the learning part is subtracted from the uncompensated rate. Otherwise, the removal of a constant bias would
+count as an improvement.
 """
 
 from dataclasses import dataclass
@@ -16,12 +17,12 @@ from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 MINUTE_S: Final = 60.0
 """One minute in seconds."""
 SPANS_S: Final = (60.0, 600.0, 3600.0)
-"""Time spans in seconds over which the mean rate is evaluated, because it is an error of heading."""
+"""Averaging periods in seconds for the mean rate, which is the mean error of the heading rate."""
 
 
 @dataclass(frozen=True, slots=True)
 class RestScore:
-    """Quality of one axis at rest, in rad/s. Values that the record is too short for are NaN."""
+    """Quality of one axis at rest, in rad/s. A value is NaN if the record is too short."""
 
     rms: float  # rms about zero
     worst_minute: float  # largest rms of a minute
@@ -53,7 +54,7 @@ def score_at_rest(rate: Floats, rate_hz: float) -> RestScore:
 
 
 def _span_means(x: Floats, samples: int) -> Floats:
-    """Return the means of successive spans of which at least half of the samples are known."""
+    """Return the means of successive periods in which at least half of the samples are known."""
     count = x.size // samples if samples else 0
     if not count:
         return np.zeros(0)

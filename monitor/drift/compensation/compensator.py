@@ -1,15 +1,14 @@
 """Removal of the drift of three gyro axes from the measured rate, sample by sample, while the carrier may move.
 
-The measured rate is z = ω + drift + noise. At rest the true rate ω is zero, so the drift is learned only there, from
-means over intervals (``sage_husa``, with the model of ``arma``). In motion the drift is predicted, and the remaining
-rate is smoothed by filters that follow motion (``motion_filter_bank``). A single filter for both would have to divide
-every slow change between drift and motion. The knowledge that the carrier is at rest is more reliable than any such
-division.
+The measured rate is z = ω + drift + noise. At rest the true rate ω is zero, so the drift is estimated from means over
+intervals at rest. ``sage_husa`` estimates the drift with a model of ``arma``. In motion the drift is predicted, and the
+filters of ``carrier_rate_filter_bank`` smooth the remaining rate. A single filter for drift and motion would have to
+attribute every slow change to one of them. Rest detection is more reliable than such a decision.
 
-The decision whether a sample was taken at rest follows some blocks later (``motion_kernel``). The result of an interval
-therefore applies from the second block after it, which is 0.5 s at most rates. The compensated rate has no such delay:
-sample k depends on the samples up to k. The output does not depend on how the stream is divided into blocks.
-Accelerometer values are not changed. They are used to detect rest.
+The motion detector decides about a block only some blocks later (``motion_kernel``). The result of an interval is
+therefore used from the second block after the interval, which is a delay of 0.5 s at most sample rates. The compensated
+rate is not delayed, because output sample k depends on the input samples up to k. The output does not depend on how the
+stream is divided into blocks. Accelerometer values are not changed. They are used to detect rest.
 """
 
 from collections.abc import Sequence
@@ -23,7 +22,7 @@ from drivers.sample import AXES, Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import ORDERS, ArmaModel, Order, fit_arma
-from monitor.drift.compensation.motion_filter_bank import (
+from monitor.drift.compensation.carrier_rate_filter_bank import (
     MIN_REST_INTERVALS,
     filter_memories,
     filter_sample,
@@ -40,24 +39,24 @@ GYROS: Final = 3
 BLOCKS_PER_INTERVAL: Final = 4
 """Blocks of the motion detector in an interval. An interval lasts 1 s, and longer at rates below 32 Hz."""
 MIN_REST_BLOCKS: Final = 2
-"""Blocks at rest that an interval needs to count as at rest."""
+"""Smallest number of blocks at rest in an interval at rest."""
 MAX_PENDING_BLOCKS: Final = 4
 """Blocks that can wait for a rest decision."""
 HISTORY_INTERVALS: Final = 2048
 """Intervals that are kept to identify a model."""
 MIN_IDENTIFICATION_INTERVALS: Final = 60
-"""Intervals at rest before a first model is identified. The next identification follows after half as many more, and
-after at most HISTORY_INTERVALS more."""
+"""Number of intervals at rest before the first identification. The next identification follows when the number has
+grown by half, but after at most HISTORY_INTERVALS more."""
 MAX_REST_RMS: Final = (0.02,) * 3 + (0.3,) * 3
 """Largest rms of a block at rest about its mean, in rad/s and m/s².
 
-The limit holds whatever the motion detector has learned, for example in a car that drives all day. Above it nothing is
-learned, and the rates are hardly changed.
+The limit applies even if the motion detector has adapted to permanent motion, for example in a car that drives all day.
+A block above the limit is not used to learn the drift.
 """
 MAX_BIAS_RAD_S: Final = 0.35
 """Largest mean rate of a gyro at rest: 0.35 rad/s is 20 °/s."""
 MAX_GAP_INTERVALS: Final = 100_000
-"""Largest number of intervals predicted across a gap. After a longer gap, the prediction holds no information."""
+"""Largest number of intervals predicted across a gap. After a longer gap, the prediction contains no information."""
 
 BLOCK_NUMBER, COUNT, ORIGIN, SUM, SQUARES = range(5)
 """Columns of ``CompensatorState.waiting``: number of the block, number of samples, origin of the sums, sum, and sum of
@@ -79,8 +78,8 @@ class CompensatorState(NamedTuple):
     learned: Ints  # [3] intervals at rest from which the filters learned their noise
     drift: np.ndarray  # [3] of sage_husa.DRIFT_FILTER
     bias: Floats  # [3] rad/s, bias that is subtracted now; NaN = not known yet
-    bank: Floats  # [3, filters + 1, 5] columns as in ``motion_filter_bank``
-    ages: Ints  # [3, filters, 2] columns as in ``motion_filter_bank``
+    bank: Floats  # [3, filters + 1, 5] columns as in ``carrier_rate_filter_bank``
+    ages: Ints  # [3, filters, 2] columns as in ``carrier_rate_filter_bank``
     feedback: Floats  # [3, 1] difference of input and output that is still to be fed back
     waiting: Floats  # [MAX_PENDING_BLOCKS, 6, 5] sums of the blocks that wait for a rest decision
     sums: Floats  # [MAX_PENDING_BLOCKS, 3, filters + 1, 2] sums of ``filter_sample`` for each of these blocks
@@ -118,7 +117,7 @@ class Compensator:
     rate_hz : float
         Sample rate in Hz.
     adapts : bool
-        True if the noise of the drift is estimated continuously. False if it stays as the identification found it.
+        True if the noise of the drift is estimated continuously. False if the identified noise is kept.
     orders : sequence of (p, q)
         ARMA orders to choose from.
 
@@ -157,12 +156,12 @@ class Compensator:
 
     @property
     def bias(self) -> Floats:
-        """Return the bias [3] in rad/s that is subtracted now; NaN means that it is not known yet."""
+        """Return the bias [3] in rad/s that is subtracted; NaN = not known yet."""
         return self._state.bias.copy()
 
     @property
-    def error(self) -> Floats:
-        """Return the standard error [3] of the bias in rad/s; NaN means that the bias is not known yet."""
+    def bias_standard_error(self) -> Floats:
+        """Return the standard error [3] of the bias in rad/s; NaN = not known yet."""
         known = [sage_husa.expected_bias(drift)[1] ** 0.5 for drift in self._state.drift]
         return np.where(np.isnan(self._state.bias), np.nan, known)
 
@@ -191,7 +190,7 @@ class Compensator:
         # Numba compiles one version per memory layout and access flag, so the array is always contiguous and read-only.
         values = np.ascontiguousarray(values, np.float64).view()
         values.flags.writeable = False
-        # After a gap, all waiting blocks are decided at once, and each of them may end an interval.
+        # After a gap, the motion detector decides about all waiting blocks at once, and each block may end an interval.
         outcomes = np.empty((len(values) // self.interval_samples + 2 + MAX_PENDING_BLOCKS, 1 + 6 * GYROS))
         filled = _advance(values, self.sample_count, self.block_samples, self._state, out, outcomes)
         self.sample_count += len(values)
@@ -210,7 +209,8 @@ class Compensator:
     def samples_to_interval_end(self) -> int:
         """Return the number of samples to the end of the interval.
 
-        If models change only there, they change at the same sample however the stream is divided into blocks.
+        A caller that changes models only at the end of an interval gets results that do not depend on the division into
+        blocks.
         """
         return self.interval_samples - self.sample_count % self.interval_samples
 
@@ -219,7 +219,7 @@ class Compensator:
         """Return the indices of the axes that have enough new intervals to identify a model."""
         return tuple(np.flatnonzero(self._at_rest >= self._next_identification).tolist())
 
-    def identification_data(self, axis: int) -> tuple[Floats, float]:
+    def identification_means_and_variance(self, axis: int) -> tuple[Floats, float]:
         """Return the interval means from which the model of an axis is to be identified.
 
         Parameters
@@ -239,7 +239,7 @@ class Compensator:
         return z, white
 
     def set_model(self, axis: int, model: ArmaModel | None) -> None:
-        """Use a new model for an axis, and filter all remembered intervals again with it.
+        """Use a new model for an axis, and run the filter with the new model over all stored intervals.
 
         Parameters
         ----------
@@ -261,18 +261,18 @@ class Compensator:
         drift["rest_count"] = count  # The repeated intervals are not counted a second time.
         _update_bias(axis, self._state.drift, self._state.bias, self._state.bank)
 
-    def identify(self) -> None:
+    def identify_due_models(self) -> None:
         """Identify the models of all axes that are due."""
         for axis in self.axes_due:
             try:
-                self.set_model(axis, fit_arma(*self.identification_data(axis), self._orders))
-            except NotReady:  # The means are all equal or too few. The identification is repeated later.
+                self.set_model(axis, fit_arma(*self.identification_means_and_variance(axis), self._orders))
+            except NotReady:  # There are too few means, or all means are equal. The identification is repeated later.
                 self.set_model(axis, None)
 
     # --- results of intervals
 
     def _history(self, axis: int) -> tuple[Floats, Floats]:
-        """Return the remembered means and their scatter, oldest first."""
+        """Return the stored means and their scatter, oldest first."""
         count = min(self._interval_count, HISTORY_INTERVALS)
         order = np.arange(self._interval_count - count, self._interval_count) % HISTORY_INTERVALS
         return self._means[axis][order], self._scatter[axis][order]
@@ -397,7 +397,7 @@ def _accumulate(values: Floats, sums: Floats) -> None:
 
 @compiled
 def _apply_rest_decision(number: int, moves: bool, s: CompensatorState, outcomes: Floats) -> bool:
-    """Apply the final rest decision on a block, and return True if this ended the previous interval."""
+    """Apply the final decision about a block, and return True if the block ended the previous interval."""
     interval = number // BLOCKS_PER_INTERVAL
     over = bool(s.current[0] >= 0 and interval > s.current[0])
     if over:
@@ -422,7 +422,7 @@ def _apply_rest_decision(number: int, moves: bool, s: CompensatorState, outcomes
 
 @compiled
 def _exceeds_rest_limits(waiting: Floats) -> bool:
-    """Return True if a block exceeds the limits of rest, whatever the motion detector has learned."""
+    """Return True if a block exceeds the fixed limits of rest."""
     for a in range(len(AXES)):
         n = waiting[a, COUNT]
         if n == 0.0:
@@ -437,7 +437,7 @@ def _exceeds_rest_limits(waiting: Floats) -> bool:
 
 @compiled
 def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
-    """End the interval: update drift and filters with it, and predict the drift of the next interval."""
+    """End the interval: update drift and filters, and predict the drift of the next interval."""
     outcomes[0] = s.current[0]
     for a in range(GYROS):
         outcome = outcomes[1 + 6 * a : 7 + 6 * a]
@@ -486,7 +486,8 @@ def _interval_mean(means: Floats) -> tuple[int, float, float]:
 
 @compiled
 def _min_variance(blocks: Floats, axis: int) -> float:
-    """Return the variance of an interval mean that rounding may hide, from ``MotionState.open``."""
+    """Return the smallest variance of an interval mean, which follows from the quantization step in
+    ``MotionState.open``."""
     return float(blocks[axis, motion_kernel.STEP] ** 2 / 12.0 / BLOCKS_PER_INTERVAL + motion_kernel.MIN_VARIANCE)
 
 
@@ -494,13 +495,13 @@ def _min_variance(blocks: Floats, axis: int) -> float:
 def _predict_next_interval(axis: int, s: CompensatorState) -> None:
     """Predict the drift of the next interval, if a level is confirmed."""
     if s.drift[axis]["rest_count"] >= sage_husa.MIN_CONFIRMED_INTERVALS:
-        sage_husa.predict(s.drift[axis])
+        sage_husa.predict_next_interval(s.drift[axis])
         _update_bias(axis, s.drift, s.bias, s.bank)
 
 
 @compiled
 def _update_bias(axis: int, drifts: np.ndarray, biases: Floats, banks: Floats) -> None:
-    """Subtract the predicted drift from now on, and shift the filters by its change."""
+    """Use the predicted drift as the bias, and shift the filters by the change of the bias."""
     now = sage_husa.expected_bias(drifts[axis])[0]
     before = biases[axis] if biases[axis] == biases[axis] else 0.0
     shift_bias(banks[axis], now - before)

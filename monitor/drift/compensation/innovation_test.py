@@ -1,8 +1,8 @@
 """Test of the innovations of a drift model: detection of a model that no longer fits.
 
-While the model fits, the mean of ε²/S over the last intervals follows a χ² distribution divided by its degrees of
-freedom. If the mean exceeds LIMIT, the model does not fit, even with its adapted noise. The change is reported once,
-and again only after the model has fitted in between.
+If the model fits, the mean of ε²/S over the last intervals follows a χ² distribution divided by the degrees of freedom.
+If the mean exceeds LIMIT, the model does not fit, even with adapted noise. The test reports the misfit once. After the
+mean has fallen below RESET_LIMIT, a new misfit is reported again.
 """
 
 from collections import deque
@@ -13,7 +13,7 @@ INTERVALS: Final = 64
 FALSE_ALARM_PROBABILITY: Final = 1e-8
 """Probability that noise alone exceeds the limit in one evaluation. Successive evaluations overlap."""
 LIMIT: Final = 2.327393746165351
-"""Quantile of χ² with INTERVALS degrees of freedom divided by INTERVALS. Noise exceeds the quantile with
+"""Quantile of χ² with INTERVALS degrees of freedom, divided by INTERVALS, for the probability 1 −
 FALSE_ALARM_PROBABILITY."""
 RESET_LIMIT: Final = 1.3
 """Mean square below which the model fits again."""
@@ -42,7 +42,7 @@ class InnovationTest:
         self._exceeded = True
         return True
 
-    def reset(self) -> None:
+    def forget_innovations(self) -> None:
         """Discard all innovations, after a change of the model or of the level."""
         self._squares.clear()
         self._exceeded = False

@@ -1,8 +1,8 @@
-"""Live drift compensation of one device: the samples of a stream without the drift of their gyros.
+"""Live drift compensation of one device: removes the gyro drift from a stream of samples.
 
-Each interval produces a ``DriftUpdate``. An event reports a model that no longer fits, or a step of the bias. The
-caller identifies the models beside the stream, because an identification takes some 50 ms. The property ``axes_due`` of
-the compensator names the axes, and ``set_model`` takes an identified model.
+Each interval produces a ``DriftUpdate``. An event reports a model that no longer fits, or a step of the bias. An
+identification takes about 50 ms, so the caller runs it in another thread. ``Compensator.axes_due`` lists the axes to
+identify, and ``set_model`` receives an identified model.
 """
 
 from dataclasses import dataclass
@@ -59,7 +59,7 @@ class LiveCompensation:
             self._publish(interval, t_ns)
         return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
-    def take(self) -> list[DriftUpdate]:
+    def take_updates(self) -> list[DriftUpdate]:
         """Return the results of the intervals that have ended since the last call."""
         updates, self._updates = self._updates, []
         return updates
@@ -81,20 +81,20 @@ class LiveCompensation:
         """
         self.compensator.set_model(axis, model)
         if model is not None:
-            self._innovations[axis].reset()
+            self._innovations[axis].forget_innovations()
 
     def set_rate(self, rate_hz: float) -> None:
         """Set a better estimate of the sample rate in Hz.
 
-        If the rate differs by more than MAX_RATE_CHANGE, the compensation starts anew, because the intervals had
-        another length.
+        If the rate differs by more than MAX_RATE_CHANGE, the compensation is restarted, because the length of an
+        interval has changed.
         """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._rate_hz = rate_hz
             self._reset()
 
     def _reset(self) -> None:
-        """Start the compensation anew at the current sample rate."""
+        """Restart the compensation at the current sample rate."""
         self.compensator = Compensator(self._rate_hz)
         self._innovations = [InnovationTest() for _ in range(GYROS)]
 
@@ -114,7 +114,7 @@ class LiveCompensation:
         )
         for at in range(GYROS):
             if interval.outcome[at] == STEPPED:
-                self._innovations[at].reset()
+                self._innovations[at].forget_innovations()
                 self._events.append(_step_event(AXES[at], float(interval.mean[at] - interval.expected[at]), t_ns))
                 continue
             known = used[at] and np.isfinite(interval.expected[at])
@@ -125,16 +125,14 @@ class LiveCompensation:
 
 def _step_event(axis: str, size: float, t_ns: int) -> Event:
     """Return the event of a step of the bias by ``size`` rad/s."""
-    text = (
-        f"{axis}: the bias has stepped by {format_rate(axis, size, sign=True)} and stayed; it is taken out from now on"
-    )
+    text = f"{axis}: lasting step of the bias by {format_rate(axis, size, sign=True)}; the new bias is now compensated"
     return Event(EVENT_KIND, t_ns, text, axis, {"bias": {"size": size}})
 
 
 def _misfit_event(axis: str, mean_square: float, t_ns: int, since_ns: int) -> Event:
     """Return the event of innovations whose mean square is too large."""
     text = (
-        f"{axis}: the drift does not go as its model lets expect: squared innovations are {mean_square:.1f} times as "
-        f"large as they should be"
+        f"{axis}: the drift does not follow its model: squared innovations are {mean_square:.1f} times as large as "
+        f"expected"
     )
     return Event(EVENT_KIND, t_ns, text, axis, {"innovation": {"mean_square": mean_square}}, since_ns, mean_square**0.5)

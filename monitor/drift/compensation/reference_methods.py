@@ -1,8 +1,8 @@
-"""Published methods that remove drift and noise from a finished recording, with one interface, for comparison.
+"""Published methods that remove drift and noise from a finished recording, for comparison.
 
 All three methods learn from samples at rest and then treat the recording as one signal. None of them detects motion.
-``filter_emd_modes`` and ``shrink_wavelets`` need future samples. ``autoregressive_filter`` needs a signal that is
-similar to the noise at rest.
+``filter_emd_modes`` and ``shrink_wavelets`` need future samples. ``autoregressive_filter`` assumes that the whole
+signal has the spectrum of the noise at rest.
 """
 
 from collections.abc import Callable
@@ -20,8 +20,8 @@ MAX_ORDER: Final = 8
 MIN_REST_SAMPLES: Final = 100
 """Smallest number of samples at rest."""
 PIECE, OVERLAP = 16_384, 4_096
-"""Samples of one empirical mode decomposition, and of the cross-fade to the next one. The decomposition is made in
-pieces because its memory grows with its length."""
+"""Samples of one empirical mode decomposition, and of the cross-fade to the next one. A long signal is decomposed in
+pieces, because the required memory grows with the length."""
 MAX_NOISE_LAG: Final = 2
 """Lag in samples by which the autocorrelation of a noise mode has fallen below 1/e."""
 WAVELET: Final = "db4"
@@ -34,8 +34,8 @@ MISSING_PACKAGES: Final = 'EMD-signal and PyWavelets are not installed: pip inst
 """Message for a missing optional package."""
 
 ReferenceMethod = Callable[[Floats, Floats], Floats]
-"""Function of a rate [n] and of samples at rest [m], both minus the mean at rest; it returns the rate [n] without
-noise."""
+"""Function that returns a rate [n] without noise. The arguments are the rate [n] and samples at rest [m], minus the
+mean at rest."""
 
 
 def apply_reference_method(x: Floats, learned: Floats, variant: ReferenceMethod) -> Floats:
@@ -62,7 +62,7 @@ def apply_reference_method(x: Floats, learned: Floats, variant: ReferenceMethod)
     """
     rest = learned[np.isfinite(learned)]
     if rest.size < MIN_REST_SAMPLES:
-        raise NotReady(f"{rest.size} samples at rest; {MIN_REST_SAMPLES} are needed to learn from")
+        raise NotReady(f"{rest.size} samples at rest; at least {MIN_REST_SAMPLES} are needed for learning")
     mean = float(rest.mean())
     there = np.isfinite(x)
     whole = np.interp(np.arange(x.size), np.flatnonzero(there), x[there]) - mean
@@ -78,7 +78,7 @@ def autoregressive_filter(x: Floats, learned: Floats) -> Floats:
     x : ndarray, shape (n,)
         Rate in rad/s without its mean at rest.
     learned : ndarray, shape (m,)
-        Rate at rest in rad/s without its mean. Its variance is the measurement noise of the filter.
+        Rate at rest in rad/s without its mean. The variance is the measurement noise of the filter.
     """
     return _kalman_filtered(x, *_autoregression(learned), float(learned.var()))
 
@@ -111,7 +111,7 @@ def shrink_wavelets(x: Floats, learned: Floats) -> Floats:
     x : ndarray, shape (n,)
         Rate in rad/s without its mean at rest.
     learned : ndarray, shape (m,)
-        Rate at rest in rad/s without its mean. It gives the noise of each level.
+        Rate at rest in rad/s without its mean. The noise of each level is estimated from this rate.
 
     Raises
     ------
@@ -159,8 +159,8 @@ def _steady_covariance(step: Floats, new: float) -> Floats:
     """Return the steady-state covariance of a Kalman filter's prediction.
 
     ``step`` is the transition matrix [p, p], and ``new`` is the variance added to the first element in each step. The
-    first element is measured with a variance of one. The structure-preserving doubling algorithm (Chu, Fan, Lin & Wang,
-    Int. J. Control 77, 2004) converges quadratically.
+    first element is measured with a variance of one. The function uses the structure-preserving doubling algorithm,
+    which converges quadratically (Chu, Fan, Lin & Wang, Int. J. Control 77, 2004).
     """
     p = step.shape[0]
     a, g, h = step.T.copy(), np.zeros((p, p)), np.zeros((p, p))

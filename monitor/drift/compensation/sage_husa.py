@@ -1,21 +1,23 @@
-"""Adaptive Kalman filter for the bias of one gyro axis from interval to interval, with its ARMA model.
+"""Adaptive Kalman filter with an ARMA model for the bias of one gyro axis. The time step is one interval.
 
-The state is [x, x̂, level]. The first two elements are the process in the form of Green's function (see ``arma``). The
-level is a random walk that is slower than anything in the record of the identification. The measurement is z = x +
-level + v. The noise is estimated continuously after Sage and Husa (1969), in the forms that cannot become negative.
-With ε = z − ẑ, S its variance, d_k = (1 − b)/(1 − b^{k+1}), k = 1, 2, …
+The state is [x, x̂, level]. The elements x and x̂ are the ARMA process and its one-step prediction (see ``arma``). The
+level is a slow random walk, for changes that are slower than the record used for the identification. The measurement z
+is the sum of x, level and white noise v. The noise variances are estimated continuously after Sage and Husa (1969), in
+a form that keeps them positive. With the innovation ε, its variance S and the weight d_k = (1 − b)/(1 − b^{k+1}) of
+interval k:
 
     Q̂ ← Q̂ + d Q̂ D (ε² − S) Dᵀ Q̂,  D = Hᵀ/S        R̂ ← (1 − d) R̂ + d [(1 − H K)² ε² + H P Hᵀ]
 
-Q̂ starts as s B Bᵀ and keeps this form: s ← s + d s² (ε² − S)/S². R̂ could collapse to zero. It is therefore kept above
-half of the variance that the scatter within intervals gives, and s above a share of its identified value. The means of
-the noise, q̂ and r̂, are not estimated. On recordings at rest they increased the error up to three times, because they
-cannot be distinguished from the level.
+Q̂ starts as s B Bᵀ and keeps this form, so only s is updated: s ← s + d s² (ε² − S)/S². The lower limit of R̂ is half
+of the variance that follows from the scatter within intervals. The lower limit of s is MIN_VARIANCE_SHARE of the
+identified value. Without these limits, the estimates could become zero. The means q̂ and r̂ of the noise are not
+estimated, because they cannot be distinguished from the level. On recordings at rest, estimated means increased the
+error up to three times.
 
 An interval is rejected if its innovation exceeds OUTLIER_SIGMAS standard deviations, or if its scatter is far above the
-usual scatter. Slow rotation has both effects, and its rate may pass through zero. After a rejected interval,
-GUARD_INTERVALS successive intervals must therefore agree before one is used again. A step of the bias is assumed only
-if the new value persists as long as the level before had been confirmed, within 10 s to 5 min.
+usual scatter. Slow rotation increases the innovation and the scatter, but the rate may pass through zero. After a
+rejected interval, intervals are used again only after GUARD_INTERVALS successive intervals agree. A step of the bias is
+assumed if the new value persists for as long as the previous level was confirmed. The limits are 10 s and 5 min.
 """
 
 from typing import Final
@@ -42,12 +44,12 @@ AGREEMENT_SIGMAS: Final = 4.0
 STEP_INTERVALS: Final = (10.0, 300.0)
 """Smallest and largest number of intervals after which a persistent change counts as a step."""
 MIN_CONFIRMED_INTERVALS: Final = 5
-"""Successive intervals at rest that confirm the first level. The carrier may rotate at the start."""
+"""Successive intervals at rest that confirm the first level, because the carrier may rotate at the start."""
 SCATTER_WEIGHT: Final = 0.02
 """Weight of one interval in the average of the scatter within intervals."""
 MIN_LEVEL_MEMORY, MAX_LEVEL_MEMORY = 40, 1000
-"""Smallest and largest memory of the level in intervals. It is a third of the record of the identification, within
-these limits."""
+"""Smallest and largest memory of the level in intervals. Within these limits, the memory is a third of the record used
+for the identification."""
 
 DRIFT_FILTER: Final = np.dtype(
     [
@@ -77,7 +79,7 @@ NOT_AT_REST, USED, REJECTED, STEPPED = range(4)
 
 
 def set_model(drift: np.void, arma: ArmaModel) -> None:
-    """Set a new model, with an unknown state and the identified noise.
+    """Set a new model. The state becomes unknown, and the noise is that of the identification.
 
     Parameters
     ----------
@@ -93,7 +95,7 @@ def set_model(drift: np.void, arma: ArmaModel) -> None:
     drift["phi1"], drift["phi2"], drift["g1"] = phi1, phi2, phi1 + arma.theta
     drift["identified_variance"] = drift["variance"] = arma.variance
     drift["white_variance"] = arma.white_variance
-    # Spectral density of the process and of v at f = 0.
+    # Spectral density of x + v at zero frequency.
     slow = arma.white_variance + arma.variance * ((1.0 + arma.theta) / (1.0 - phi1 - phi2)) ** 2
     drift["level_variance"] = slow / min(max(arma.count / 3.0, MIN_LEVEL_MEMORY), MAX_LEVEL_MEMORY) ** 2
     drift["covariance"][2, 2] = slow / arma.count
@@ -102,7 +104,7 @@ def set_model(drift: np.void, arma: ArmaModel) -> None:
 
 
 @compiled
-def predict(drift: np.void) -> None:
+def predict_next_interval(drift: np.void) -> None:
     """Predict the state of the next interval."""
     phi1, phi2, g1, s = drift["phi1"], drift["phi2"], drift["g1"], drift["variance"]
     x, p = drift["state"], drift["covariance"]
@@ -118,7 +120,7 @@ def predict(drift: np.void) -> None:
 
 @compiled
 def skip_interval(drift: np.void) -> None:
-    """Process an interval that was not at rest."""
+    """Process an interval in motion."""
     if drift["rest_count"] < MIN_CONFIRMED_INTERVALS:
         drift["rest_count"] = 0.0
 
@@ -189,7 +191,7 @@ def _update_scatter(drift: np.void, scatter: float, least: float) -> bool:
 
 @compiled
 def _model_level_only(drift: np.void, z: float, least: float) -> None:
-    """Set the noise before the first identification, when all variation except a level counts as scatter."""
+    """Set the noise before the first identification, when the model is a slowly varying level with white noise."""
     drift["white_variance"] = max(drift["scatter"], least)
     drift["level_variance"] = drift["white_variance"] / MIN_LEVEL_MEMORY**2
     if drift["rest_count"] == 0.0:
@@ -247,7 +249,7 @@ def _correct(drift: np.void, e: float) -> None:
 
 @compiled
 def refilter_history(drift: np.void, z: Floats, scatter: Floats, least: float) -> None:
-    """Filter all remembered intervals again after ``set_model``.
+    """Run the filter over all stored intervals after ``set_model``.
 
     Parameters
     ----------
@@ -263,4 +265,4 @@ def refilter_history(drift: np.void, z: Floats, scatter: Floats, least: float) -
     for k in range(z.size):
         if z[k] == z[k]:
             update_with_interval(drift, z[k], scatter[k], least)
-        predict(drift)
+        predict_next_interval(drift)

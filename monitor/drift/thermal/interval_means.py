@@ -8,7 +8,7 @@ import numpy as np
 from drivers.sample import Floats
 
 PARTS_PER_INTERVAL: Final = 8
-"""Parts of an interval. Their scatter gives the standard error of the mean."""
+"""Number of parts of an interval. The scatter of the parts determines the standard error of the mean."""
 MIN_KNOWN_SHARE: Final = 0.5
 """Smallest share of known samples in an interval."""
 
@@ -27,7 +27,7 @@ class IntervalMeans:
         """True [n] where bias and temperature are both known."""
         return np.isfinite(self.bias) & np.isfinite(self.temperature_c)
 
-    def first(self, n: int) -> "IntervalMeans":
+    def first_intervals(self, n: int) -> "IntervalMeans":
         """Return the first n intervals."""
         return IntervalMeans(self.interval_s, self.bias[:n], self.error[:n], self.temperature_c[:n])
 
@@ -35,8 +35,10 @@ class IntervalMeans:
 def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float, interval_s: float) -> IntervalMeans:
     """Return the means over whole intervals; a shorter remainder at the end is dropped.
 
-    The standard error is √(mean square of half differences of neighbouring parts / parts). For white noise it equals
-    σ/√n. A drift across the interval has hardly any effect on it.
+    An interval is divided into PARTS_PER_INTERVAL parts. Half of the mean square difference between the means of
+    neighbouring parts estimates the variance of a part. The standard error of the interval is the root of this variance
+    divided by the number of parts. For white noise, the standard error equals σ/√n. A drift across the interval has
+    little effect.
 
     Parameters
     ----------
@@ -67,7 +69,7 @@ def _row_means(rows: Floats) -> tuple[Floats, Floats]:
     known_samples = np.isfinite(rows)
     count = known_samples.sum(axis=1)
     too_few = count < max(MIN_KNOWN_SHARE * rows.shape[1], 1.0)
-    # The origin is subtracted to preserve the digits of a mean of 9.81 with noise of 1e-4.
+    # Subtracting the origin avoids rounding errors, for example with gravity of 9.81 m/s² and noise of 1e-4 m/s².
     origin = np.nanmedian(rows) if known_samples.any() else 0.0
     mean = origin + np.where(known_samples, rows - origin, 0.0).sum(axis=1) / np.maximum(count, 1)
     size = rows.shape[1] // PARTS_PER_INTERVAL

@@ -1,10 +1,11 @@
 """Live models of bias against temperature for one device.
 
 The input consists of blocks of samples in order, with NaN for samples in motion. At the end of every interval, a
-``ThermalUpdate`` holds the measured and the predicted mean of each axis. Changes that temperature does not explain are
-reported as events. Nothing is stored or computed before the first temperature has been received.
+``ThermalIntervalResult`` holds the measured and the predicted mean of each axis. Changes that temperature does not
+explain are reported as events. Nothing is stored or computed before the first temperature has been received.
 
-``update`` takes a few ms at the end of an interval. ``step`` chooses models in small pieces between the intervals.
+``update`` takes a few milliseconds at the end of an interval. ``step`` selects models in short steps between the
+intervals.
 """
 
 from collections.abc import Mapping
@@ -16,7 +17,7 @@ import numpy as np
 from drivers.sample import AXES, Event, SampleBlock
 from monitor.common.units import format_rate
 from monitor.drift.thermal.interval_means import PARTS_PER_INTERVAL
-from monitor.drift.thermal.online_thermal_model import MAX_INTERVALS, AxisThermalUpdate, OnlineThermalModel
+from monitor.drift.thermal.online_thermal_model import MAX_INTERVALS, OnlineThermalModel, PredictedAxisInterval
 from monitor.drift.thermal.residual_alarm import UnexplainedChange
 from monitor.drift.thermal.running_interval_means import IntervalMean, RunningIntervalMeans
 from monitor.estimation.detection.signal_monitor import MAX_RATE_CHANGE
@@ -26,13 +27,13 @@ KIND: Final = "temperature_unexplained"
 
 
 @dataclass(frozen=True, slots=True)
-class ThermalUpdate:
+class ThermalIntervalResult:
     """Interval means and predictions of all axes that have been measured."""
 
     t_ns: int  # end of the interval
     interval_s: float
     temperature_c: float  # mean of the interval, °C
-    axes: Mapping[str, AxisThermalUpdate]  # axis -> result, in the order of AXES
+    axes: Mapping[str, PredictedAxisInterval]  # axis -> result, in the order of AXES
 
 
 class LiveThermal:
@@ -54,8 +55,8 @@ class LiveThermal:
         self._sample_count = 0  # samples since the first temperature, including missing ones
         self._reset()
 
-    def update(self, samples: SampleBlock) -> list[ThermalUpdate]:
-        """Return the intervals with a temperature that have ended with these samples."""
+    def update(self, samples: SampleBlock) -> list[ThermalIntervalResult]:
+        """Add samples, and return the results of the intervals that ended and have a known temperature."""
         # Samples that are missing before the first temperature belong to no interval.
         lost = samples.lost if self._has_temperature else 0
         self._has_temperature = self._has_temperature or bool(np.isfinite(samples.temperature_c).any())
@@ -68,14 +69,14 @@ class LiveThermal:
 
     @property
     def choosing(self) -> bool:
-        """True if ``step`` has work to do."""
+        """True if a model selection is active, so that ``step`` has work to do."""
         return any(one.choosing for one in self._axes.values())
 
     def step(self) -> bool:
-        """Do one piece of the choice of a model, about 1 ms, and return False if there is nothing to do."""
+        """Run one step of the model selection, which takes about 1 ms. Return False if no selection is active."""
         for axis, one in self._axes.items():
             if one.step():
-                self._events += [self._event(axis, found) for found in one.take()]
+                self._events += [self._event(axis, found) for found in one.take_unexplained_changes()]
                 return True
         return False
 
@@ -86,22 +87,22 @@ class LiveThermal:
 
     def learn_new_offset(self) -> None:
         """Learn new offsets after the sensor was moved or restarted, and discard the current interval."""
-        self._means.forget()
+        self._means.forget_sensor_values()
         for one in self._axes.values():
-            one.offset_is_new()
+            one.learn_new_offset()
 
     def set_rate(self, rate_hz: float) -> None:
         """Set a better estimate of the sample rate in Hz.
 
-        If the rate differs by more than MAX_RATE_CHANGE, the models start anew, because the intervals had
-        another length.
+        If the rate differs by more than MAX_RATE_CHANGE, the models are discarded, because the length of an interval
+        has changed.
         """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._rate_hz = rate_hz
             self._reset()
 
     def _reset(self) -> None:
-        """Start anew at the current sample rate."""
+        """Discard all models, and start at the current sample rate."""
         length = max(round(self._requested_interval_s * self._rate_hz), PARTS_PER_INTERVAL)
         self._interval_s = length / self._rate_hz
         self._means = RunningIntervalMeans(length, MAX_INTERVALS)
@@ -109,10 +110,10 @@ class LiveThermal:
         self._has_temperature, self._sample_count = False, 0
         self._t_ns = 0  # end of the last interval
 
-    def _process_interval(self, interval: IntervalMean, newest_ns: int) -> ThermalUpdate:
+    def _process_interval(self, interval: IntervalMean, newest_ns: int) -> ThermalIntervalResult:
         """Update the models of all axes with an interval; ``newest_ns`` is the time of the newest sample."""
         t_ns = newest_ns - round((self._sample_count - interval.end) / self._rate_hz * 1e9)
-        axes: dict[str, AxisThermalUpdate] = {}
+        axes: dict[str, PredictedAxisInterval] = {}
         for at, axis in enumerate(AXES):
             bias, error = float(interval.bias[at]), float(interval.error[at])
             if axis not in self._axes:
@@ -121,14 +122,14 @@ class LiveThermal:
                 self._axes[axis] = OnlineThermalModel(self._interval_s)
             axes[axis] = self._axes[axis].update(bias, error, interval.temperature_c)
         self._t_ns = t_ns
-        return ThermalUpdate(t_ns, self._interval_s, interval.temperature_c, axes)
+        return ThermalIntervalResult(t_ns, self._interval_s, interval.temperature_c, axes)
 
     def _event(self, axis: str, found: UnexplainedChange) -> Event:
         """Return the event of an unexplained change."""
         size = format_rate(axis, found.size, sign=True)
         text = (
-            f"{axis} is {size} off what its temperature lets expect: {found.outside} of the last {found.of} means "
-            f"were outside of their interval"
+            f"{axis} differs by {size} from the bias that its temperature predicts: {found.outside} of the last "
+            f"{found.of} means were outside their prediction interval"
         )
         what = {"bias": {"size": found.size, "outside": float(found.outside), "of": float(found.of)}}
         since_ns = self._t_ns - round(found.since * self._interval_s * 1e9)

@@ -1,18 +1,19 @@
 """Online model of bias against temperature for one axis: each interval is predicted before it is used for the fit.
 
-The model of the earlier intervals predicts each interval, multi-step and one-step. Only then is the interval used, and
-``RecursiveThermalFit`` updates the coefficients. Form and time constants are chosen again when the number of known
-intervals has grown by the factor REFIT_GROWTH. A choice takes up to a second. ``step`` therefore does
-one piece of the choice at a time, on the intervals that were known at the start.
+The model that was fitted to the earlier intervals predicts each new interval. A multi-step prediction uses the
+temperature only, and a one-step prediction also uses the previous bias. After the prediction, ``RecursiveThermalFit``
+updates the coefficients with the interval. The terms and time constants of the model are selected again when the number
+of known intervals has grown by the factor REFIT_GROWTH. A selection takes up to a second. ``step`` therefore runs one
+short step at a time, on the intervals that were known at the start of the selection.
 
-Intervals that stay outside their prediction are a suspected change (``residual_alarm``). Until it is resolved, no
-routine choice is started, because a new form could fit the change and hide it. Intervals far outside their prediction
-are not used for the fit either. Two fits resolve the suspicion, without and with a step of the offset at its beginning.
-Both include lags, because delayed heat looks like a change at the first reversal of temperature. If temperature
-explains the intervals without a step, the new model is used and nothing is reported. Otherwise the change is reported.
-The earlier intervals are then shifted to the new offset, so that the known dependence on temperature is kept and the
-new level is expected. After the sensor has been moved or restarted, the new offset is learned in the same way, but not
-reported.
+If several intervals lie outside their prediction intervals, ``residual_alarm`` suspects a change of the bias. During a
+suspicion, no regular model selection starts, because a new model could fit the change and hide it. Intervals far
+outside their prediction are not used for the fit. The suspicion is tested by two fits: one with a step of the offset at
+the start of the suspicion, and one without a step. Both fits include lags, because delayed heat looks like a change
+when the temperature reverses for the first time. If temperature explains the intervals without a step, the new model is
+used and no change is reported. Otherwise, the change is reported, and the earlier intervals are shifted to the new
+offset. The known dependence on temperature is thus kept. After the sensor has been moved or restarted, the new offset
+is learned in the same way, but not reported.
 """
 
 from collections import deque
@@ -31,20 +32,20 @@ from monitor.drift.thermal.thermal_fit import StepwiseWork, fit_in_steps
 from monitor.drift.thermal.thermal_model import ThermalModel
 
 MAX_INTERVALS: Final = 1000
-"""Largest number of intervals that are kept: a week of ten minutes each."""
+"""Largest number of stored intervals, which is a week with intervals of ten minutes."""
 REFIT_GROWTH: Final = 1.25
-"""Growth of the number of known intervals after which the model is chosen again."""
+"""Growth of the number of known intervals after which the model is selected again."""
 OFFSET_INTERVALS: Final = 3
 """Intervals that determine a new offset."""
 STEP_AICC_MARGIN: Final = 10.0
-"""Gain in AICc above which a step is accepted. The margin is needed because the intervals themselves determined the
-position of the step."""
-NEW_OFFSET: Final = "it was handled, or started anew: its new offset is being learned"
+"""Gain in AICc above which a step is accepted. The margin is needed because the position of the step was chosen with
+the same intervals."""
+NEW_OFFSET: Final = "the sensor was moved or restarted: the new offset is being learned"
 """Text for intervals without a prediction after a change of the offset."""
 
 
 @dataclass(frozen=True, slots=True)
-class AxisThermalUpdate:
+class PredictedAxisInterval:
     """One interval of one axis, with its prediction."""
 
     bias: float  # rad/s or m/s²; NaN if too few samples are known
@@ -65,7 +66,7 @@ class _Row:
     temperature_c: float
 
     @property
-    def known(self) -> bool:
+    def has_bias_and_temperature(self) -> bool:
         """True if bias and temperature are both known."""
         return bool(np.isfinite(self.bias) and np.isfinite(self.temperature_c))
 
@@ -93,7 +94,7 @@ class OnlineThermalModel:
         self._settled: list[UnexplainedChange] = []
         self._missing_reason = ""  # reason why there is no model
 
-    def update(self, bias: float, error: float, temperature_c: float) -> AxisThermalUpdate:
+    def update(self, bias: float, error: float, temperature_c: float) -> PredictedAxisInterval:
         """Add an interval, and return it with its prediction.
 
         Parameters
@@ -107,34 +108,36 @@ class OnlineThermalModel:
         """
         row = _Row(bias, error, temperature_c)
         self._interval_count += 1
-        self._known_count += row.known
+        self._known_count += row.has_bias_and_temperature
         self._rows.append(row)
         if self._recursion is None:
             if self._work is None:
-                self._begin(self._choose())
-            return AxisThermalUpdate(bias, error, None, None, "", np.nan, self._missing_reason)
-        multi_step, one_step = self._recursion.predict(temperature_c)
+                self._start_work(self._choose_model())
+            return PredictedAxisInterval(bias, error, None, None, "", np.nan, self._missing_reason)
+        multi_step, one_step = self._recursion.predict_multi_and_one_step(temperature_c)
         model = self._recursion.model
         if self._offset_differences is not None:
             self._recursion.update(temperature_c, np.nan)
-            if row.known:
+            if row.has_bias_and_temperature:
                 self._add_offset_difference(self._offset_differences, bias - multi_step.bias)
-            return AxisThermalUpdate(bias, error, None, None, model.shape.name, model.slope, NEW_OFFSET)
-        found = self._suspicion.update(bias if row.known else np.nan, multi_step, one_step)
-        self._recursion.update(temperature_c, np.nan if row.known and self._suspicion.far else bias)
+            return PredictedAxisInterval(bias, error, None, None, model.shape.name, model.mean_slope, NEW_OFFSET)
+        found = self._suspicion.update(bias if row.has_bias_and_temperature else np.nan, multi_step, one_step)
+        self._recursion.update(
+            temperature_c, np.nan if row.has_bias_and_temperature and self._suspicion.is_unfit_for_update else bias
+        )
         if found is not None:
-            self._begin(self._test_for_step(found))
-        elif self._known_count >= self._next_choice and self._work is None and self._suspicion.clear:
-            self._begin(self._choose())
-        return AxisThermalUpdate(bias, error, multi_step, one_step, model.shape.name, model.slope, "")
+            self._start_work(self._test_for_step(found))
+        elif self._known_count >= self._next_choice and self._work is None and self._suspicion.is_within_prediction:
+            self._start_work(self._choose_model())
+        return PredictedAxisInterval(bias, error, multi_step, one_step, model.shape.name, model.mean_slope, "")
 
     @property
     def choosing(self) -> bool:
-        """True if ``step`` has work to do."""
+        """True if a model selection is active, so that ``step`` has work to do."""
         return self._work is not None
 
     def step(self) -> bool:
-        """Do one piece of a choice, about 1 ms, and return False if there is nothing to do."""
+        """Run one step of the model selection, which takes about 1 ms. Return False if no selection is active."""
         if self._work is None:
             return False
         try:
@@ -143,29 +146,29 @@ class OnlineThermalModel:
             self._work = None
         return True
 
-    def take(self) -> list[UnexplainedChange]:
-        """Return the changes that temperature does not explain, confirmed since the last call."""
+    def take_unexplained_changes(self) -> list[UnexplainedChange]:
+        """Return the unexplained changes of the bias that were confirmed since the last call."""
         told, self._settled = self._settled, []
         return told
 
-    def offset_is_new(self) -> None:
-        """Learn a new offset of the bias, because the old one no longer applies."""
+    def learn_new_offset(self) -> None:
+        """Learn a new offset of the bias, for example after the sensor has been moved."""
         self._work = None
-        self._suspicion.forget()
+        self._suspicion.forget_residuals()
         if self._recursion is None:
             self._rows.clear()  # Without a model, the new offset cannot be determined.
         else:
             self._offset_differences, self._new_offset_at = [], self._interval_count
 
-    def _begin(self, work: StepwiseWork[None]) -> None:
+    def _start_work(self, work: StepwiseWork[None]) -> None:
         """Start new work. Unfinished earlier work is discarded, because it used fewer intervals."""
         self._work = work
         self.step()
 
-    def _choose(self) -> StepwiseWork[None]:
-        """Choose the model again, and keep the present one if the intervals do not suffice."""
+    def _choose_model(self) -> StepwiseWork[None]:
+        """Select the model again. The present model is kept if there are too few intervals."""
         self._next_choice = ceil(REFIT_GROWTH * self._known_count)
-        self._missing_reason = "the model is being chosen"
+        self._missing_reason = "the model is being selected"
         try:
             chosen = yield from fit_in_steps(self._means())
         except NotReady as error:
@@ -182,7 +185,7 @@ class OnlineThermalModel:
             without = yield from fit_in_steps(means, lags=True)
             stepped = yield from fit_in_steps(means, since, lags=True)
         except NotReady:
-            pass  # The intervals do not suffice for a choice. The present model is kept.
+            pass  # There are too few intervals to select a model. The present model is kept.
         else:
             if without.aicc - stepped.aicc < STEP_AICC_MARGIN:
                 self._recursion = RecursiveThermalFit(without.model, self._means())
@@ -193,13 +196,13 @@ class OnlineThermalModel:
         self._settled.append(replace(doubt, size=size, since=since))
 
     def _add_offset_difference(self, apart: list[float], by: float) -> None:
-        """Add a residual, and determine the new offset when there are enough."""
+        """Add a residual. Determine the new offset when OFFSET_INTERVALS residuals are known."""
         apart.append(by)
         if len(apart) == OFFSET_INTERVALS:
-            self._begin(self._settle_offset(float(np.mean(apart))))
+            self._start_work(self._settle_offset(float(np.mean(apart))))
 
     def _settle_offset(self, size: float) -> StepwiseWork[None]:
-        """Determine the new offset, by a fit to all intervals if possible, else by the mean residual."""
+        """Determine the new offset by a fit to all intervals, or by the mean residual if a fit is not possible."""
         model = None
         try:
             stepped = yield from fit_in_steps(
@@ -213,7 +216,7 @@ class OnlineThermalModel:
         self._shift_history(size, self._interval_count - self._new_offset_at, model)
 
     def _shift_history(self, by: float, last: int, model: ThermalModel | None) -> None:
-        """Shift the bias of all but the last intervals by the step of the offset, and fit the model again."""
+        """Add the step of the offset to the bias of all intervals except the last ones, and fit the model again."""
         before = max(len(self._rows) - last, 0)
         moved = [_Row(row.bias + by, row.error, row.temperature_c) for row in islice(self._rows, before)]
         self._rows = deque([*moved, *islice(self._rows, before, None)], maxlen=MAX_INTERVALS)

@@ -1,13 +1,14 @@
 """Recursive least squares: update of the coefficients of a thermal model with each interval.
 
-The form, the time constants and φ stay as they were chosen. The triangle R of a QR decomposition holds the information
-of all intervals: their whitened rows beside their whitened values. A new interval is one more row, and R is made
-triangular again (Golub & Van Loan, Matrix Computations, 6.5). The coefficients agree with least squares over the whole
-record up to rounding, and the cost does not grow with the record. The derivatives by the time constants are further
-columns. They do not affect the coefficients, but the uncertainty of the time constants widens the prediction intervals.
+The terms of the model, the time constants and φ are not changed. The whitened regressors and values of all intervals
+are stored as the triangular factor R of their QR decomposition. A new interval adds one row, and R is made triangular
+again (Golub & Van Loan, Matrix Computations, 6.5). Except for rounding, the coefficients agree with least squares over
+the whole record, and the cost does not grow with the record. R has further columns for the derivatives with respect to
+the time constants. These columns do not affect the coefficients, but they add the uncertainty of the time constants to
+the prediction intervals.
 
-If the temperature of an interval is missing, the temperature of the interval before is used. A fit of the whole record
-interpolates instead, because it also has the later temperatures.
+If the temperature of an interval is missing, the previous temperature is used. A fit to the whole record interpolates
+missing temperatures.
 """
 
 from dataclasses import dataclass, replace
@@ -21,8 +22,8 @@ from monitor.drift.thermal.thermal_fit import whiten
 from monitor.drift.thermal.thermal_model import (
     LOG_TIME_CONSTANT_STEP,
     ThermalModel,
+    bias_derivatives_by_time_constant,
     coefficient_covariance,
-    combine_derivatives,
     interpolate_gaps,
     predict_with_variance,
     regressor_derivatives,
@@ -38,7 +39,7 @@ class PredictionInterval:
     lo: float
     hi: float
 
-    def side(self, bias: float) -> int:
+    def side_of(self, bias: float) -> int:
         """Return 1 if the bias lies above the interval, −1 if below, and 0 if inside or not measured."""
         return int(bias > self.hi) - int(bias < self.lo)
 
@@ -49,15 +50,15 @@ class RecursiveThermalFit:
     Parameters
     ----------
     model : ThermalModel
-        Model with the form, the time constants, φ and the reference to use. Its coefficients are computed again.
+        Model whose terms, time constants, φ and reference temperature are used. The coefficients are computed again.
     means : IntervalMeans
-        The intervals so far, from the first one that the model is to use.
+        Intervals so far.
     """
 
     def __init__(self, model: ThermalModel, means: IntervalMeans) -> None:
         self._model = model
         shape = model.shape
-        k = self._k = shape.memory
+        k = self._k = shape.difference_equation_order
         self._terms = 1 + shape.powers + k
         excess = interpolate_gaps(means.temperature_c) - model.reference_c
         columns = regressors(shape, excess, model.interval_s, began=True)
@@ -87,19 +88,20 @@ class RecursiveThermalFit:
         taken = self._terms + 2 * self._k + (self._model.phi > 0.0)
         return max(self._count - taken, 1)
 
-    def predict(self, temperature_c: float) -> tuple[PredictionInterval, PredictionInterval]:
+    def predict_multi_and_one_step(self, temperature_c: float) -> tuple[PredictionInterval, PredictionInterval]:
         """Return the multi-step and the one-step prediction of the next interval from its temperature in °C.
 
-        The prediction intervals use Student's t distribution, because few intervals determine the scatter at first.
+        The prediction intervals use Student's t distribution, because the scatter is at first estimated from few
+        intervals.
         """
         model = self.model
         excess = np.array([self._excess, temperature_c - model.reference_c if np.isfinite(temperature_c) else np.nan])
         excess[1] = excess[0] if np.isnan(excess[1]) else excess[1]
-        row, _, _ = self._next_row(float(excess[1]), model.temperature_range_c)
+        row, _, _ = self._next_row(float(excess[1]), model.temperature_range_from_reference_c)
         rows = np.stack([self._row, row])
         sizes = np.concatenate([model.coefficients, model.initial_state])
         own = sizes.size
-        bends = combine_derivatives(model.shape, rows[:, own:], sizes)
+        bends = bias_derivatives_by_time_constant(model.shape, rows[:, own:], sizes)
         wide = student_quantile(self.degrees_of_freedom, 0.975)
         both = []
         for measured in (None, np.array([self._bias, np.nan])):
@@ -136,7 +138,8 @@ class RecursiveThermalFit:
             self.model = self._with_current_coefficients(lowest, highest)
 
     def _next_row(self, excess: float, ends: tuple[float, float] | None) -> tuple[Floats, Floats, Floats]:
-        """Return the next row with its derivatives, and the lags and initial-state responses after it."""
+        """Return the regressors of the next interval with their derivatives, the updated lags, and the updated
+        initial-state responses."""
         lags = self._decays * self._lags + (1.0 - self._decays) * excess
         left = self._initial_responses * self._decays
         shape = replace(self._model.shape, constants_s=())
@@ -152,7 +155,7 @@ class RecursiveThermalFit:
         sizes = np.linalg.lstsq(x / scale, z, rcond=1e-10)[0] / scale
         square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
         sigma = (square / self.degrees_of_freedom) ** 0.5
-        bends = combine_derivatives(self._model.shape, self._triangle[:, own:-1], sizes)
+        bends = bias_derivatives_by_time_constant(self._model.shape, self._triangle[:, own:-1], sizes)
         return replace(
             self._model,
             coefficients=sizes[: self._terms],

@@ -1,9 +1,9 @@
-"""Alarm for a bias that leaves its prediction from temperature more often than by chance, for one axis.
+"""Alarm for one axis whose bias lies outside its prediction from temperature more often than by chance.
 
 Every interval is predicted one step ahead before it is used for the fit. If the model is true, one in forty intervals
 lies above its 95 % prediction interval and one in forty below, independently. If MIN_OUTSIDE of the last
-WINDOW_INTERVALS known intervals lie outside on the same side, a change is suspected. ``online_thermal_model`` resolves
-the suspicion. docs/thermal.md has the measured rate of false alarms.
+WINDOW_INTERVALS known intervals lie outside on the same side, a change is suspected. ``online_thermal_model`` tests the
+suspicion. The measured rate of false alarms is in docs/thermal-measurements.md.
 """
 
 from collections import deque
@@ -17,7 +17,7 @@ from monitor.common.distributions import Z95
 from monitor.drift.thermal.recursive_least_squares import PredictionInterval
 
 MIN_OUTSIDE: Final = 4
-"""Number of intervals outside their prediction on one side that raises a suspicion."""
+"""Number of intervals above, or below, their prediction intervals that causes a suspicion."""
 WINDOW_INTERVALS: Final = 6
 """Number of known intervals that are considered."""
 FAR_HALF_WIDTHS: Final = 2.0
@@ -47,23 +47,23 @@ class _Residual:
 
 
 class ResidualAlarm:
-    """Detector of unexplained changes of one axis, from its last intervals."""
+    """Detector of unexplained changes in the last intervals of one axis."""
 
     def __init__(self) -> None:
         self._recent: deque[_Residual] = deque(maxlen=WINDOW_INTERVALS)  # only intervals with a known bias
         self._interval_count = 0
 
     @property
-    def clear(self) -> bool:
-        """True if the last interval was inside its prediction and at most one interval on each side was outside.
+    def is_within_prediction(self) -> bool:
+        """True if the last interval was inside its prediction, and at most one recent interval was above and one below.
 
-        The intervals may then be used to choose a model.
+        The intervals may then be used to select a model.
         """
         return not (self._recent and self._recent[-1].side) and all(self._count_outside(side) < 2 for side in (-1, 1))
 
     @property
-    def far(self) -> bool:
-        """True if the last interval was so far outside that it must not be used for the fit yet."""
+    def is_unfit_for_update(self) -> bool:
+        """True if the last interval was so far outside its prediction that it must not be used for the fit yet."""
         return bool(self._recent) and abs(self._recent[-1].z) > FAR_HALF_WIDTHS * Z95
 
     def update(
@@ -83,7 +83,7 @@ class ResidualAlarm:
             return None
         half = max(0.5 * (one_step.hi - one_step.lo), 1e-300)
         z = Z95 * (bias - one_step.bias) / half
-        self._recent.append(_Residual(self._interval_count, one_step.side(bias), bias - multi_step.bias, z))
+        self._recent.append(_Residual(self._interval_count, one_step.side_of(bias), bias - multi_step.bias, z))
         side = self._recent[-1].side
         if not side or self._count_outside(side) < MIN_OUTSIDE:
             return None
@@ -95,10 +95,10 @@ class ResidualAlarm:
         self._recent.clear()
         return found
 
-    def forget(self) -> None:
+    def forget_residuals(self) -> None:
         """Discard the residual history."""
         self._recent.clear()
 
     def _count_outside(self, side: int) -> int:
-        """Return the number of recent intervals outside on one side."""
+        """Return the number of recent intervals above (1) or below (-1) their prediction intervals."""
         return sum(one.side == side for one in self._recent)

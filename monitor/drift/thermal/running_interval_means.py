@@ -1,4 +1,4 @@
-"""Interval means of live samples, equal to those of ``compute_interval_means`` for a whole recording.
+"""Interval means of live samples. The means equal those of ``compute_interval_means`` for a whole recording.
 
 Only sums are stored. Blocks of samples must arrive in order, with the number of missing samples before each block.
 Every interval is returned when it ends. An interval has a fixed number of samples, including missing ones. Rows are
@@ -38,7 +38,7 @@ class RunningIntervalMeans:
     length : int
         Samples per interval, at least PARTS_PER_INTERVAL.
     longest : int
-        Largest number of empty intervals that are returned for one gap. More would hold no information.
+        Largest number of empty intervals that are returned for one gap.
 
     Examples
     --------
@@ -52,11 +52,11 @@ class RunningIntervalMeans:
         size = length // PARTS_PER_INTERVAL
         self._length = length
         self._max_empty = longest
-        # The last edge ends the remainder of the interval, which belongs to no part.
+        # Samples after the last part count for the mean of the interval, but not for the standard error.
         self._edges = [*(size * k for k in range(1, PARTS_PER_INTERVAL)), size * PARTS_PER_INTERVAL, length]
         self._rows = np.empty((BUFFER_ROWS, TEMPERATURE_COLUMN + 1))
         self._buffered = 0
-        # The origin is subtracted to preserve the digits of a mean of 9.81 with noise of 1e-4.
+        # Subtracting the origin avoids rounding errors, for example with gravity of 9.81 m/s² and noise of 1e-4 m/s².
         self._origin = np.full(TEMPERATURE_COLUMN + 1, np.nan)
         self._end = 0  # end of the last finished interval, in samples
         self._begin()
@@ -85,7 +85,7 @@ class RunningIntervalMeans:
             finished += self._advance(count)
         return finished
 
-    def forget(self) -> None:
+    def forget_sensor_values(self) -> None:
         """Discard the sensor values of the current interval, and keep the temperatures of the interval."""
         self._rows[: self._buffered, :TEMPERATURE_COLUMN] = np.nan
         self._sum[:, :TEMPERATURE_COLUMN], self._count[:, :TEMPERATURE_COLUMN] = 0.0, 0
@@ -97,8 +97,8 @@ class RunningIntervalMeans:
         self._count = np.zeros((PARTS_PER_INTERVAL + 1, TEMPERATURE_COLUMN + 1), np.int64)
 
     def _advance(self, count: int) -> list[IntervalMean]:
-        """Advance by ``count`` samples; sum the buffer at the end of a part, and return the
-        interval if it has ended."""
+        """Advance by ``count`` samples, and return the interval if it has ended. At the end of a part, the buffer is
+        summed."""
         self._position += count
         if self._buffered == BUFFER_ROWS or self._position == self._edges[self._part]:
             self._sum_buffer()

@@ -1,14 +1,16 @@
 """Test whether the slow part of a bias depends on temperature, and whether heating and cooling differ.
 
-A random walk correlates with a temperature ramp by chance, so ordinary regression would name axes that do not depend
-on temperature. Both tests are therefore generalised least squares under a null hypothesis of correlated noise: white
-noise of the interval means plus a random walk whose increments may be correlated themselves (a smooth drift). The
-ratio of the two and the correlation of the increments are not known. An F test is made for every pair on a grid, and
-the least significant result counts among the pairs whose log restricted likelihood (Harville, J. Am. Stat. Assoc. 72,
-1977) is within MAX_LIKELIHOOD_LOSS of the best. The measured false positive rates are in docs/thermal.md.
+A random walk correlates with a temperature ramp by chance, so ordinary regression would name axes that do not depend on
+temperature. The tests are therefore generalised least squares with correlated noise as the null hypothesis. The noise
+is the sum of white noise and a random walk whose increments may be correlated (a smooth drift). The ratio of random
+walk to white noise and the correlation of the increments are unknown. An F test is made for each pair of these two
+parameters on a grid. Pairs are plausible if their log restricted likelihood (Harville, J. Am. Stat. Assoc. 72, 1977) is
+within MAX_LIKELIHOOD_LOSS of the best. The result is the largest p-value of all plausible pairs. The measured false
+positive rates are in
+docs/thermal-measurements.md.
 
 ``find_dependence`` tests a cubic polynomial in temperature, alone and with each description of hysteresis.
-``find_hysteresis`` tests the descriptions of hysteresis beside a polynomial of order 5. The descriptions are:
+``find_hysteresis`` tests the descriptions of hysteresis in addition to a polynomial of order 5. The descriptions are:
 
 - differences between heating and cooling that vanish at the ends of the temperature range;
 - first-order lags, for heat that reaches the sensor with a delay;
@@ -35,9 +37,10 @@ from monitor.drift.thermal.thermal_response import first_order_lag
 SIGNIFICANCE: Final = 0.01
 """Largest p-value of a dependence or a hysteresis that is reported, after Bonferroni's correction."""
 MAIN_SHARE: Final = 0.5
-"""Share of the variance of the means above which temperature explains most of it."""
+"""Share of the variance of the means above which temperature is said to explain most of the variance."""
 MAX_MEANS: Final = 150
-"""Largest number of means. More are averaged in groups, because the cost of the test grows with their cube."""
+"""Largest number of means. If there are more, groups of means are averaged, because the cost grows with the cube of the
+number."""
 MIN_FREE: Final = 4
 """Smallest number of degrees of freedom that a regression must leave."""
 MAX_LIKELIHOOD_LOSS: Final = 2.0
@@ -59,7 +62,7 @@ LOOP_POWERS: Final = 4
 FOLDS: Final = 6
 """Parts of the means for cross-validation. Successive means belong to different parts."""
 MIN_NEW_SHARE: Final = 1e-4
-"""Smallest part of a regressor that the other regressors must leave unexplained. A regressor with less is dropped."""
+"""Smallest part of a regressor that the previous regressors must leave unexplained. Other regressors are dropped."""
 CURVE_ORDER: Final = 3
 """Order of the polynomial in temperature for the test of dependence."""
 HYSTERESIS_CURVE_ORDER: Final = 5
@@ -90,7 +93,7 @@ class Hysteresis:
     p_value: float  # p-value of the hypothesis of no difference
 
     @property
-    def significant(self) -> bool:
+    def hysteresis_is_significant(self) -> bool:
         """True if noise alone does not explain the difference."""
         return self.p_value < SIGNIFICANCE
 
@@ -106,7 +109,8 @@ class _Regression:
 
 
 def heating_direction(temperature_c: Floats) -> Floats:
-    """Return +1 where temperature last rose and -1 where it last fell, 0 everywhere if it did neither.
+    """Return +1 where temperature was last rising and -1 where it was last falling. All values are 0 without any
+    change.
 
     A reversal counts if it exceeds MIN_REVERSAL_SHARE of the range and MIN_REVERSAL_SIGMAS standard errors of a mean.
 
@@ -202,11 +206,12 @@ def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
         return None
     curve, loops = _polynomial(x, HYSTERESIS_CURVE_ORDER), _hysteresis_regressors(x, direction)
     drifting = np.hstack([_linear_drift(x.size), curve])
-    # A single lag or play operator leaves more degrees of freedom than a sum of four. This matters with few means.
+    # A single lag or play operator is also tested, because it leaves more degrees of freedom than all four together.
     parts = [loops[name][:, [at]] for name in ("lag", "play") for at in range(loops[name].shape[1])]
     tests = [_regression(pooled.bias, drifting, each, pooled.known) for each in (*loops.values(), *parts)]
     p_values = [one.p_value for one in tests if one is not None]
-    # Within one cycle, a drift and a loop are nearly collinear, so the size is taken from a fit without a drift.
+    # Within one temperature cycle, a drift and hysteresis are nearly collinear, so the size comes from a fit without a
+    # drift.
     fits = [_regression(pooled.bias, curve, each, pooled.known) for each in (*loops.values(), *parts)]
     best = max((one for one in fits if one is not None), key=lambda one: one.likelihood, default=None)
     if not p_values or best is None:
@@ -243,12 +248,12 @@ def _scaled(means: IntervalMeans) -> tuple[Floats, Floats]:
 
 
 def _rose_and_fell(direction: Floats) -> bool:
-    """Return True if temperature rose for three means or more, and fell for three means or more."""
+    """Return True if temperature was rising in at least three means and falling in at least three means."""
     return min(int((direction > 0.0).sum()), int((direction < 0.0).sum())) >= 3
 
 
 def _polynomial(x: Floats, order: int) -> Floats:
-    """Return the powers [n, order] of x, from the first on."""
+    """Return the powers 1, 2, …, ``order`` of x as columns [n, order]."""
     return np.stack([x**power for power in range(1, order + 1)], axis=1)
 
 
@@ -281,7 +286,7 @@ def _play(x: Floats, half_width: float) -> Floats:
 
 
 def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) -> _Regression | None:
-    """Return the F test of the tested regressors beside the nuisance regressors, or None if there are too few means."""
+    """Return the F test of regressors that are added to the nuisance regressors, or None if there are too few means."""
     if int(known.sum()) <= MIN_FREE + 1:
         return None
     whiteners, log_determinants = _whiteners(known.tobytes())
@@ -394,7 +399,7 @@ def _loop_width(bias: Floats, x: Floats, direction: Floats) -> float:
 
 
 def _mean_of_legs(legs: list[Floats], n: int) -> Floats:
-    """Return the mean [n] of the legs at each temperature, NaN where there is no leg."""
+    """Return the mean [n] over all temperature sweeps at each temperature; NaN where no sweep passed."""
     rows = np.array(legs).reshape(len(legs), n)
     there = np.isfinite(rows)
     with np.errstate(invalid="ignore"):

@@ -1,18 +1,18 @@
-"""Fit of a bias model against temperature: choice of its form, its coefficients and their uncertainty.
+"""Fit of the bias as a function of temperature: selection of the terms, coefficients and their uncertainty.
 
 Polynomials and difference equations (``thermal_response``) are fitted to interval means by least squares over the whole
-record. The outputs of a difference equation are fed back, not the measured values, so that noise in the means does not
-bias its roots towards zero. The residuals may be correlated: r_n = φ r_{n−1} + e_n. The form with the least AICc is
-chosen (Hurvich & Tsai, Biometrika 76, 1989). AICc asymptotically agrees with leave-one-out cross-validation (Stone, J.
-R. Stat. Soc. B 39, 1977) and needs no separate samples, of which there are few. A cross-validated error is given too,
-over FOLDS parts of the record that are each predicted from the others. A form that predicts them worse than a constant
-is rejected, because slow heating leaves one end of a polynomial unconstrained. A thermal model with lags, or with
-powers above the third, is selected only if its AICc is better by a margin.
+record. A difference equation is evaluated with its own outputs and not with the measured values, because noise in the
+measured values would bias the roots towards zero. The residuals may be correlated: r_n = φ r_{n−1} + e_n. The model
+with the least AICc is selected (Hurvich & Tsai, Biometrika 76, 1989). AICc asymptotically agrees with leave-one-out
+cross-validation (Stone, J. R. Stat. Soc. B, 1977), and no separate samples are needed. In addition, FOLDS parts of the
+record are each predicted from the other parts. A model that predicts the parts worse than a constant is rejected,
+because slow heating leaves one end of a polynomial unconstrained. A model with lags, or with powers above the third, is
+selected only if its AICc is better by a margin.
 
-The search takes some 50 ms to a second. ``fit_in_steps`` divides it into pieces of less than a millisecond.
+The search takes between 50 ms and 1 s. ``fit_in_steps`` divides the search into steps of less than a millisecond.
 
-The method follows Wang et al., bias modelling of MEMS gyroscopes under small temperature changes (72 h, means of 1 h).
-The constant and the fed-back outputs are additions to the paper.
+The method follows Wang et al., who modelled the bias of MEMS gyroscopes under small temperature changes, with 72 means
+of 1 h. The constant term and the evaluation with own outputs are not part of their paper.
 """
 
 from collections.abc import Generator, Iterator
@@ -24,7 +24,7 @@ from typing import Final, TypeVar
 import numpy as np
 
 from drivers.errors import NotReady
-from drivers.quantities import HOUR_S
+from drivers.number_ranges import HOUR_S
 from drivers.sample import Floats
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.temperature_dependence import find_hysteresis
@@ -45,13 +45,14 @@ CUBIC: Final = 3
 MAX_LAGS: Final = 3
 """Highest order of a difference equation."""
 INTERVALS_PER_SQUARED_LAGS: Final = 8
-"""Intervals that k lags need for each k². With fewer intervals, the lags follow a random walk of the bias."""
+"""Number of intervals, divided by k², that a model with k lags needs. With fewer intervals, the lags would follow a
+random walk of the bias."""
 MAX_TIME_CONSTANT_SHARE: Final = 0.25
-"""Longest time constant as a share of the record. A longer one cannot be distinguished from a drift."""
+"""Longest time constant as a share of the record. A longer time constant cannot be distinguished from a drift."""
 MIN_TIME_CONSTANT_INTERVALS: Final = 0.5
-"""Shortest time constant in intervals. A shorter one has no effect."""
+"""Shortest time constant in intervals. A shorter time constant has no effect."""
 MIN_TIME_CONSTANT_RATIO: Final = 2.0
-"""Smallest ratio of two time constants. Closer ones only form a difference of two large coefficients."""
+"""Smallest ratio of two time constants. Closer time constants have large coefficients that cancel."""
 GRID_POINTS: Final = 20
 """Number of time constants on the first grid."""
 PHI_VALUES: Final = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
@@ -59,20 +60,20 @@ PHI_VALUES: Final = (0.0, 0.3, 0.6, 0.8, 0.9, 0.97)
 FOLDS: Final = 6
 """Parts of the record that are each predicted from the others."""
 MAX_ERROR_RATIO: Final = 1.05
-"""Largest cross-validated error of an accepted form, relative to the error of a constant. The value above one allows
+"""Largest cross-validated error of an accepted model, relative to the error of a constant. The margin above one allows
 for chance."""
 LAG_AICC_MARGIN: Final = 6.0
 """Margin in AICc that a lag must gain. With few means, noise sometimes looks like a lag, and a wrong choice causes
 large errors."""
 CURVE_AICC_MARGIN: Final = 10.0
-"""Margin in AICc that a power beyond the third must gain, for the same reason."""
+"""Margin in AICc that a power above the third must gain, because noise sometimes looks like a higher power."""
 MIN_SWING_C: Final = 0.1
 """Smallest range of temperature for a fit, °C."""
 MIN_SWING_SIGMAS: Final = 5.0
 """Smallest range of temperature, in standard errors of a mean of temperature."""
 MIN_REVERSE_SHARE: Final = 0.1
-"""Smallest share of the total temperature movement in the lesser direction. Below it, temperature only rose or only
-fell."""
+"""Smallest share of the smaller direction in the total change of temperature, if temperature is said to rise and
+fall."""
 GOLDEN_STEPS: Final = 10
 """Number of steps of the golden-section search."""
 GOLDEN_RATIO: Final = 0.6180339887498949
@@ -81,7 +82,7 @@ GOLDEN_RATIO: Final = 0.6180339887498949
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One form of the model that was fitted."""
+    """Fitted model that was a candidate for the selection."""
 
     shape: ThermalModelForm
     aicc: float  # difference to the chosen form; negative if a margin was not reached
@@ -95,7 +96,7 @@ class ThermalFit:
 
     model: ThermalModel
     candidates: tuple[Candidate, ...]  # the chosen form first, then the others by AICc
-    both_ways: bool  # True if temperature rose and fell
+    temperature_rose_and_fell: bool  # True if temperature rose and fell
     explained: float  # explained share of the variance of the means
     aicc: float  # only differences between fits of the same means are meaningful
     step: float = 0.0  # step of the offset (after minus before), if one was fitted; rad/s or m/s²
@@ -106,26 +107,26 @@ class ThermalFit:
 
 T = TypeVar("T")
 StepwiseWork = Generator[None, None, T]
-"""Generator that does one piece of the work at each ``next``, and returns the result at its end."""
+"""Generator that runs one step at each ``next``, and returns the result at the end."""
 
 
 def fit_thermal_model(means: IntervalMeans) -> ThermalFit:
-    """Choose and fit a model, and test whether heating and cooling differ.
+    """Select and fit a model, and test whether heating and cooling differ.
 
     Raises
     ------
     NotReady
-        If there are too few intervals, or if temperature hardly moved.
+        If there are too few intervals, or if temperature hardly changed.
     """
     found = run_all_steps(fit_in_steps(means))
-    loop = find_hysteresis(means) if found.both_ways else None
+    loop = find_hysteresis(means) if found.temperature_rose_and_fell else None
     if loop is None:
         return found
-    return replace(found, hysteresis=loop.size if loop.significant else 0.0, hysteresis_p=loop.p_value)
+    return replace(found, hysteresis=loop.size if loop.hysteresis_is_significant else 0.0, hysteresis_p=loop.p_value)
 
 
 def run_all_steps(pieces: StepwiseWork[T]) -> T:
-    """Run all pieces and return the result."""
+    """Run all steps and return the result."""
     try:
         while True:
             next(pieces)
@@ -135,27 +136,27 @@ def run_all_steps(pieces: StepwiseWork[T]) -> T:
 
 
 def fit_in_steps(means: IntervalMeans, since: int | None = None, lags: bool = False) -> StepwiseWork[ThermalFit]:
-    """Choose and fit a model, with one least-squares fit in each piece.
+    """Select and fit a model. Each ``next`` runs one least-squares fit.
 
     Parameters
     ----------
     means : IntervalMeans
         Interval means of bias (rad/s or m/s²) and temperature (°C).
     since : int or None
-        Index of the interval from which the bias may have another offset. The step is one more coefficient.
+        Index of the first interval after a possible step of the bias. The step is one more coefficient.
     lags : bool
         True if lags are fitted even if temperature moved in one direction only.
 
     Raises
     ------
     NotReady
-        If there are too few intervals, or if temperature hardly moved. The first piece raises it.
+        If there are too few intervals, or if temperature hardly changed. The first step raises the error.
     """
-    check_means(means)
+    check_means_suffice(means)
     excess, reference_c = _temperature_difference(means)
-    both_ways = _both_ways(means.temperature_c)
+    temperature_rose_and_fell = _both_ways(means.temperature_c)
     tried = []
-    for shape in _shapes(means, both_ways or lags):
+    for shape in _shapes(means, temperature_rose_and_fell or lags):
         tried.append((yield from _fit_shape(means, excess, shape, since)))
     tried.sort(key=lambda one: one.aicc + _aicc_margin(one.shape))
     errors = []
@@ -173,7 +174,7 @@ def fit_in_steps(means: IntervalMeans, since: int | None = None, lags: bool = Fa
     known = means.known
     left = means.bias[known] - (best.columns @ best.sizes)[known]
     explained = 1.0 - float(np.var(left) / np.var(means.bias[known]))
-    return ThermalFit(model, candidates, both_ways, explained, best.aicc, best.step)
+    return ThermalFit(model, candidates, temperature_rose_and_fell, explained, best.aicc, best.step)
 
 
 @dataclass(frozen=True, slots=True)
@@ -190,19 +191,19 @@ class _ShapeFit:
     step: float
 
 
-def check_means(means: IntervalMeans) -> None:
+def check_means_suffice(means: IntervalMeans) -> None:
     """Check that the means suffice for a fit.
 
     Raises
     ------
     NotReady
-        If the means are too few, or if temperature or bias hardly moved.
+        If there are too few means, if temperature hardly changed, or if the bias is constant.
     """
     count = int(means.known.sum())
     if count < MIN_INTERVALS:
         raise NotReady(
-            f"{count} intervals of {means.interval_s:g} s with bias and temperature; {MIN_INTERVALS} are the least "
-            f"that anything can be said of: record longer, or take a shorter interval"
+            f"{count} intervals of {means.interval_s:g} s with bias and temperature; at least {MIN_INTERVALS} are "
+            f"needed: record longer, or use a shorter interval"
         )
     known_temperature_c = means.temperature_c[means.known]
     swing = float(np.ptp(known_temperature_c))
@@ -214,16 +215,16 @@ def check_means(means: IntervalMeans) -> None:
     least = max(MIN_SWING_C, MIN_SWING_SIGMAS * noise)
     if swing < least:
         raise NotReady(
-            f"temperature hardly moved: by {swing:.2g} °C in {count * means.interval_s / HOUR_S:.3g} h, and "
-            f"{least:.2g} °C are the least that anything can be said of"
+            f"temperature hardly changed: by {swing:.2g} °C in {count * means.interval_s / HOUR_S:.3g} h; "
+            f"at least {least:.2g} °C are needed"
         )
     if not np.ptp(means.bias[means.known]) > 0.0:
         raise NotReady("the bias is the same in all intervals")
 
 
 def _aicc_margin(shape: ThermalModelForm) -> float:
-    """Return the margin in AICc that a form must gain."""
-    if shape.memory:
+    """Return the margin in AICc that a model must gain."""
+    if shape.difference_equation_order:
         return LAG_AICC_MARGIN
     return CURVE_AICC_MARGIN if shape.powers > CUBIC else 0.0
 
@@ -236,7 +237,7 @@ def _temperature_difference(means: IntervalMeans) -> tuple[Floats, float]:
 
 
 def _both_ways(temperature_c: Floats) -> bool:
-    """Return True if temperature, smoothed over three intervals, moved both ways by more than MIN_REVERSE_SHARE."""
+    """Return True if temperature, smoothed over three intervals, rose and fell by more than MIN_REVERSE_SHARE."""
     smooth = np.convolve(np.pad(interpolate_gaps(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid")
     moved = np.diff(smooth)
     up, down = float(moved[moved > 0.0].sum()), float(-moved[moved < 0.0].sum())
@@ -244,7 +245,7 @@ def _both_ways(temperature_c: Floats) -> bool:
 
 
 def _shapes(means: IntervalMeans, lags: bool) -> Iterator[ThermalModelForm]:
-    """Yield the forms that the number of intervals allows."""
+    """Yield the model forms that the number of intervals allows."""
     count = int(means.known.sum())
     for powers in range(MAX_POWER + 1):
         if powers + 3 < count / 2:
@@ -258,7 +259,7 @@ def _shapes(means: IntervalMeans, lags: bool) -> Iterator[ThermalModelForm]:
 def _fit_shape(
     means: IntervalMeans, excess: Floats, shape: ThermalModelForm, since: int | None
 ) -> StepwiseWork[_ShapeFit]:
-    """Fit a form with its best time constants and the best φ."""
+    """Fit a model with the best time constants and the best correlation φ of the residuals."""
     best = yield from _TimeConstantSearch(means, excess, shape, PHI_VALUES[0], since).run()
     for phi in PHI_VALUES[1:]:
         other = yield from _TimeConstantSearch(means, excess, shape, phi, since).run()
@@ -267,7 +268,7 @@ def _fit_shape(
 
 
 class _TimeConstantSearch:
-    """Search for the time constants of a form with a given φ.
+    """Search for the time constants of a model with a given φ.
 
     The time constants are chosen one after the other from a grid, then refined by golden-section search.
     """
@@ -282,8 +283,8 @@ class _TimeConstantSearch:
         self._constants: tuple[float, ...] = ()
 
     def run(self) -> StepwiseWork[_ShapeFit]:
-        """Fit the form with its best time constants."""
-        k = self._shape.memory
+        """Fit the model with the best time constants."""
+        k = self._shape.difference_equation_order
         for _ in range(k):
             yield from self._add_from_grid()
         for _ in range(2 if k > 1 else min(k, 1)):
@@ -322,7 +323,8 @@ class _TimeConstantSearch:
         return (*self._constants[:at], constant, *self._constants[at + 1 :])
 
     def _bounds(self, at: int) -> tuple[float, float]:
-        """Return the limits of a time constant: its neighbours on the grid, at a distance from the other constants."""
+        """Return the limits for the refinement of a time constant. The limits are one grid step away, and keep
+        MIN_TIME_CONSTANT_RATIO to the other constants."""
         one, others = self._constants[at], (*self._constants[:at], *self._constants[at + 1 :])
         ratio = float(self._grid[1] / self._grid[0])
         below = max((MIN_TIME_CONSTANT_RATIO * other for other in others if other < one), default=self._fastest)
@@ -344,7 +346,7 @@ def _fit_sizes(
     sizes = least_squares(x, z)
     count = x.shape[0]
     square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
-    free = sizes.size + shape.memory + (phi > 0.0) + 1
+    free = sizes.size + shape.difference_equation_order + (phi > 0.0) + 1
     likelihood = count * log(square / count) - fresh * log(1.0 - phi**2)
     aicc = likelihood + 2.0 * free * count / max(count - free - 1.0, 0.5)
     rms = float(np.sqrt(np.mean((y - columns @ sizes)[known] ** 2)))
@@ -397,10 +399,10 @@ def whiten(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[F
 
 
 def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit) -> float:
-    """Return the rms error over parts of the record, each predicted from the others with the same form and time
-    constants.
+    """Return the rms error of parts of the record, each predicted from the other parts with the same time constants.
 
-    The initial state of the lags is known from the first part only. This part is predicted with settled lags.
+    The initial state of the lags is known only from the first part. When this part is predicted, the temperature before
+    the record is assumed to be constant.
     """
     edges = np.linspace(0, excess.size, FOLDS + 1).astype(np.int64)
     square = 0.0
@@ -416,7 +418,7 @@ def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit)
 
 def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _ShapeFit) -> ThermalModel:
     """Return the model of a fitted form, with the covariance of its coefficients."""
-    k = one.shape.memory
+    k = one.shape.difference_equation_order
     terms = one.sizes.size - k
     model = ThermalModel(
         shape=one.shape,

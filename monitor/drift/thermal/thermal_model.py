@@ -45,10 +45,10 @@ class ThermalModel:
         return float(self.sigma / (1.0 - self.phi**2) ** 0.5)
 
     @property
-    def slope(self) -> float:
-        """Return the mean slope of the bias in rad/s or m/s² per °C over the temperatures of the fit, with settled
-        lags."""
-        (lo, hi), powers = self.temperature_range_c, np.arange(1, self.shape.powers + 1)
+    def mean_slope(self) -> float:
+        """Return the mean slope of the bias over the temperatures of the fit after all lags have settled, in rad/s or
+        m/s² per °C."""
+        (lo, hi), powers = self.temperature_range_from_reference_c, np.arange(1, self.shape.powers + 1)
         chords = (hi**powers - lo**powers) / (hi - lo)
         return float(
             self.coefficients[1 : 1 + self.shape.powers] @ chords + self.coefficients[1 + self.shape.powers :].sum()
@@ -64,7 +64,7 @@ class ThermalModel:
         return {"a": a.tolist(), "b": b.tolist(), "c": c}
 
     @property
-    def temperature_range_c(self) -> tuple[float, float]:
+    def temperature_range_from_reference_c(self) -> tuple[float, float]:
         """Return the lowest and the highest temperature of the fit minus the reference, °C."""
         return self.lowest_c - self.reference_c, self.highest_c - self.reference_c
 
@@ -83,8 +83,8 @@ def predict(
 ) -> Prediction:
     """Predict the interval means, multi-step or one-step.
 
-    Nothing is known beyond the temperatures of the fit. The model continues along its chord there, and the change along
-    the chord widens the prediction interval.
+    Outside the temperatures of the fit, each power continues with its mean slope between the lowest and the highest
+    temperature. The extrapolated change is added to the uncertainty.
 
     Parameters
     ----------
@@ -96,12 +96,15 @@ def predict(
         Measured bias of each interval, rad/s or m/s². Each value is used for the prediction of the next interval. None
         selects the multi-step prediction from temperature only.
     began : bool
-        True if the first interval is the first one of the fit, whose initial state is known. If False, temperature is
-        assumed to have been constant before, and the prediction intervals include the uncertainty of this assumption.
+        True if the first interval is also the first interval of the fit, so that the initial state is known. If False,
+        temperature is assumed to have been constant before the first interval, and the prediction intervals include the
+        uncertainty of this assumption.
     """
     excess = interpolate_gaps(temperature_c) - model.reference_c
-    columns = regressors(model.shape, excess, model.interval_s, began=True, ends=model.temperature_range_c)
-    k = model.shape.memory
+    columns = regressors(
+        model.shape, excess, model.interval_s, began=True, ends=model.temperature_range_from_reference_c
+    )
+    k = model.shape.difference_equation_order
     if not began:
         columns[:, columns.shape[1] - k :] = 0.0
     sizes = np.concatenate([model.coefficients, model.initial_state if began else np.zeros(k)])
@@ -154,12 +157,12 @@ def predict_with_variance(
         bias[1:] += model.phi * last
         sigma[1:][known] = model.sigma
     variance = np.einsum("ij,jk,ik->i", rows, model.covariance, rows) + sigma**2
-    variance += (model.slope * excess_beyond_range(excess, model.temperature_range_c)) ** 2
+    variance += (model.mean_slope * excess_beyond_range(excess, model.temperature_range_from_reference_c)) ** 2
     return bias, variance
 
 
 def interpolate_gaps(temperature_c: Floats) -> Floats:
-    """Return the temperature [n] with gaps interpolated, because the lags depend on the temperature within the gaps."""
+    """Return the temperature [n] with interpolated gaps. The lags need the temperature within the gaps."""
     there = np.flatnonzero(np.isfinite(temperature_c))
     return np.interp(np.arange(temperature_c.size), there, temperature_c[there])
 
@@ -191,12 +194,14 @@ def time_constant_derivatives(model: ThermalModel, excess: Floats, sizes: Floats
     sizes : ndarray, shape (terms + k,)
         Coefficients of the columns.
     """
-    return combine_derivatives(model.shape, regressor_derivatives(model.shape, excess, model.interval_s), sizes)
+    return bias_derivatives_by_time_constant(
+        model.shape, regressor_derivatives(model.shape, excess, model.interval_s), sizes
+    )
 
 
 def regressor_derivatives(shape: ThermalModelForm, excess: Floats, interval_s: float) -> Floats:
-    """Return the derivatives [n, 2 k] of the lags and of their initial-state responses by the logarithm of their time
-    constants.
+    """Return the derivatives [n, 2 k] of the lags and their initial-state responses with respect to the logarithm of
+    each time constant.
 
     Parameters
     ----------
@@ -216,17 +221,19 @@ def regressor_derivatives(shape: ThermalModelForm, excess: Floats, interval_s: f
     return np.asarray((more - less)[:, 1:] / (2.0 * LOG_TIME_CONSTANT_STEP))
 
 
-def combine_derivatives(shape: ThermalModelForm, of_each: Floats, sizes: Floats) -> Floats:
-    """Return the derivatives [n, k] of the bias by the logarithms of the time constants, from those of the columns.
+def bias_derivatives_by_time_constant(shape: ThermalModelForm, column_derivatives: Floats, sizes: Floats) -> Floats:
+    """Return the derivatives [n, k] of the bias with respect to the logarithm of each time constant.
 
     Parameters
     ----------
     shape : ThermalModelForm
         Form of the model.
-    of_each : ndarray, shape (n, 2 k)
+    column_derivatives : ndarray, shape (n, 2 k)
         Derivatives of the columns, from ``regressor_derivatives``.
     sizes : ndarray, shape (terms + k,)
         Coefficients of the columns.
     """
-    k, first = shape.memory, 1 + shape.powers
-    return np.asarray(of_each[:, :k] * sizes[first : first + k] + of_each[:, k:] * sizes[first + k :])
+    k, first = shape.difference_equation_order, 1 + shape.powers
+    return np.asarray(
+        column_derivatives[:, :k] * sizes[first : first + k] + column_derivatives[:, k:] * sizes[first + k :]
+    )

@@ -7,10 +7,10 @@ resistances and capacitances have only real, positive time constants. A differen
 
 with roots p_1 … p_k is therefore a sum of k lags, each with its own coefficient. m = k − 1, or m = k if a part of the
 bias follows without delay. The equation is stable by construction. Each root also has an initial-state response p^n,
-the effect of the time before the first interval.
+which is the effect of temperatures before the first interval.
 
-A **polynomial** in T is the established alternative without memory. Outside the temperatures of its fit it continues
-along the chord between the ends, because a power would diverge.
+A **polynomial** in T is the established alternative without memory. Outside the temperatures of the fit, each power
+continues as the straight line through its end points, because powers diverge.
 """
 
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class ThermalModelForm:
     constants_s: tuple[float, ...]  # time constants of the lags, s
 
     @property
-    def memory(self) -> int:
+    def difference_equation_order(self) -> int:
         """Return the order k of the difference equation; 0 for a polynomial."""
         return len(self.constants_s)
 
@@ -42,12 +42,12 @@ class ThermalModelForm:
         >>> ThermalModelForm(0, (3600.0,)).name, ThermalModelForm(1, (60.0, 600.0)).name
         ('difference 1, 0', 'difference 2, 2')
         """
-        if self.memory:
-            return f"difference {self.memory}, {self.memory - 1 + min(self.powers, 1)}"
+        if order := self.difference_equation_order:
+            return f"difference {order}, {order - 1 + min(self.powers, 1)}"
         return f"polynomial {self.powers}" if self.powers else "constant"
 
 
-def lag_roots(shape: ThermalModelForm, interval_s: float) -> Floats:
+def compute_lag_roots(shape: ThermalModelForm, interval_s: float) -> Floats:
     """Return the root p of each lag.
 
     Parameters
@@ -78,10 +78,10 @@ def regressors(
     interval_s : float
         Length of an interval, s.
     began : bool
-        True if each lag has an initial state of its own, because the temperature before is not known. False if
-        temperature is assumed to have been constant before.
+        True if each lag has a regressor for its initial state, because the earlier temperature is unknown. False if
+        temperature is assumed to have been constant before the first interval.
     ends : (float, float) or None
-        Lowest and highest T − reference of the fit, °C. Beyond them, powers continue along their chord.
+        Lowest and highest T − reference of the fit, °C. Outside this range, powers continue as straight lines.
 
     Examples
     --------
@@ -91,7 +91,7 @@ def regressors(
     n = excess_c.size
     columns = [np.ones(n)]
     columns += [_power(excess_c, power, ends) for power in range(1, shape.powers + 1)]
-    p = lag_roots(shape, interval_s)
+    p = compute_lag_roots(shape, interval_s)
     columns += [first_order_lag(excess_c, one) for one in p]
     if began:
         columns += [one ** np.arange(n, dtype=np.float64) for one in p]
@@ -99,7 +99,7 @@ def regressors(
 
 
 def excess_beyond_range(excess_c: Floats, ends: tuple[float, float]) -> Floats:
-    """Return how far each temperature lies beyond the ends, °C.
+    """Return the signed distance of each temperature from the range of the fit in °C; 0 inside.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ def excess_beyond_range(excess_c: Floats, ends: tuple[float, float]) -> Floats:
 
 
 def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
-    """Return a power of x, continued along its chord beyond the ends."""
+    """Return a power of x, continued outside the range as the straight line through its end points."""
     if ends is None or ends[1] <= ends[0]:
         return np.asarray(x**power)
     chord = (ends[1] ** power - ends[0] ** power) / (ends[1] - ends[0])
@@ -173,7 +173,7 @@ def difference_equation(shape: ThermalModelForm, sizes: Floats, interval_s: floa
     >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12)
     ([-0.5], [5.0], 1.5)
     """
-    p = lag_roots(shape, interval_s)
+    p = compute_lag_roots(shape, interval_s)
     whole = np.poly(p) if p.size else np.ones(1)  # [k + 1] 1, followed by a
     b = np.zeros(whole.size)
     if shape.powers:

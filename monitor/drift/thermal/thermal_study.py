@@ -51,8 +51,8 @@ class ThermalFitReport:
 
 
 @dataclass(frozen=True, slots=True)
-class ModelComparison:
-    """Comparison of a model with the means of a recording."""
+class ComparisonWithMeans:
+    """Comparison of a thermal model with the interval means of a recording."""
 
     multi_step: Prediction
     one_step: Prediction
@@ -71,13 +71,13 @@ class ThermalPredictionReport:
     recording: str
     interval_s: float
     means: Mapping[str, IntervalMeans]
-    judged: Mapping[str, ModelComparison]
+    judged: Mapping[str, ComparisonWithMeans]
     refused: Mapping[str, str]
     notes: tuple[str, ...] = ()
 
 
-def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ModelComparison:
-    """Compare a model with means that were not used for its fit.
+def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ComparisonWithMeans:
+    """Compare a model with interval means that were not used for the fit.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ModelCompar
     offset = float(residual[known].mean())
     one = predict(model, means.temperature_c, means.bias - offset)
     inside = (means.bias >= multi.lo) & (means.bias <= multi.hi)
-    return ModelComparison(
+    return ComparisonWithMeans(
         multi,
         Prediction(one.bias + offset, one.lo + offset, one.hi + offset),
         offset,
@@ -103,8 +103,8 @@ def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ModelCompar
     )
 
 
-def round_interval_s(seconds: float, rate_hz: float) -> float:
-    """Return a round interval length in seconds that divides a recording into about DEFAULT_INTERVALS intervals.
+def choose_interval_s(seconds: float, rate_hz: float) -> float:
+    """Return a round interval length in seconds, such that a recording has about DEFAULT_INTERVALS intervals.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def round_interval_s(seconds: float, rate_hz: float) -> float:
 
     Examples
     --------
-    >>> round_interval_s(72 * 3600.0, 100.0), round_interval_s(8784.0, 4.16), round_interval_s(60.0, 100.0)
+    >>> choose_interval_s(72 * 3600.0, 100.0), choose_interval_s(8784.0, 4.16), choose_interval_s(60.0, 100.0)
     (3600, 120, 0.5)
     """
     most = max(seconds / DEFAULT_INTERVALS, 1.0 / rate_hz) * 1.01

@@ -26,8 +26,8 @@ since the last change. The detector returns a ``Change`` of one of three kinds.
   burst, the samples of the burst are removed from the reference.
 
 ``analyze`` and the live service share this detector. ``reconcile`` tests steps of the level and of the noise by the
-likelihood ratio of the fitted model of the axis (``diagnostics.step_gains``, ``single_steps``, ``variance_history``).
-The gain of a step must be comparable with the gains of all other effects.
+likelihood ratio of the fitted model of the axis (``diagnostics.level_step_gains``, ``single_steps``,
+``variance_history``). The gain of a step must be comparable with the gains of all other effects.
 """
 
 from collections.abc import Mapping
@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import ConfigError
-from drivers.quantities import DAY_S
+from drivers.number_ranges import DAY_S
 from drivers.sample import AXES, Floats
 from monitor.common.units import format_rate
 from monitor.estimation.detection.change_kernel import (

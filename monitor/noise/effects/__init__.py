@@ -1,4 +1,5 @@
-"""Effects of a noise model, one per file, in a folder per family. In model files an effect has the name of its file."""
+"""Effects of a noise model, one per file, in a folder per family. The name of the file is the name of the effect in
+model files."""
 
 from typing import Final
 
@@ -24,7 +25,7 @@ from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk as Rat
 from monitor.noise.effects.ieee952.sinusoidal import Sinusoidal as Sinusoidal
 from monitor.noise.effects.signal_chain.bandwidth_limit import BandwidthLimit as BandwidthLimit
 from monitor.noise.effects.signal_chain.resolution import Resolution as Resolution
-from monitor.noise.effects.signal_chain.sample_hold import SampleHold as SampleHold
+from monitor.noise.effects.signal_chain.sample_hold import RandomSampleHold as RandomSampleHold
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError as SampleRateError
 from monitor.noise.effects.signal_chain.saturation import Saturation as Saturation
 from monitor.noise.effects.signal_chain.scale_factor import ScaleFactor as ScaleFactor
@@ -35,10 +36,10 @@ TRANSFORM_ORDER: Final[tuple[type[Transform], ...]] = (
     SampleRateError,
     Saturation,
     Resolution,
-    SampleHold,
+    RandomSampleHold,
 )
-"""Order in which transforms act, whatever their order in the model. Two transforms of one kind act in the order of the
-model."""
+"""Order in which transforms act, independent of their order in the model. Two transforms of the same kind act in the
+order of the model."""
 
 _ALL: Final[tuple[type[Effect], ...]] = (
     Bias,

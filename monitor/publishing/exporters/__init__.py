@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import Any, Final
 
 from drivers.errors import ConfigError
-from drivers.quantities import COEFFICIENT, INFLATION
+from drivers.number_ranges import COEFFICIENT, INFLATION
 from monitor.publishing.exporters.gyroparams import gyroparams
 from monitor.publishing.exporters.kalibr import kalibr
 from monitor.publishing.exporters.kalman import kalman

@@ -1,12 +1,13 @@
 """Export as a MATLAB script with ``gyroparams`` and ``accelparams`` for ``imuSensor``, one value per axis.
 
 Properties and units follow the reference pages of MathWorks. ``single-sided`` is the MathWorks term for white noise
-with σ = NoiseDensity·√rate per sample, which is N of IEEE Std 952. The default of MathWorks would be smaller by √2.
-``BiasInstability`` is the σ of the white noise that drives a filter. With ``fractalcoef`` (Kasdin, Proc. IEEE 83(5),
-1995) the result has the spectrum B²/(2πf), which is B of IEEE Std 952. The default filter has one pole at 0.5, and
-its output is not flicker noise.
+with σ = NoiseDensity·√rate per sample, where the density is N of IEEE Std 952. The default of MathWorks would be
+smaller by √2. ``BiasInstability`` is the σ of the white noise that drives a filter. With the filter ``fractalcoef``
+(Kasdin, Proc. IEEE 83(5), 1995), the bias has the spectrum B²/(2πf), where B is the bias instability of IEEE Std 952.
+The default filter has one pole at 0.5, and its output is not flicker noise.
 
-The script is meant for simulation. A coefficient with only an upper bound is therefore 0, with the bound in a comment.
+The script is meant for simulation. A coefficient with only an upper bound is therefore set to 0, and a comment states
+the bound.
 """
 
 from typing import Final
@@ -66,7 +67,7 @@ def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
 
 
 def _property(noise: NoiseCoefficients, kind: Kind, letter: str, name: str, unit: str, inflation: float) -> str:
-    """Return one property of three axes; unknown values are 0 and named in a comment."""
+    """Return one property of three axes. An unknown value is 0, and a comment names the axis."""
     known, values, said = noise.coefficients(kind, letter), [], ""
     for axis in axes_of(kind):
         term = known.get(axis)

@@ -1,9 +1,10 @@
-"""Export as Kalibr's ``imu.yaml``: continuous-time densities, the largest of the three axes for each kind of sensor.
+"""Export as ``imu.yaml`` of Kalibr, with continuous-time noise densities.
 
-Keys and units follow the wiki of Kalibr, pages "YAML formats" and "IMU Noise Model". Kalibr multiplies the white-noise
-density by 1/√Δt to get the σ of a sample. It multiplies the random-walk density by √Δt to get a step of the bias. Both
-agree with N and K of IEEE Std 952. Kalibr rejects zero, so a term that no axis has is an error. If the axes have only
-upper bounds, the largest bound is used and the comment says so.
+The file has one value for each kind of sensor: the largest of the three axes. Keys and units follow the pages "YAML
+formats" and "IMU Noise Model" in the wiki of Kalibr. Kalibr multiplies the white-noise density by 1/√Δt to get the σ of
+a sample. The random-walk density is multiplied by √Δt to get a step of the bias. The densities are therefore N and K of
+IEEE Std 952. Kalibr rejects zero, so a term that no axis has is an error. If the axes have only upper bounds, the
+largest bound is used, and a comment in the file says that the value is a bound.
 """
 
 from typing import Final
@@ -26,7 +27,6 @@ INFLATION_COMMENT: Final = (
     "# Kalibr's wiki, IMU Noise Model: a sensor at rest at one temperature shows too little; for the",
     "# lowest-cost sensors it may be necessary to raise these values by a factor of 10 or more (--inflation 10)",
 )
-"""Comment on the inflation of the values."""
 
 
 def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
@@ -61,18 +61,17 @@ def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/i
     for kind, name in kinds:
         for letter, key, unit_of in (("N", "noise_density", "B"), ("K", "random_walk", "R")):
             largest, comment = _largest_term(noise, kind, letter)
-            unit = f"{ascii_unit(unit_of, kind)}/sqrt(Hz)"  # the unit of a density: that of B for N, that of R for K
+            unit = f"{ascii_unit(unit_of, kind)}/sqrt(Hz)"  # a density has the unit of B (for N) or R (for K) per √Hz
             lines += [f"# {letter}: {comment}", f"{name}_{key}: {number(largest.value * inflation)}  # {unit}"]
     return join_lines([*lines, *omitted_comment(noise, "NK", "#")])
 
 
 def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[Term, str]:
-    """Return the largest estimate of a kind, or the largest bound if there is no estimate, and a comment on it."""
+    """Return the largest estimate, or the largest bound if there is no estimate, and a comment on the choice."""
     known = noise.coefficients(kind, letter)
     if not known:
         raise missing_coefficient_error(
-            noise,
-            f"kalibr needs {letter} ({COEFFICIENT_EFFECTS[letter].name}) above 0 on the {kind} axes, and none has it",
+            noise, f"kalibr needs {letter} ({COEFFICIENT_EFFECTS[letter].name}) above 0 on the {kind} axes"
         )
     rank = {axis: (not term.bound, term.value) for axis, term in known.items()}
     axis = max(rank, key=lambda one: rank[one])

@@ -1,15 +1,17 @@
 """Export of the process noise of a Kalman filter as TOML: densities, and discrete F and Q of each axis.
 
-Error model of one gyroscope (for an accelerometer, velocity replaces the angle):
+The error model of one gyroscope has three states. For an accelerometer, velocity replaces the angle.
 
-    angle' = walk + markov + white,   walk' = white of density K²,   markov' = -markov/T + white of density 2σ²/T
+    angle' = walk + markov + white
+    walk' = white noise of density K²
+    markov' = -markov/T + white noise of density 2σ²/T
 
-The rate has white noise of density N². Flicker noise has no finite-dimensional state model, so a first-order
+The white noise of the rate has the density N². Flicker noise has no finite-dimensional state model, so a first-order
 Gauss-Markov process approximates it. The Allan deviation of this process peaks at 0.618 σ and τ = 1.89 T (IEEE Std
-952). σ is chosen so that the peak equals the Allan deviation of flicker noise, 0.664 B. T is chosen so that the peak
-lies in the middle (of log τ) of the range in which flicker noise dominates. This range extends from τ = N²/(0.664 B)²
-to 3 (0.664 B)²/K², so its middle is √3 N/K. Without N or K the range is not bounded. T must then be given, or B is
-omitted and a comment in the file says so.
+952). σ is chosen so that the peak equals the Allan deviation of flicker noise, 0.664 B. The correlation time T is
+chosen so that the peak lies in the middle (of log τ) of the range in which flicker noise dominates. This range extends
+from τ = N²/(0.664 B)² to 3 (0.664 B)²/K², so its middle is √3 N/K. Without N or K, the range is not bounded. The user
+must then give T. Otherwise the flicker noise B is omitted, and a comment in the file states the omission.
 
 An upper bound is used as if it were the value, because a larger process noise is the safer choice. A comment in the
 file names the coefficient.
@@ -22,7 +24,7 @@ from typing import Final
 import numpy as np
 
 from drivers.errors import ConfigError
-from drivers.quantities import DURATION_S
+from drivers.number_ranges import DURATION_S
 from drivers.sample import Floats
 from monitor.common.units import sensor_kind
 from monitor.noise.effects import BiasInstability
@@ -40,9 +42,9 @@ FLICKER_TAU_S: Final = np.array([1000.0])  # any τ much longer than the sample 
 MARKOV_PEAK_RATIO: Final = 0.437 * math.sqrt(2.0)
 """Ratio of the peak Allan deviation of the Gauss-Markov process to σ: 0.437 q √T with q² = 2σ²/T (IEEE Std 952)."""
 MARKOV_PEAK_AT: Final = 1.89
-"""Averaging time of this peak in units of the correlation time T."""
+"""Averaging time of the peak in units of the correlation time T."""
 SERIES_BELOW: Final = 0.1
-"""Value of dt/T below which differences of exponentials are computed from their series."""
+"""Value of dt/T below which differences of exponentials are computed from a power series."""
 
 HEADER_COMMENT: Final = (
     "# Process noise of a Kalman filter. States of an axis: angle (velocity) error, bias that walks, and a first-order",
@@ -51,7 +53,6 @@ HEADER_COMMENT: Final = (
     "# psd: two-sided densities of the w; white noise of a sample has variance psd_white/dt",
     "# x[k+1] = F x[k] + w[k], cov(w) = Q: exact over dt",
 )
-"""Comment at the beginning of the file."""
 
 
 def kalman(
@@ -78,7 +79,7 @@ def kalman(
     step_s = 1.0 / noise.sample_rate_hz if dt_s is None and noise.sample_rate_hz else dt_s
     if step_s is None or not DURATION_S.supports(step_s):
         raise ConfigError(
-            f"kalman needs a time step of {DURATION_S.range_text()}: the model's sample_rate, or one that is given"
+            f"kalman needs a time step of {DURATION_S.format_range()}: the model's sample_rate, or one that is given"
         )
     if correlation_time_s is not None:
         try:
@@ -115,7 +116,7 @@ def _markov_time_s(N: float, K: float) -> float:
     return math.sqrt(3.0) * N / K / MARKOV_PEAK_AT
 
 
-def transition(dt_s: float, time_s: float) -> Floats:
+def bias_state_transition_matrix(dt_s: float, time_s: float) -> Floats:
     """Return the transition matrix F [3, 3] of angle, random-walk bias and Gauss-Markov bias.
 
     Parameters
@@ -129,8 +130,10 @@ def transition(dt_s: float, time_s: float) -> Floats:
     return np.array([[1.0, dt_s, time_s * lost], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0 - lost]])
 
 
-def process_noise(dt_s: float, N: float, K: float, sigma: float, time_s: float) -> Floats:
-    """Return the process noise Q [3, 3] of angle, random-walk bias and Gauss-Markov bias: ∫ F(s) G F(s)ᵀ ds.
+def process_noise_matrix(dt_s: float, N: float, K: float, sigma: float, time_s: float) -> Floats:
+    """Return the covariance Q [3, 3] of the process noise of angle, random-walk bias and Gauss-Markov bias.
+
+    Q is the integral of F(s) G F(s)ᵀ over 0 ≤ s ≤ dt, where F is the transition matrix and G = diag(N², K², 2σ²/T).
 
     Parameters
     ----------
@@ -155,7 +158,7 @@ def process_noise(dt_s: float, N: float, K: float, sigma: float, time_s: float) 
 
 
 def _integrated_markov_variance(x: float) -> float:
-    """Return x - 2(1 - e^-x) + (1 - e^-2x)/2; a series for small x, where the leading term is x³/3, keeps precision."""
+    """Return x - 2(1 - e^-x) + (1 - e^-2x)/2. For small x, the power series from x³/3 on avoids cancellation."""
     if x > SERIES_BELOW:
         return x + 2.0 * math.expm1(-x) - 0.5 * math.expm1(-2.0 * x)
     return math.fsum((-x) ** k * (2.0 - 2.0 ** (k - 1)) / math.factorial(k) for k in range(3, 14))
@@ -192,13 +195,13 @@ def _axis(
         *lines,
         f"states = [{listed}]",
         *densities,
-        f"F = {_matrix(transition(dt_s, time_s)[:size, :size])}",
-        f"Q = {_matrix(process_noise(dt_s, N, K, sigma, time_s)[:size, :size])}",
+        f"F = {_matrix(bias_state_transition_matrix(dt_s, time_s)[:size, :size])}",
+        f"Q = {_matrix(process_noise_matrix(dt_s, N, K, sigma, time_s)[:size, :size])}",
     ]
 
 
 def _remarks(terms: Mapping[str, Term]) -> list[str]:
-    """Return comments on unknown coefficients and upper bounds of one axis."""
+    """Return comments on the unknown coefficients and upper bounds of one axis."""
     unknown = [letter for letter in "NBK" if letter not in terms]
     bounds = [letter for letter in "NBK" if letter in terms and terms[letter].bound]
     lines = [f"# not known, counted as 0: {', '.join(unknown)}"] if unknown else []

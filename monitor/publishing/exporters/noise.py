@@ -1,9 +1,9 @@
 """Noise coefficients to export, and the comments that are common to all formats.
 
-A ``NoiseCoefficients`` object holds Q, N, B, K and R of each axis in SI. From a model file, all of them are values.
-From ``analyze --json``, those with status ``estimated`` are values, those with ``upper_bound`` are marked as bounds,
-and others are absent. Effects without a letter (a spectral line, a bias, …) are kept by name, so that a comment can
-name them as omitted.
+A ``NoiseCoefficients`` object holds Q, N, B, K and R of each axis in SI. All coefficients of a model file are values.
+In the output of ``analyze --json``, a coefficient with the status ``estimated`` is a value, and a coefficient with the
+status ``upper_bound`` is marked as a bound. Coefficients with another status are absent. Other effects, such as a
+spectral line or a bias, are kept only by name, so that a comment can list what the file omits.
 """
 
 import math
@@ -14,10 +14,10 @@ from typing import Final
 import msgspec
 
 from drivers.errors import ConfigError, ImuError, NotReady
-from drivers.quantities import RATE_HZ
+from drivers.number_ranges import RATE_HZ
 from drivers.sample import AXES
 from monitor.common.units import KINDS, Kind, axes_of
-from monitor.noise.effect import Source, parameter_units
+from monitor.noise.effect import Source, gyro_and_accel_units
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
 
@@ -28,7 +28,7 @@ COEFFICIENT_EFFECTS: Final[dict[str, type[Source]]] = {
     "K": RateRandomWalk,
     "R": RateRamp,
 }
-"""Effect of the noise model whose parameter is the coefficient."""
+"""Noise effect with the same coefficient as parameter."""
 
 
 def ascii_unit(letter: str, kind: Kind) -> str:
@@ -44,7 +44,7 @@ def ascii_unit(letter: str, kind: Kind) -> str:
     kind
         Kind of sensor.
     """
-    unit = parameter_units(COEFFICIENT_EFFECTS[letter])[letter][KINDS.index(kind)]
+    unit = gyro_and_accel_units(COEFFICIENT_EFFECTS[letter])[letter][KINDS.index(kind)]
     return unit.replace("√s", "sqrt(s)").replace("²", "^2").replace("³", "^3")
 
 
@@ -58,12 +58,12 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class NoiseCoefficients:
-    """Noise coefficients by axis and letter; unknown axes and letters are absent."""
+    """Noise coefficients by axis and letter. Unknown axes and letters are absent."""
 
     axes: Mapping[str, Mapping[str, Term]]
     sample_rate_hz: float | None
     source: str  # origin of the numbers, for the header of the file
-    left_out: tuple[str, ...] = ()  # effects without a letter, such as "gz.sinusoidal"
+    left_out: tuple[str, ...] = ()  # other effects, such as "gz.sinusoidal"
     measured: bool = False  # True if the coefficients come from a recording
     warnings: tuple[str, ...] = ()  # ASCII sentences for the header of the file
 
@@ -81,7 +81,7 @@ class NoiseCoefficients:
 
 
 def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficients:
-    """Return the coefficients of a noise model; the variances of equal effects on one axis are added.
+    """Return the coefficients of a noise model. The variances of equal effects on one axis are added.
 
     >>> model = NoiseModel.from_toml('sample_rate = 100.0\\n["g*".angle_random_walk]\\nN = 1.5e-4')
     >>> from_model(model).axes["gz"]["N"].value
@@ -111,7 +111,7 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
 
 
 class _Coefficient(msgspec.Struct):
-    """Coefficient in the JSON of an analysis."""
+    """One coefficient in the JSON of an analysis."""
 
     value: float | None
     hi: float | None
@@ -119,20 +119,20 @@ class _Coefficient(msgspec.Struct):
 
 
 class _Temperature(msgspec.Struct):
-    """Dependence on temperature in the JSON of an analysis."""
+    """Key ``temperature`` of an axis in the JSON of an analysis."""
 
     share: float
 
 
 class _Axis(msgspec.Struct):
-    """Axis in the JSON of an analysis."""
+    """One axis in the JSON of an analysis."""
 
     coefficients: dict[str, _Coefficient]
     temperature: _Temperature | None = None
 
 
 class _Analysis(msgspec.Struct):
-    """JSON of an analysis, as far as it is used."""
+    """JSON of an analysis with only the keys that an export needs."""
 
     schema: str
     axes: dict[str, _Axis]
@@ -182,7 +182,7 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
 
 
 def missing_coefficient_error(noise: NoiseCoefficients, text: str) -> ImuError:
-    """Return NotReady if a recording lacks a coefficient, and ConfigError if a noise model lacks one.
+    """Return the error for a missing coefficient: NotReady for a recording, ConfigError for a noise model.
 
     Parameters
     ----------
@@ -242,5 +242,5 @@ def number(value: float) -> str:
 
 
 def join_lines(lines: Iterable[str]) -> str:
-    """Join lines to the text of a file."""
+    """Return the lines as the text of a file."""
     return "\n".join(lines) + "\n"

@@ -1,4 +1,4 @@
-"""Output of ``analyze --json``: the estimate of a recording, with the optional curves that were computed."""
+"""Output of ``analyze --json``: coefficients and deviations of a recording."""
 
 from typing import Final, Self
 
@@ -8,7 +8,7 @@ from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
 from drivers.sample import AXES, Floats
-from monitor.drift.thermal.temperature_share import SLOW_LETTERS, TemperatureShare
+from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemoval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.allan.hadamard import HadamardCurve
@@ -21,7 +21,7 @@ from monitor.publishing.messages.message import encode_json, shared_fields
 from monitor.publishing.messages.results import (
     CoefficientValue,
     coefficient_values,
-    deviation_columns,
+    deviations_with_interval_ends,
     measured_axes,
 )
 
@@ -39,11 +39,11 @@ class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
     @classmethod
     def of(cls, curve: AllanCurve | TotalCurve | HadamardCurve, axis: int) -> Self:
         """Return the deviations of column ``axis`` of a curve."""
-        return cls(curve.tau_s, *deviation_columns(curve, axis))
+        return cls(curve.tau_s, *deviations_with_interval_ends(curve, axis))
 
 
-class TemperatureValues(msgspec.Struct, frozen=True, rename={"interval_s": "interval"}):
-    """Measures of how strongly the bias of an axis depends on temperature."""
+class TemperatureDependenceValues(msgspec.Struct, frozen=True, rename={"interval_s": "interval"}):
+    """Measures of the dependence of the bias of an axis on temperature."""
 
     share: float
     p_value: float
@@ -52,7 +52,7 @@ class TemperatureValues(msgspec.Struct, frozen=True, rename={"interval_s": "inte
     interval_s: float
 
 
-class WithoutTemperature(msgspec.Struct, frozen=True):
+class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
     """K and R of an axis after its temperature-correlated bias has been removed."""
 
     model: str
@@ -60,7 +60,7 @@ class WithoutTemperature(msgspec.Struct, frozen=True):
     share: dict[str, float | None]
 
     @classmethod
-    def of(cls, found: TemperatureShare, axis: str) -> Self:
+    def of(cls, found: TemperatureRemoval, axis: str) -> Self:
         """Return the values of one axis."""
         i = AXES.index(axis)
         values = coefficient_values(found.coefficients, i, found.k_or_r[i])
@@ -72,19 +72,19 @@ class WithoutTemperature(msgspec.Struct, frozen=True):
 
 
 class AxisAnalysis(msgspec.Struct, frozen=True, kw_only=True):
-    """Results of one axis; curves that were not computed are absent."""
+    """Results of one axis. Deviations that were not computed are absent."""
 
     allan: AxisDeviations
     total: AxisDeviations | UnsetType = UNSET
     hadamard: AxisDeviations | UnsetType = UNSET
     coefficients: dict[str, CoefficientValue]
     bandwidth: float | None
-    temperature: TemperatureValues | UnsetType = UNSET
-    without_temperature: WithoutTemperature | UnsetType = UNSET
+    temperature: TemperatureDependenceValues | UnsetType = UNSET
+    without_temperature: CoefficientsWithoutTemperature | UnsetType = UNSET
 
 
 class MotionValues(msgspec.Struct, frozen=True):
-    """Detected motion; ``t`` is its start after the first sample [s]."""
+    """Detected motion. ``t`` is the time from the first sample to the start of the motion [s]."""
 
     kind: str
     axis: str
@@ -100,7 +100,7 @@ class MotionValues(msgspec.Struct, frozen=True):
 
 
 class ChangeValues(msgspec.Struct, frozen=True):
-    """Detected change; ``t`` is its start after the first sample [s]."""
+    """Detected change. ``t`` is the time from the first sample to the start of the change [s]."""
 
     kind: str
     axis: str
@@ -117,7 +117,7 @@ class ChangeValues(msgspec.Struct, frozen=True):
 
 
 class CoefficientSeries(msgspec.Struct, frozen=True, eq=False):
-    """Coefficient of one axis, one value for each time step."""
+    """Coefficient of one axis at each time step."""
 
     value: Floats
     lo: Floats
@@ -149,7 +149,7 @@ class DynamicAxis(msgspec.Struct, frozen=True, eq=False):
 
 
 class DynamicValues(msgspec.Struct, frozen=True, eq=False):
-    """Dynamic Allan deviations; ``t`` is the end of each window after the first sample [s]."""
+    """Dynamic Allan deviations. ``t`` is the time from the first sample to the end of each window [s]."""
 
     window: float
     t: Floats
@@ -176,7 +176,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
         total: TotalCurve | None = None,
         hadamard: HadamardCurve | None = None,
         dynamic: DynamicAllan | None = None,
-        temperature: TemperatureShare | None = None,
+        temperature: TemperatureRemoval | None = None,
     ) -> Self:
         """Build the output of an analysis.
 
@@ -205,7 +205,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
                 temperature=_temperature_values(result, temperature, axis),
                 without_temperature=UNSET
                 if temperature is None or axis not in temperature.models
-                else WithoutTemperature.of(temperature, axis),
+                else CoefficientsWithoutTemperature.of(temperature, axis),
             )
             for i, axis in measured
         }
@@ -233,7 +233,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
 
 
 class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag=SCHEMA):
-    """Output of ``analyze --json`` if the data do not support an estimate; ``notes`` holds the reason."""
+    """Output of ``analyze --json`` if no estimate is possible. ``notes`` contains the reason."""
 
     samples: int
     notes: list[str]
@@ -245,9 +245,9 @@ class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag
 
 
 def _temperature_values(
-    result: Analysis, temperature: TemperatureShare | None, axis: str
-) -> TemperatureValues | UnsetType:
-    """Return the dependence of an axis on temperature, if temperature explains most of its slow variance."""
+    result: Analysis, temperature: TemperatureRemoval | None, axis: str
+) -> TemperatureDependenceValues | UnsetType:
+    """Return the measures of an axis if temperature explains most of its slow variance."""
     if temperature is None or axis not in result.axes_of_temperature:
         return UNSET
-    return TemperatureValues(**shared_fields(TemperatureValues, temperature.dependences[axis]))
+    return TemperatureDependenceValues(**shared_fields(TemperatureDependenceValues, temperature.dependences[axis]))

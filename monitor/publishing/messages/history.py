@@ -1,9 +1,9 @@
 """Past results: the reply to ``imu/<device>/history`` and the output of ``history --json``.
 
 All lists are indexed by bucket. For each number, ``value`` is the last value of its bucket, and ``low`` and ``high``
-are the extremes. A coefficient also has the interval of its last value and its status. The status is ``upper_bound``
-if the value was bounded and never estimated within the bucket. Stored values have seven digits. Nine are written, so
-that the decoded float32 values equal the stored ones exactly.
+are the extremes. A coefficient also has a status and the interval of its last value. The status is ``upper_bound`` if
+the coefficient was bounded but never estimated within the bucket. Numbers are written with nine digits, so that the
+decoded float32 values equal the stored values exactly.
 """
 
 from typing import Any, Final, Literal, Self
@@ -27,20 +27,19 @@ from monitor.publishing.messages.message import Message, decode_message, remove_
 MAX_BUCKETS: Final = 1_000_000
 """Largest number of buckets accepted in a message."""
 MAX_HISTORY_BYTES: Final = 1 << 30
-"""Largest accepted payload."""
 STATUS_COLUMNS: Final = (*HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
 _STATUS_NAMES: Final = {status.value: status.name.lower() for status in Status}
 
 
 class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Number over time: last value, minimum and maximum of each bucket."""
+    """Last value, minimum and maximum of a number in each bucket."""
 
     value: Floats
     low: Floats
     high: Floats
 
     @classmethod
-    def of(cls, column: ColumnStatistics) -> Self:
+    def from_column(cls, column: ColumnStatistics) -> Self:
         """Return the history of a stored column."""
         return cls(value=_nine_digits(column.last), low=_nine_digits(column.low), high=_nine_digits(column.high))
 
@@ -51,7 +50,7 @@ class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
-    """Coefficient of one axis over time, with interval, count and status."""
+    """Coefficient of one axis over time, with intervals, numbers of estimates and statuses."""
 
     lo: Floats
     hi: Floats
@@ -59,10 +58,10 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
     status: list[str]
 
     @classmethod
-    def of_coefficient(cls, past: HistoryTable, name: str) -> Self:
-        """Return the history of a coefficient, given the name of its column, such as gz.N."""
-        value, bound = past.column(name), past.column(f"{name}.bound")
-        lo, hi = (past.column(f"{name}.{end}") for end in ("lo", "hi"))
+    def coefficient_from_history(cls, past: HistoryTable, value_column: str) -> Self:
+        """Return the history of a coefficient, given the column of its value, such as gz.N."""
+        value, bound = past.column(value_column), past.column(f"{value_column}.bound")
+        lo, hi = (past.column(f"{value_column}.{end}") for end in ("lo", "hi"))
         estimated, bounded = value.n > 0, bound.n > 0
         status = np.where(estimated, Status.ESTIMATED, np.where(bounded, Status.UPPER_BOUND, Status.UNESTIMATED))
         only_bounded = bounded & ~estimated
@@ -76,12 +75,12 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
             status=[_STATUS_NAMES[one] for one in status.tolist()],
         )
 
-    def to_columns(self, name: str, buckets: int) -> dict[str, ColumnStatistics]:
+    def coefficient_columns(self, value_column: str, buckets: int) -> dict[str, ColumnStatistics]:
         """Return the stored columns of the coefficient.
 
         Parameters
         ----------
-        name
+        value_column
             Name of the column of the value, such as gz.N.
         buckets
             Number of buckets.
@@ -92,10 +91,10 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
         if only_bounded.shape != (buckets,):
             raise ValueError("lists of different lengths")
         return {
-            name: ColumnStatistics(n, value.low, value.high, value.last),
-            f"{name}.lo": _column_without_extremes(np.where(only_bounded, np.nan, lo)),
-            f"{name}.hi": _column_without_extremes(np.where(only_bounded, np.nan, hi)),
-            f"{name}.bound": _column_without_extremes(np.where(only_bounded, hi, np.nan)),
+            value_column: ColumnStatistics(n, value.low, value.high, value.last),
+            f"{value_column}.lo": _column_without_extremes(np.where(only_bounded, np.nan, lo)),
+            f"{value_column}.hi": _column_without_extremes(np.where(only_bounded, np.nan, hi)),
+            f"{value_column}.bound": _column_without_extremes(np.where(only_bounded, hi, np.nan)),
         }
 
 
@@ -106,7 +105,7 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     axes: dict[str, NumberHistory]
 
     @classmethod
-    def of(cls, past: HistoryTable, axes: tuple[str, ...]) -> Self:
+    def deviations_from_history(cls, past: HistoryTable, axes: tuple[str, ...]) -> Self:
         """Return the stored deviations of the given axes."""
         taus, found = past.taus(), {}
         for axis in axes:
@@ -119,7 +118,7 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
                 found[axis] = NumberHistory(value=last, low=low, high=high)
         return cls(tau=[float(tau) for tau in taus], axes=found)
 
-    def to_columns(self, buckets: int) -> dict[str, ColumnStatistics]:
+    def deviation_columns(self, buckets: int) -> dict[str, ColumnStatistics]:
         """Return the stored columns of all axes."""
         columns, shape = {}, (buckets, len(self.tau))
         for axis in (axis for axis in self.axes if axis in AXES):
@@ -132,7 +131,7 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """State and counters of the device over time."""
+    """State and sample counters of the device over time."""
 
     state: list[Literal["ended", "running", "waiting", "lost"]]
     received: Ints
@@ -145,15 +144,15 @@ class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     temperature: NumberHistory | UnsetType | None = UNSET
 
     @classmethod
-    def of(cls, past: HistoryTable) -> Self:
+    def status_from_history(cls, past: HistoryTable) -> Self:
         """Return the stored states, counters and numbers."""
         counts: dict[str, Any] = {name: past.counts[:, i] for i, name in enumerate(COUNTS)}
         numbers: dict[str, Any] = {
-            name: NumberHistory.of(past.column(name)) for name in STATUS_COLUMNS if name in past.names
+            name: NumberHistory.from_column(past.column(name)) for name in STATUS_COLUMNS if name in past.names
         }
         return cls(state=[STATES[one] for one in past.state.tolist()], **counts, **numbers)
 
-    def to_columns(self, buckets: int) -> dict[str, ColumnStatistics]:
+    def status_columns(self, buckets: int) -> dict[str, ColumnStatistics]:
         """Return the stored columns of the numbers."""
         numbers = {name: getattr(self, name) for name in STATUS_COLUMNS}
         return {name: one.to_column(buckets) for name, one in numbers.items() if isinstance(one, NumberHistory)}
@@ -165,7 +164,10 @@ class PastEvent(
     kw_only=True,
     rename={"t_s": "t", "since_s": "since", "represented_events": "stands_for"},
 ):
-    """Stored event of the device; ``stands_for`` counts the event and the deleted earlier ones of its kind."""
+    """Stored event of the device.
+
+    ``stands_for`` is the number of events that the entry represents, because older events of the same kind are deleted.
+    """
 
     t_s: float
     kind: str
@@ -177,7 +179,7 @@ class PastEvent(
     represented_events: int = 1
 
     @classmethod
-    def of(cls, event: StoredEvent) -> Self:
+    def from_stored_event(cls, event: StoredEvent) -> Self:
         """Return a stored event."""
         return cls(**shared_fields(cls, event) | {"what": {name: dict(sides) for name, sides in event.what.items()}})
 
@@ -197,7 +199,7 @@ class PastEvent(
 
 
 class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.schema()):
-    """Message ``imu/<device>/history``; parts that were not requested are absent."""
+    """Message ``imu/<device>/history``. Parts that were not requested are absent."""
 
     topic = topics.HISTORY
     from_: float = msgspec.field(name="from")
@@ -227,7 +229,10 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
             Number of samples since the start of the device.
         """
         axes = {
-            axis: {symbol: CoefficientHistory.of_coefficient(past, f"{axis}.{symbol}") for symbol in query.symbols}
+            axis: {
+                symbol: CoefficientHistory.coefficient_from_history(past, f"{axis}.{symbol}")
+                for symbol in query.symbols
+            }
             for axis in query.axes
             if axis in past.axes()
         }
@@ -241,9 +246,11 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
             start=past.start_s,
             width=past.width_s,
             axes=axes if COEFFICIENTS in query.what else UNSET,
-            deviations=DeviationHistory.of(past, query.axes) if DEVIATIONS in query.what else UNSET,
-            status=StatusHistory.of(past) if STATUS in query.what else UNSET,
-            events=[PastEvent.of(one) for one in past.events] if EVENTS in query.what else UNSET,
+            deviations=DeviationHistory.deviations_from_history(past, query.axes)
+            if DEVIATIONS in query.what
+            else UNSET,
+            status=StatusHistory.status_from_history(past) if STATUS in query.what else UNSET,
+            events=[PastEvent.from_stored_event(one) for one in past.events] if EVENTS in query.what else UNSET,
             events_in_all=past.events_in_all if EVENTS in query.what else UNSET,
         )
 
@@ -257,20 +264,20 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
         """
         buckets = self.start.size
         if self.width.shape != (buckets,) or buckets > MAX_BUCKETS:
-            raise ValueError("not the reply of a history")
+            raise ValueError(f"the lists do not have one length of at most {MAX_BUCKETS:,} buckets")
         columns: dict[str, ColumnStatistics] = {}
         for axis, coefficients in (self.axes or {}).items():
             for symbol, one in coefficients.items():
                 if axis in AXES and symbol in SYMBOLS:
-                    columns |= one.to_columns(f"{axis}.{symbol}", buckets)
+                    columns |= one.coefficient_columns(f"{axis}.{symbol}", buckets)
         if self.deviations:
-            columns |= self.deviations.to_columns(buckets)
+            columns |= self.deviations.deviation_columns(buckets)
         counts, state = np.zeros((buckets, len(COUNTS)), np.int64), np.full(buckets, STATES.index("running"))
         if self.status:
-            columns |= self.status.to_columns(buckets)
+            columns |= self.status.status_columns(buckets)
             counts = np.column_stack([_checked(getattr(self.status, name), (buckets,)) for name in COUNTS])
             state = _checked(np.array([STATES.index(one) for one in self.status.state], np.int64), (buckets,))
-        with np.errstate(over="ignore"):  # a value beyond the range of float32, which no sensor produces, is infinite
+        with np.errstate(over="ignore"):  # a value beyond the range of float32 becomes infinite
             low, high, last = (
                 np.array([getattr(one, part) for one in columns.values()]).reshape(-1, buckets).T.astype(np.float32)
                 for part in ("low", "high", "last")
@@ -305,17 +312,17 @@ def decode_history(payload: bytes) -> HistoryTable:
 
 
 def _column_without_extremes(last: Floats) -> ColumnStatistics:
-    """Return a column whose extremes equal its last values."""
+    """Return a column for which only last values are stored; they also serve as extremes."""
     return ColumnStatistics((~np.isnan(last)).astype(np.int64), last, last, last)
 
 
 def _nine_digits(column: Floats) -> Floats:
-    """Return values rounded to nine digits, which represent every float32 exactly."""
+    """Return values rounded to nine digits, which identify every float32."""
     return np.array([float(f"{one:.9g}") for one in column.tolist()])
 
 
 def _checked(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return an array of the expected shape; any empty array stands for one without buckets."""
+    """Return the array in the expected shape. An empty array is accepted if there are no buckets."""
     if array.shape != shape and (array.size or 0 not in shape):
         raise ValueError("lists of different lengths")
     return array.reshape(shape)

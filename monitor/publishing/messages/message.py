@@ -1,11 +1,11 @@
 """Base class of the messages, and their encoding as JSON.
 
 Each message is one ``msgspec.Struct``. The publisher, ``watch``, ``view`` and the history queries use the same structs.
-The fields have the order in which the JSON keys are written, and the names of the keys or of the attributes of the
-result (see ``rename``). Numbers are in SI units. NaN is written as null, because JSON cannot represent it. In an array,
-null is read as NaN.
+The order of the fields is the order of the JSON keys. A field has the name of its JSON key or of the attribute of the
+result (see ``rename``). Numbers are in SI units. NaN is written as null, because JSON cannot represent NaN. In an
+array, null is read as NaN.
 
-Unknown keys are ignored, so messages of newer daemons can be read. Any payload that is not the expected message raises
+Unknown keys are ignored, so messages of newer daemons can be read. A payload that is not the expected message raises
 ``ValueError``. The module does no I/O.
 """
 
@@ -19,18 +19,18 @@ from drivers.sample import Ints
 from monitor.common.topics import Topic
 
 MAX_PAYLOAD_BYTES: Final = 1_000_000
-"""Largest accepted payload; a message of six axes has a few kilobytes."""
+"""Largest accepted payload. A message of six axes has a few kilobytes."""
 Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="schema"):
-    """Message about one device. The key ``schema`` is written and checked by msgspec, see the tag of each subclass."""
+    """Message about one device. msgspec writes and checks the key ``schema``, which is the tag of each subclass."""
 
     topic: ClassVar[Topic]
 
     device: str = ""
     t: float | None = None
-    """Unix time of the newest sample [s]; None before the first sample of a device that has its own clock."""
+    """Unix time of the newest sample [s]. None before the first sample of a device that has its own clock."""
     samples: Count = 0
     """Number of samples of the device since the start."""
 
@@ -93,7 +93,7 @@ def encode_json(value: Any) -> bytes:
 
 
 def shared_fields(kind: type[msgspec.Struct], source: object) -> dict[str, Any]:
-    """Return the attributes of an object that have the name of a field of a struct.
+    """Return those attributes of an object that a struct has as fields.
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ from drivers.credential_masking import mask_secrets
 from drivers.sample import AXES, Event, Floats
 from monitor.common import topics
 from monitor.common.health import Health
-from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.recursive_least_squares import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
@@ -26,13 +26,13 @@ from monitor.publishing.messages.message import Count, Message, decode_message, 
 MAX_AVERAGING_TIMES: Final = 1000
 """Largest accepted number of averaging times."""
 MAX_TEXT_LENGTH: Final = 400
-"""Length to which received texts are cut, so that no device can exhaust the memory of the receiver."""
+"""Length to which received texts are cut, because a device must not exhaust the memory of the receiver."""
 MAX_OUTPUTS: Final = 16
 STATUSES: Final = {status.name.lower(): status for status in Status}
 
 
 class SlowStatistics(NamedTuple):
-    """Statistics of the window that are computed step by step."""
+    """Total and Hadamard deviations of the window, which are computed in small steps."""
 
     total: TotalCurve
     hadamard: HadamardCurve
@@ -47,7 +47,7 @@ class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
 
 
 class AllanAxis(DeviationCurve, frozen=True):
-    """Allan deviations of one axis; ``recent`` covers a shorter time, max(10 s, 16 τ) at each τ."""
+    """Allan deviations of one axis. ``recent`` uses only the last max(10 s, 16 τ) at each averaging time τ."""
 
     recent: DeviationCurve | UnsetType = UNSET
 
@@ -60,16 +60,16 @@ class CoefficientValue(msgspec.Struct, frozen=True):
     hi: float | None = None
     status: str = ""
     other: str | UnsetType | None = msgspec.field(name="or", default=UNSET)
-    """The other symbol of K and R, if the data do not show which of the two is present."""
+    """K for R, and R for K, if the data do not show which of the two is present."""
 
 
-class WindowMessage(
+class WindowResultMessage(
     Message,
     frozen=True,
     kw_only=True,
     rename={"rate_hz": "rate", "window_s": "window", "filled_s": "filled", "tau_s": "tau"},
 ):
-    """Message with results of the window."""
+    """Base class of messages with results of the window."""
 
     rate_hz: float | None = None
     window_s: float | None = None
@@ -78,7 +78,7 @@ class WindowMessage(
     """Filled part of the window."""
 
 
-class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema()):
+class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema()):
     """Message ``imu/<device>/allan``: Allan deviations of each measured axis."""
 
     topic = topics.ALLAN
@@ -91,8 +91,8 @@ class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.sc
         recent = result.display_curve
         axes = {
             axis: AllanAxis(
-                *deviation_columns(result.curve, i),
-                recent=UNSET if recent is None else DeviationCurve(*deviation_columns(recent, i)),
+                *deviations_with_interval_ends(result.curve, i),
+                recent=UNSET if recent is None else DeviationCurve(*deviations_with_interval_ends(recent, i)),
             )
             for i, axis in measured_axes(result.curve)
         }
@@ -100,7 +100,7 @@ class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.sc
         return cls(device=device, t=t, filled_s=filled_s, tau_s=result.curve.tau_s, axes=axes, **shared)
 
     def to_estimate(self, coefficients: Coefficients, k_or_r: frozenset[str]) -> Estimate:
-        """Build an estimate. Degrees of freedom and numbers of terms are not part of the message and are unknown.
+        """Build an estimate. Its degrees of freedom and numbers of terms are unknown, because the message lacks them.
 
         Parameters
         ----------
@@ -112,13 +112,13 @@ class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.sc
         Raises
         ------
         ValueError
-            If the averaging times do not increase from above zero, or if a curve has another length.
+            If the averaging times are not positive and increasing, or if a list has another length.
         """
         tau_s, m = self.tau_s, self.tau_s.size
         rate_hz, window_s, filled_s = self.rate_hz or 0.0, self.window_s or 0.0, self.filled_s or 0.0
         rising = tau_s.ndim == 1 and bool(np.all(tau_s > 0.0) and np.all(np.diff(tau_s) > 0.0))
         if not 0 < m <= MAX_AVERAGING_TIMES or not rising or not rate_hz > 0.0 or self.t is None:
-            raise ValueError("the averaging times must increase from above zero")
+            raise ValueError("the averaging times must be positive and increasing")
         deviation, lo, hi = (np.full((m, len(AXES)), np.nan) for _ in range(3))
         for i, axis in enumerate(AXES):
             if curve := self.axes.get(axis):
@@ -139,7 +139,7 @@ class AllanMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.ALLAN.sc
         )
 
 
-class CoefficientsMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema()):
+class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema()):
     """Message ``imu/<device>/coefficients``: Q, N, B, K and R of each measured axis."""
 
     topic = topics.COEFFICIENTS
@@ -186,7 +186,7 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Comparison of one axis with its model."""
 
     agrees: bool | None = None
-    """Current decision, with hysteresis: it changes later than ``gap`` crosses ``threshold``. None: not decided yet."""
+    """Decision with hysteresis. It changes later than ``gap`` crosses ``threshold``. None before the first decision."""
     gap: float
     where: TauRange
     ratio: float | None = None
@@ -197,8 +197,8 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     z: Floats | None = None
 
 
-class GapMessage(WindowMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
-    """Message ``imu/<device>/gap``: comparison of the measured deviations with the model in force."""
+class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
+    """Message ``imu/<device>/gap``: comparison of the measured Allan deviations with the noise model of the device."""
 
     topic = topics.GAP
     tau_s: Floats | None = None
@@ -231,7 +231,7 @@ class PredictedBias(msgspec.Struct, frozen=True):
 
 
 class AxisThermalValues(msgspec.Struct, frozen=True):
-    """Mean bias of one axis in an interval, and its predictions; ``text`` says why there is none."""
+    """Mean bias of one axis in an interval, and its predictions. ``text`` states why a prediction is missing."""
 
     bias: float | None
     error: float | None
@@ -251,7 +251,7 @@ class ThermalMessage(
     tag=topics.THERMAL.schema(),
     rename={"interval_s": "interval", "temperature_c": "temperature"},
 ):
-    """Message ``imu/<device>/thermal``: mean biases of an interval, which ends at ``t``, and their predictions."""
+    """Message ``imu/<device>/thermal``: mean biases of the interval that ends at ``t``, and their predictions."""
 
     topic = topics.THERMAL
     interval_s: float
@@ -259,7 +259,7 @@ class ThermalMessage(
     axes: dict[str, AxisThermalValues]
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: ThermalUpdate) -> Self:
+    def of(cls, device: str, t: float | None, samples: int, result: ThermalIntervalResult) -> Self:
         """Build the message from the result of the thermal model for an interval."""
         axes = {
             axis: AxisThermalValues(
@@ -284,8 +284,8 @@ class DeviationTable(msgspec.Struct, frozen=True, eq=False):
 
     @classmethod
     def of(cls, curve: TotalCurve | HadamardCurve) -> Self:
-        """Return the deviations of the axes that have at least one."""
-        curves = {axis: DeviationCurve(*deviation_columns(curve, i)) for i, axis in enumerate(AXES)}
+        """Return the deviations of all axes that have at least one deviation."""
+        curves = {axis: DeviationCurve(*deviations_with_interval_ends(curve, i)) for i, axis in enumerate(AXES)}
         return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
 
 
@@ -310,7 +310,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
     kind: str
     axis: str | None = None
     what: dict[str, dict[str, Any]] = msgspec.field(default_factory=dict)
-    """Values by coefficient, for example before and after a change."""
+    """Values by coefficient, such as the values before and after a change."""
     since: float | None = None
     """Unix time at which the reported condition began [s]."""
     sigma: float | None = None
@@ -333,7 +333,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode a message of another process; its texts are cleaned.
+        """Decode a message of another process. Control characters are removed from all texts.
 
         Raises
         ------
@@ -342,11 +342,11 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
         """
         found = decode_message(cls, payload)
         if found.t is None:
-            raise ValueError("an event without a time")
+            raise ValueError("the event has no time")
         return msgspec.structs.replace(found, kind=_clean(found.kind), text=_clean(found.text))
 
     def to_event(self) -> Event:
-        """Build an event with the changed coefficients, which are marked in plots."""
+        """Build an event with the changed coefficients."""
         values: dict[str, dict[str, float]] = {
             symbol: {side: value for side, value in self.what[symbol].items() if isinstance(value, float | int)}
             for symbol in SYMBOLS
@@ -402,7 +402,7 @@ class StatusMessage(
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode a message of another process; its texts are cleaned.
+        """Decode a message of another process. Control characters are removed from all texts.
 
         Raises
         ------
@@ -422,8 +422,8 @@ class StatusMessage(
         return Health(**known, latency_p50_s=self.latency.p50, latency_p99_s=self.latency.p99)
 
 
-class ResetMessage(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
-    """Reply to ``imu/<device>/command/reset``; the result is a text for the user."""
+class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
+    """Reply to ``imu/<device>/command/reset`` with a text for the user."""
 
     topic = topics.RESET
     text: str
@@ -434,8 +434,8 @@ class ResetMessage(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()
         return cls(device=device, t=t, samples=samples, text=result)
 
 
-class ReconcileMessage(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
-    """Head of the reply to ``imu/<device>/command/reconcile``; the keys of the report follow."""
+class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
+    """First keys of the reply to ``imu/<device>/command/reconcile``. The keys of the report follow."""
 
     topic = topics.RECONCILE
 
@@ -449,14 +449,16 @@ class ReconcileMessage(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.
         status
             Exit status of the command.
         folder
-            Folder that contains the complete report; None if the report was not saved.
+            Folder that contains the complete report. None if the report was not saved.
         """
         head = msgspec.to_builtins(self)
         keys = {key: value for key, value in report.items() if key not in head}
         return msgspec.json.encode({**head, **keys, "exit": status, "folder": folder})
 
 
-def coefficient_values(coefficients: Coefficients, axis: int, k_or_r: bool = False) -> dict[str, CoefficientValue]:
+def coefficient_values(
+    coefficients: Coefficients, axis: int, k_r_ambiguous: bool = False
+) -> dict[str, CoefficientValue]:
     """Return the coefficients of one axis by symbol, as in messages and in ``analyze --json``.
 
     Parameters
@@ -465,10 +467,10 @@ def coefficient_values(coefficients: Coefficients, axis: int, k_or_r: bool = Fal
         Coefficients of all axes.
     axis
         Column of the axis.
-    k_or_r
+    k_r_ambiguous
         True if either K or R is present and the data do not show which.
     """
-    other = {"K": "R", "R": "K"} if k_or_r else {}
+    other = {"K": "R", "R": "K"} if k_r_ambiguous else {}
     return {
         symbol: CoefficientValue(
             float(coefficients.value[row, axis]),
@@ -495,7 +497,7 @@ def event_start_s(unix_s: float, event: Event) -> float | None:
 
 
 def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -> Floats:
-    """Return the Allan variance of the estimated terms, shape [m, 6]; NaN on axes without estimated terms.
+    """Return the Allan variance of the estimated terms, shape [m, 6]. It is NaN on axes without estimated terms.
 
     Parameters
     ----------
@@ -512,7 +514,9 @@ def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -
     return total
 
 
-def deviation_columns(curve: AllanCurve | TotalCurve | HadamardCurve, axis: int) -> tuple[Floats, Floats, Floats]:
+def deviations_with_interval_ends(
+    curve: AllanCurve | TotalCurve | HadamardCurve, axis: int
+) -> tuple[Floats, Floats, Floats]:
     """Return the deviations of one axis and the ends of their intervals, each of shape [m].
 
     Parameters
@@ -533,7 +537,7 @@ def deviation_columns(curve: AllanCurve | TotalCurve | HadamardCurve, axis: int)
 
 
 def measured_axes(curve: AllanCurve) -> list[tuple[int, str]]:
-    """Return the column and name of each axis that has a curve."""
+    """Return the column and name of each axis with Allan variances."""
     return [(i, axis) for i, axis in enumerate(AXES) if not np.isnan(curve.avar[:, i]).all()]
 
 

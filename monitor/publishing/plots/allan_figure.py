@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 MARKERS: Final = ("o", "s", "^")
-MARKER_SIZES: Final = (8.2, 5.0, 3.8)  # points
-RING_SIZES: Final = (12.0, 8.5, 5.0)  # points
+MARKER_SIZES: Final = (5.0, 6.2, 7.4)  # points; a filled circle is visible inside an open square or triangle
+RING_SIZES: Final = (13.0, 10.5, 8.0)  # points
 FIT_DASHES: Final = ((0, (4, 8)), (4, (4, 8)), (8, (4, 8)))
 READING_TAU_S: Final = {"Q": 3.0**0.5, "N": 1.0, "K": 3.0, "R": 2.0**0.5}  # τ at which the term's deviation equals it
 LINE_TAU_S: Final = np.array([1e-6, 1e9])  # ends of the line of a term, beyond any plot
@@ -126,7 +126,8 @@ def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequ
         measured, longest_s = measured[valid], float(tau_s[valid][-1])
         draw_band(panel, tau_s[valid], lo, hi, COLOURS[number])
         panel.plot(tau_s, fitted, linestyle=FIT_DASHES[number], color=COLOURS[number], zorder=3)
-        style = {"color": COLOURS[number], "markersize": MARKER_SIZES[number], "mec": "white", "mew": 0.4}
+        style = {"color": COLOURS[number], "markersize": MARKER_SIZES[number], "mew": 1.1}
+        style["mfc"] = COLOURS[number] if number == 0 else "none"
         panel.plot(tau_s[valid], measured, MARKERS[number], label=axis, zorder=4, **style)  # type: ignore[arg-type]
         near_lo, near_hi = np.maximum(lo, measured / MAX_BAND_RATIO), np.minimum(hi, measured * MAX_BAND_RATIO)
         shown += [measured, fitted, near_lo, near_hi]

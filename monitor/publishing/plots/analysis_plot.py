@@ -39,7 +39,7 @@ TABLE_LEGEND: Final = (
 
 
 @dataclass(frozen=True, slots=True)
-class DrawnAnalysis:
+class AnalysisPlotData:
     """Analysis of a recording with everything that its plot and its report show."""
 
     analysis: Analysis
@@ -48,7 +48,7 @@ class DrawnAnalysis:
     marks: Sequence[ChangeMark] = ()  # changes to mark in the dynamic Allan deviation
 
 
-def save_analysis_plot(drawn: DrawnAnalysis, path: Path, title: str = "") -> None:
+def save_analysis_plot(drawn: AnalysisPlotData, path: Path, title: str = "") -> None:
     """Write the plot.
 
     Parameters

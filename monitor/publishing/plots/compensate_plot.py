@@ -1,11 +1,14 @@
-"""Plot of drift compensation, one row per axis: the drift over time, and the Allan deviation before and after."""
+"""Plot of drift compensation with one row per axis: drift over time, and Allan deviation before and after.
+
+The predicted drift of a long recording is averaged over groups of intervals, so that its 95 % band stays visible.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from drivers.sample import AXES
+from drivers.sample import AXES, Floats
 from monitor.common.distributions import Z95
 from monitor.common.units import DEVIATION_UNITS, format_duration
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
@@ -17,6 +20,8 @@ if TYPE_CHECKING:
 
 ROW_INCHES: Final = (11.0, 2.6)
 UNIT: Final = DEVIATION_UNITS["gyro"]
+MAX_LINE_POINTS: Final = 400  # a line with more points would cover its band and the measured means
+MEANS_ALPHA: Final = 0.6
 
 
 def save_compensation_plot(result: CompensationResult, path: Path) -> None:
@@ -56,14 +61,22 @@ def _draw_drift(panel: "Axes", axis: str, result: CompensationResult) -> None:
     mean = UNIT.factor * (mean - centre)
     expected = UNIT.factor * (np.array([one.expected[i] for one in result.intervals]) - centre)
     error = UNIT.factor * Z95 * np.array([one.known[i] for one in result.intervals])
-    label = f"means of {format_duration(result.interval_s)} at rest"
-    panel.plot(minutes, mean, ".", markersize=2, color=style.GREY, label=label, rasterized=True)
-    style.draw_band(panel, minutes, expected - error, expected + error, colour, alpha=0.25)
-    panel.plot(minutes, expected, color=colour, label="predicted drift, 95 %")
     limit = 1.1 * np.nanmax(np.abs([mean, expected])) if used.any() else 1.0
+    label = f"means of {format_duration(result.interval_s)} at rest"
+    points = {"markersize": 2.5, "markeredgewidth": 0, "alpha": MEANS_ALPHA}
+    panel.plot(minutes, mean, ".", color=style.GREY, label=label, rasterized=True, **points)  # type: ignore[arg-type]
+    size = -(-minutes.size // MAX_LINE_POINTS)
+    minutes, expected, error = (_average_groups(values, size) for values in (minutes, expected, error))
+    style.draw_band(panel, minutes, expected - error, expected + error, colour, alpha=0.4, label="95 %", zorder=2)
+    panel.plot(minutes, expected, color=colour, linewidth=1.0, label="predicted drift", zorder=3)
     panel.set_ylim(-limit, limit)
     panel.set_ylabel(f"{axis} minus its median, {UNIT.name}")
-    style.draw_legend_above(panel, 2, fontsize=7.5, markerscale=3.0)
+    style.draw_legend_above(panel, 3, fontsize=7.5, markerscale=3.0)
+
+
+def _average_groups(values: Floats, size: int) -> Floats:
+    """Return the means of groups of ``size`` values; an incomplete last group is omitted."""
+    return np.asarray(values[: values.size // size * size].reshape(-1, size).mean(axis=1))
 
 
 def _draw_allan_deviation(panel: "Axes", axis: str, one: AxisCompensation) -> None:

@@ -19,10 +19,10 @@ from monitor.publishing.reports.reconcile_sentences import (
     diagnostic_name,
     field_unit,
     format_range,
-    gap_ratio,
+    gap_to_threshold_ratio,
     readable_name,
 )
-from monitor.reconcile.result import Location, ParameterInterval, PlotData, Score
+from monitor.reconcile.result import DiagnosticGap, Location, ParameterInterval, PlotData
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -64,15 +64,15 @@ class DiagnosticPlot:
     mark_label: str
 
 
-def diagnostic_svg(
-    views: Sequence[tuple[str, PlotData]], axis: str, width: float, height: float, where: Location | None = None
+def compared_diagnostic_svg(
+    model_panels: Sequence[tuple[str, PlotData]], axis: str, width: float, height: float, where: Location | None = None
 ) -> str:
     """Draw one diagnostic, one panel for each model, and return it as an SVG element.
 
     Parameters
     ----------
-    views
-        Title and data of each panel.
+    model_panels
+        Title and data of each panel, one for each model.
     axis
         Name of the axis.
     width, height
@@ -80,7 +80,9 @@ def diagnostic_svg(
     where
         Range to mark in the first panel.
     """
-    plots = [to_field_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(views)]
+    plots = [
+        to_field_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(model_panels)
+    ]
     limits = value_limits(plots)
     left, right, top, bottom = MARGINS_INCHES
     share = width / len(plots)
@@ -106,10 +108,10 @@ def select_view(views: Sequence[PlotData], lens: str, where: Location) -> PlotDa
         Range that the diagnostic found.
     """
     own = [view for view in views if view.lens == lens]
-    return next(iter(own or [view for view in views if range_along(view, where) is not None]), None)
+    return next(iter(own or [view for view in views if range_on_x_axis(view, where) is not None]), None)
 
 
-def range_along(view: PlotData, where: Location) -> tuple[float, float] | None:
+def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | None:
     """Return the part of a range that lies along the x axis of a diagnostic, in the diagnostic's unit.
 
     Parameters
@@ -143,7 +145,7 @@ def detail_view(view: PlotData, where: Location) -> PlotData | None:
     where
         The range.
     """
-    at = range_along(view, where)
+    at = range_on_x_axis(view, where)
     if at is None or view.x.size < 2:
         return None
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -184,7 +186,7 @@ def to_field_units(title: str, view: PlotData, axis: str, where: Location | None
     if view.x_name == "time" and not view.log:
         x_name, seconds = style.time_unit(float(np.ptp(view.x)))
         factor = 1.0 / seconds
-    mark = None if where is None else range_along(view, where)
+    mark = None if where is None else range_on_x_axis(view, where)
     measured, expected, lo, hi = (line * y_unit.factor for line in (view.measured, view.expected, view.lo, view.hi))
     return DiagnosticPlot(
         title=title,
@@ -253,7 +255,7 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[
     panel.set_title(plot.y_label, loc="left", fontsize=9, color=style.GREY)
 
 
-def gap_chart_svg(before: Sequence[Score], after: Sequence[Score] = ()) -> str:
+def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap] = ()) -> str:
     """Draw the gap of each diagnostic divided by its threshold, and return the chart as an SVG element.
 
     Parameters
@@ -270,8 +272,8 @@ def gap_chart_svg(before: Sequence[Score], after: Sequence[Score] = ()) -> str:
         ratios = [1.0]
         for y, score in enumerate(before):
             scores = [score] + ([later[score.lens]] if score.lens in later else [])
-            x = [max(gap_ratio(one), MIN_GAP_RATIO) for one in scores]
-            colours = [ABOVE_THRESHOLD_COLOUR if one.passes else BELOW_THRESHOLD_COLOUR for one in scores]
+            x = [max(gap_to_threshold_ratio(one), MIN_GAP_RATIO) for one in scores]
+            colours = [ABOVE_THRESHOLD_COLOUR if one.is_significant else BELOW_THRESHOLD_COLOUR for one in scores]
             panel.plot(x, [y] * len(x), color=style.GREY, linewidth=1.4, zorder=2)
             if len(x) > 1:
                 panel.plot(x[0], y, "o", mfc="white", mec=colours[0], mew=1.4, markersize=6)

@@ -202,7 +202,7 @@ def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: 
         values.append(value)
         ends.append((lo, hi))
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    style.set_value_limits(panel, low, high, 0.25)
+    style.set_value_scale(panel, low, high, 0.25)
     if not (low > 0 and high > style.LOG_SCALE_RATIO * low):
         lowest, highest = np.nanquantile(ends, [1.0 - BAND_ENDS_INSIDE, BAND_ENDS_INSIDE]).tolist()
         bottom, top = panel.get_ylim()

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import NotReady
-from drivers.quantities import DAY_S
+from drivers.number_ranges import DAY_S
 from drivers.sample import AXES, Floats
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
 from monitor.estimation.fit.coefficients import SYMBOLS
@@ -119,7 +119,7 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
         lows.append(np.nanmin(low))
         highs.append(np.nanmax(high))
     if lows:
-        style.set_value_limits(panel, float(min(lows)), float(max(highs)), 0.15)
+        style.set_value_scale(panel, float(min(lows)), float(max(highs)), 0.15)
         panel.legend(loc="upper left", ncols=3, fontsize=style.SMALL_TEXT, frameon=True, edgecolor="none")
     else:
         _draw_absence(panel, "never estimated")

@@ -239,7 +239,7 @@ def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
     panel.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=columns, **options)
 
 
-def set_value_limits(panel: "Axes", low: float, high: float, margin: float) -> None:
+def set_value_scale(panel: "Axes", low: float, high: float, margin: float) -> None:
     """Set the limits of the y axis of a positive quantity, with a logarithmic scale if its values differ much.
 
     Parameters

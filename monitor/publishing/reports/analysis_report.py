@@ -21,7 +21,7 @@ from monitor.publishing.coefficient_cells import (
     mark_temperature_axis,
 )
 from monitor.publishing.plots.allan_figure import LEGEND_TEXT, draw_allan_panel
-from monitor.publishing.plots.analysis_plot import DrawnAnalysis, is_k_or_r, measured_kinds
+from monitor.publishing.plots.analysis_plot import AnalysisPlotData, is_k_or_r, measured_kinds
 from monitor.publishing.plots.dynamic_figure import draw_dynamic_panels, height_inches
 from monitor.publishing.plots.style import axis_colour, create_figure, figure_style, svg_element
 from monitor.publishing.reports.html_page import render_template
@@ -30,7 +30,7 @@ ALLAN_INCHES: Final = (7.2, 5.2)
 STATUS_TEXTS: Final = {Status.UPPER_BOUND: "(upper bound)", Status.UNESTIMATED: "(too few data)"}
 
 
-def write_html_report(drawn: DrawnAnalysis, path: Path, title: str = "") -> None:
+def write_html_report(drawn: AnalysisPlotData, path: Path, title: str = "") -> None:
     """Write the page to a file.
 
     Parameters
@@ -54,7 +54,7 @@ def write_html_report(drawn: DrawnAnalysis, path: Path, title: str = "") -> None
         raise ConfigError(f"cannot write the report {path}: {error}") from error
 
 
-def render_page(drawn: DrawnAnalysis, title: str = "") -> str:
+def render_page(drawn: AnalysisPlotData, title: str = "") -> str:
     """Return the page as text. The parameters and errors are those of ``write_html_report``."""
     analysis = drawn.analysis
     return render_template(
@@ -106,7 +106,7 @@ def format_cell(estimate: Estimate, letter: str, axis: str) -> tuple[str, str]:
     return value, STATUS_TEXTS.get(status, text.interval)
 
 
-def _part(drawn: DrawnAnalysis, kind: Kind) -> dict[str, Any]:
+def _part(drawn: AnalysisPlotData, kind: Kind) -> dict[str, Any]:
     """Return the values of the template for one kind of sensor."""
     name, heat_maps = KIND_NAMES[kind], ""
     with figure_style():

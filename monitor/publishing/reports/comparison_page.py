@@ -12,7 +12,7 @@ from monitor.publishing.plots.style import axis_colour
 from monitor.publishing.reports import comparison_sentences, reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
 from monitor.publishing.reports.reconcile_sentences import Parameter, parameter_unit, readable_name
-from monitor.reconcile.result import ReconciliationStep
+from monitor.reconcile.result import AddedOrResizedEffect
 from monitor.reconcile.several_recordings.comparison import Comparison, MatchedEffect
 
 
@@ -39,12 +39,12 @@ def render_page(c: Comparison) -> str:
     )
 
 
-def _rows(seen: MatchedEffect) -> list[tuple[str, ReconciliationStep]]:
+def _rows(seen: MatchedEffect) -> list[tuple[str, AddedOrResizedEffect]]:
     """Return the name and the step of each recording, and of all recordings together."""
-    return [*seen.steps.items(), ("all together", seen.step())]
+    return [*seen.steps.items(), ("all together", seen.pooled_step())]
 
 
-def _parameters_by_name(c: Comparison, step: ReconciliationStep, axis: str) -> dict[str, Parameter]:
+def _parameters_by_name(c: Comparison, step: AddedOrResizedEffect, axis: str) -> dict[str, Parameter]:
     """Return the text of each parameter of a step."""
     return {one.name: one for one in reconcile_sentences.format_parameters(step, axis, c.baseline)}
 

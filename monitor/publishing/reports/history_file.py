@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.recordings.formats import format_for_path
+from drivers.recordings.formats import find_format
 from drivers.recordings.writing import atomic_write_path
 from drivers.sample import Floats
 from monitor.common.units import sensor_kind
@@ -37,7 +37,7 @@ def save_history(past: HistoryTable, path: Path) -> None:
         If the suffix is unknown or the file cannot be written.
     """
     columns = history_columns(past)
-    begin = format_for_path(path).open_writer
+    begin = find_format(path).open_writer
     with atomic_write_path(path) as part, begin(part, list(columns)) as append:
         append(columns)
 

@@ -14,10 +14,10 @@ from drivers.sample import AXES
 from monitor.common.units import format_duration
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots import diagnostic_figure, style
-from monitor.publishing.plots.diagnostic_figure import detail_view, diagnostic_svg, select_view
+from monitor.publishing.plots.diagnostic_figure import compared_diagnostic_svg, detail_view, select_view
 from monitor.publishing.reports import reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
-from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, PlotData, Reconciliation, Score
+from monitor.reconcile.result import AxisResult, DiagnosticGap, DiagnosticSnapshot, PlotData, Reconciliation
 
 RANGE_INCHES: Final = (8.0, 3.3)  # plot of a range in its diagnostic, without a detail plot
 RANGE_WITH_DETAIL_INCHES: Final = (4.9, 3.3)  # the same plot next to a detail plot
@@ -57,7 +57,7 @@ def render_page(r: Reconciliation, title: str = "") -> str:
         effects=EFFECTS,
         figures=diagnostic_figure,
         colours=style,
-        snapshots=lambda result: [result.start, *(step.look for step in result.steps)],
+        snapshots=lambda result: [result.start, *(step.snapshot_after for step in result.steps)],
         pair_scores=_pair_scores,
         scores_by_diagnostic=_scores_by_diagnostic,
         draw_range=_draw_range,
@@ -66,40 +66,44 @@ def render_page(r: Reconciliation, title: str = "") -> str:
     )
 
 
-def _pair_scores(before: Sequence[Score], after: Sequence[Score]) -> list[tuple[Score, Score | None]]:
+def _pair_scores(
+    before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap]
+) -> list[tuple[DiagnosticGap, DiagnosticGap | None]]:
     """Return each score with the score of the same diagnostic after a step; None if there is none."""
     later = {score.lens: score for score in after}
     return [(score, later.get(score.lens)) for score in before]
 
 
-def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list[Score | None]]]:
+def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list[DiagnosticGap | None]]]:
     """Return each diagnostic with the scores of the first model, one for each axis; None if an axis has no score."""
-    known = [{score.lens: score for score in result.start.scores} for result in results]
+    known = [{score.lens: score for score in result.start.gaps} for result in results]
     return [(lens, [scores.get(lens) for scores in known]) for lens in dict.fromkeys(one for k in known for one in k)]
 
 
 def _draw_single(view: PlotData, axis: str) -> str:
     """Draw one diagnostic with one model."""
-    return diagnostic_svg([("", view)], axis, *SINGLE_INCHES)
+    return compared_diagnostic_svg([("", view)], axis, *SINGLE_INCHES)
 
 
 def _draw_pairs(before: DiagnosticSnapshot, after: DiagnosticSnapshot, axis: str) -> list[str]:
     """Draw each diagnostic before and after a step."""
-    later = {view.lens: view for view in after.views}
+    later = {view.lens: view for view in after.plots}
     return [
-        diagnostic_svg([("before", view), ("after", later[view.lens])], axis, *PAIR_INCHES)
-        for view in before.views
+        compared_diagnostic_svg([("before", view), ("after", later[view.lens])], axis, *PAIR_INCHES)
+        for view in before.plots
         if view.lens in later
     ]
 
 
-def _draw_range(snapshot: DiagnosticSnapshot, found: Score, axis: str) -> list[str]:
+def _draw_range(snapshot: DiagnosticSnapshot, found: DiagnosticGap, axis: str) -> list[str]:
     """Draw the diagnostic that shows a range best, and a detail plot if the range is narrow."""
-    view = select_view(snapshot.views, found.lens, found.where)
+    view = select_view(snapshot.plots, found.lens, found.where)
     if view is None:
         return []
     detail = detail_view(view, found.where)
     if detail is None:
-        return [diagnostic_svg([("", view)], axis, *RANGE_INCHES, where=found.where)]
-    whole = diagnostic_svg([("", view)], axis, *RANGE_WITH_DETAIL_INCHES, where=replace(found.where, source=None))
-    return [whole, diagnostic_svg([("", detail)], axis, *DETAIL_INCHES, where=found.where)]
+        return [compared_diagnostic_svg([("", view)], axis, *RANGE_INCHES, where=found.where)]
+    whole = compared_diagnostic_svg(
+        [("", view)], axis, *RANGE_WITH_DETAIL_INCHES, where=replace(found.where, source=None)
+    )
+    return [whole, compared_diagnostic_svg([("", detail)], axis, *DETAIL_INCHES, where=found.where)]

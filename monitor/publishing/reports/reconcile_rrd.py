@@ -28,11 +28,11 @@ from monitor.publishing.rerun.allan_chart import (
     HEIGHT,
     WIDTH,
     Scale,
-    band,
-    clip,
-    decades,
+    band_strokes,
+    clip_to_box,
+    decade_range,
     finite_sections,
-    grid,
+    grid_lines,
 )
 from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation
 
@@ -118,7 +118,7 @@ def _steps_text(r: Reconciliation, result: AxisResult) -> str:
             f"**Step {count}: {step.kind} {words.readable_name(step.effect)}** "
             f"({words.format_probability(step.confidence)})",
             "\n".join(f"- {words.readable_name(one.name)} **{one.short}**" for one in known),
-            f"{words.diagnostic_name(step.found.lens)}, {words.format_range(step.found.where, result.axis)}: gap "
+            f"{words.diagnostic_name(step.before.lens)}, {words.format_range(step.before.where, result.axis)}: gap "
             f"**{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}**, "
             f"threshold {words.format_gap(step.after.threshold)}",
             step.because,
@@ -136,12 +136,12 @@ def _axes(r: Reconciliation) -> list[str]:
 
 def _snapshots_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
     """Return the diagnostics with the first model and after each step; the last one excludes withdrawn effects."""
-    return [result.start, *(step.look for step in result.steps[:-1]), *([result.end] if result.steps else [])]
+    return [result.start, *(step.snapshot_after for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
 def _drawn_diagnostics(result: AxisResult) -> list[str]:
     """Return the logarithmic diagnostics of an axis that are drawn."""
-    return [view.lens for view in result.start.views if view.log][:MAX_PLOTTED_DIAGNOSTICS]
+    return [view.lens for view in result.start.plots if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
 
 def _tab(result: AxisResult) -> rrb.Container:
@@ -190,7 +190,8 @@ def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult)
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
     """Log the gap of each diagnostic relative to its threshold, for the largest gaps, and the threshold, which is 1."""
     snapshots = [
-        {score.lens: words.gap_ratio(score) for score in snapshot.scores} for snapshot in _snapshots_by_step(result)
+        {score.lens: words.gap_to_threshold_ratio(score) for score in snapshot.gaps}
+        for snapshot in _snapshots_by_step(result)
     ]
     path = f"{result.axis}/gap"
     largest = sorted(snapshots[0], key=lambda lens: -max(snapshot.get(lens, 0.0) for snapshot in snapshots))
@@ -213,11 +214,11 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
     """Log both plots of one diagnostic with the same scale."""
     axis = result.axis
     views = [
-        next((view for view in snapshot.views if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
+        next((view for view in snapshot.plots if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
     ]
     plots = {step: to_field_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
-    scale = Scale(decades(plot.x for plot in every), decades([np.array(value_limits(every))]))
+    scale = Scale(decade_range(plot.x for plot in every), decade_range([np.array(value_limits(every))]))
     for when in ("before", "after") if result.steps else ("before",):
         _log_grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
     stream.reset_time()
@@ -235,7 +236,7 @@ def _log_curves(
     # A lower end of zero has no logarithm; it is drawn below the box.
     low, high = (scale.to_chart(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
     fill = rr.LineStrips2D(
-        list(band(low, high)), colors=[BAND_COLOUR], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0
+        list(band_strokes(low, high)), colors=[BAND_COLOUR], radii=[WIDTH / FILL_STEPS / 2], draw_order=-20.0
     )
     stream.log(f"{path}/band", fill, static=static)
     colour, at = colours.AXIS_COLOURS[axis], _inside(scale.to_chart(plot.x, plot.measured))
@@ -255,8 +256,8 @@ def _log_curves(
 
 def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, result: AxisResult, lens: str) -> None:
     """Log a frame around each range in which this diagnostic found a gap."""
-    view = next(view for view in result.start.views if view.lens == lens)
-    founds = [step.found for step in result.steps] + list(result.left_over)
+    view = next(view for view in result.start.plots if view.lens == lens)
+    founds = [step.before for step in result.steps] + list(result.left_over)
     marks = [to_field_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
     bounds = [mark.mark for mark in marks if mark.mark is not None]
     if not bounds:
@@ -270,7 +271,7 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, resul
 
 def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str) -> None:
     """Log frame, decade lines, labels and the key to the curves."""
-    lines = grid(scale)
+    lines = grid_lines(scale)
     for name, strips, colour, order in (
         ("minor", lines.minor, colours.MINOR, -30.0),
         ("major", lines.major, colours.MAJOR, -29.0),
@@ -296,7 +297,7 @@ def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Diagnos
 
 def _inside(at: Floats) -> Floats:
     """Limit a curve to the box; outside values are drawn on its edge."""
-    return np.column_stack([at[:, 0], clip(at[:, 1])])
+    return np.column_stack([at[:, 0], clip_to_box(at[:, 1])])
 
 
 def _markdown(text: str) -> rr.TextDocument:

@@ -24,11 +24,18 @@ from monitor.common.units import (
     format_number,
     sensor_kind,
 )
-from monitor.noise.effect import parameter_units
+from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
 from monitor.publishing.exporters.noise import COEFFICIENT_EFFECTS
-from monitor.reconcile.result import AxisResult, Location, ParameterInterval, Reconciliation, ReconciliationStep, Score
+from monitor.reconcile.result import (
+    AddedOrResizedEffect,
+    AxisResult,
+    DiagnosticGap,
+    Location,
+    ParameterInterval,
+    Reconciliation,
+)
 
 RESULT_TEXTS: Final = {
     "agrees": "agrees",
@@ -46,7 +53,7 @@ _DEGREES_PER_HOUR: Final = DEVIATION_UNITS["gyro"].factor  # °/h per rad/s
 _SI_OF_COEFFICIENTS: Final = {
     si: COEFFICIENT_UNITS[kind][letter]
     for letter, effect in COEFFICIENT_EFFECTS.items()
-    for kind, si in zip(KINDS, parameter_units(effect)[letter], strict=True)
+    for kind, si in zip(KINDS, gyro_and_accel_units(effect)[letter], strict=True)
 }
 FIELD_UNITS: Final = {
     **_SI_OF_COEFFICIENTS,
@@ -146,7 +153,7 @@ def format_range(where: Location, axis: str) -> str:
         Name of the axis, which selects the units.
     """
     texts = []
-    for name, ends in where.found().items():
+    for name, ends in where.resolved_dimensions().items():
         if isinstance(ends, str):
             texts.append(f"from {ends}")
             continue
@@ -160,7 +167,7 @@ def format_range(where: Location, axis: str) -> str:
     return ", ".join(texts) or "everywhere"
 
 
-def describe_gap(one: Score, axis: str) -> str:
+def describe_gap(one: DiagnosticGap, axis: str) -> str:
     """Return one line with the diagnostic, its range, its gap and its threshold.
 
     Parameters
@@ -185,13 +192,13 @@ def format_gap(size: float) -> str:
     return f"{size:.2f}" if size < 10.0 else f"{size:.1f}"
 
 
-def gap_ratio(one: Score) -> float:
+def gap_to_threshold_ratio(one: DiagnosticGap) -> float:
     """Return gap divided by threshold; 0 if the ratio is not finite."""
     share = one.gap / one.threshold if one.threshold > 0.0 else 0.0
     return share if isfinite(share) else 0.0
 
 
-def format_parameters(step: ReconciliationStep, axis: str, baseline: NoiseModel) -> tuple[Parameter, ...]:
+def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> tuple[Parameter, ...]:
     """Return the text of all parameters of a step; for a changed term, also its value in the model under test.
 
     Parameters
@@ -211,7 +218,7 @@ def format_parameters(step: ReconciliationStep, axis: str, baseline: NoiseModel)
     )
 
 
-def describe_step(step: ReconciliationStep, axis: str, baseline: NoiseModel) -> str:
+def describe_step(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> str:
     """Return one line with an effect and its parameters.
 
     Example: "sinusoidal: amplitude 30.94 ± 0.55 °/h, frequency 17.30000 ± 0.00010 Hz".
@@ -260,7 +267,7 @@ def describe_result(result: AxisResult) -> str:
             return "Model and measurement differ. No known effect explains the difference, so no effect is named."
 
 
-def describe_alternatives(step: ReconciliationStep) -> str:
+def describe_alternatives(step: AddedOrResizedEffect) -> str:
     """Return a sentence on the effects that were also tried, with their probabilities."""
     if not step.runners_up:
         return "No other effect explains the gap nearly as well."
@@ -268,7 +275,7 @@ def describe_alternatives(step: ReconciliationStep) -> str:
     return f"Less likely explanations of the same gap: {_join(tried)}."
 
 
-def describe_held_out_gap(step: ReconciliationStep) -> str:
+def describe_held_out_gap(step: AddedOrResizedEffect) -> str:
     """Return how the gap changed on the held-out data, which were not used to choose the effect."""
     before, after = step.held_out_before, step.held_out_after
     if before is None or after is None:
@@ -290,7 +297,7 @@ def parameter_unit(effect: str, name: str, axis: str, size: float) -> Unit:
     size
         Size of the value in the SI unit.
     """
-    si = parameter_units(EFFECTS[effect])[name][KINDS.index(sensor_kind(axis))]
+    si = gyro_and_accel_units(EFFECTS[effect])[name][KINDS.index(sensor_kind(axis))]
     return UNITS_BY_NAME.get(name) or field_unit(si, size)
 
 
@@ -339,7 +346,7 @@ def _short(value: float) -> str:
     return text.replace("-", "−", 1) if value < 0.0 else text
 
 
-def _count_steps(steps: Sequence[ReconciliationStep]) -> list[str]:
+def _count_steps(steps: Sequence[AddedOrResizedEffect]) -> list[str]:
     """Return the numbers of added effects and of changed terms, with their names."""
     texts = []
     for kind, noun in (("added", "added effect"), ("retuned", "retuned term")):

@@ -46,10 +46,10 @@ class Scale:
         return np.column_stack([across, down])
 
 
-def decades(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tuple[int, int]:
+def decade_range(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tuple[int, int]:
     """Return the exponents of the decades that contain all positive finite numbers.
 
-    >>> decades([np.array([0.02, 300.0])])
+    >>> decade_range([np.array([0.02, 300.0])])
     (-2, 3)
 
     Parameters
@@ -67,7 +67,7 @@ def decades(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tuple[in
     return low, max(high, low + least)
 
 
-def clip(y: Floats) -> Floats:
+def clip_to_box(y: Floats) -> Floats:
     """Limit heights to the box, because an interval may extend far below the plot."""
     return np.clip(y, 0.0, HEIGHT)
 
@@ -98,7 +98,7 @@ def dash_line(line: Floats, length: float = 0.22) -> list[Floats]:
     return [points[i : i + 2] for i in range(0, len(points) - 1, 2)]
 
 
-def band(low: Floats, high: Floats) -> Floats:
+def band_strokes(low: Floats, high: Floats) -> Floats:
     """Return vertical strokes that fill the area between two curves, shape [FILL_STEPS, 2, 2].
 
     Parameters
@@ -112,7 +112,7 @@ def band(low: Floats, high: Floats) -> Floats:
     low, high = low[good], high[good]
     half = (low[-1, 0] - low[0, 0]) / FILL_STEPS / 2
     x = np.linspace(low[0, 0] + half, low[-1, 0] - half, FILL_STEPS)
-    bottom, top = (clip(np.interp(x, edge[:, 0], edge[:, 1])) for edge in (low, high))
+    bottom, top = (clip_to_box(np.interp(x, edge[:, 0], edge[:, 1])) for edge in (low, high))
     return np.stack([np.column_stack([x, bottom]), np.column_stack([x, top])], axis=1)
 
 
@@ -126,7 +126,7 @@ def interval_strokes(low: Floats, high: Floats) -> Floats:
     """
     good = np.isfinite(low).all(axis=1) & np.isfinite(high).all(axis=1)
     strokes = np.stack([low[good], high[good]], axis=1)
-    strokes[:, :, 1] = clip(strokes[:, :, 1])
+    strokes[:, :, 1] = clip_to_box(strokes[:, :, 1])
     return strokes
 
 
@@ -140,7 +140,7 @@ class Grid:
     ticks: list[tuple[float, float, str]]  # x, y, label
 
 
-def grid(scale: Scale) -> Grid:
+def grid_lines(scale: Scale) -> Grid:
     """Return decade lines, fainter lines at 2 … 9, and labels below and to the left of the box."""
     x_at, x_minor = _line_positions(scale.x, WIDTH)
     y_at, y_minor = _line_positions(scale.y, HEIGHT)

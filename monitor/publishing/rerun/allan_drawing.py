@@ -22,11 +22,11 @@ from monitor.publishing.rerun.allan_chart import (
     HEIGHT,
     WIDTH,
     Scale,
-    band,
+    band_strokes,
     dash_line,
-    decades,
+    decade_range,
     finite_sections,
-    grid,
+    grid_lines,
     interval_strokes,
 )
 
@@ -64,7 +64,10 @@ class AllanPlot:
             curves = [curve for axis in axes_of(kind) if (curve := _Curve.of(estimate, axis, gap)) is not None]
             if not curves:
                 continue
-            scale = Scale(decades(one.tau for one in curves), decades(part for one in curves for part in one.shown))
+            scale = Scale(
+                decade_range(one.tau for one in curves),
+                decade_range(part for one in curves for part in one.curves_for_height),
+            )
             if self._scales.get(kind) != scale:
                 self._scales[kind] = scale
                 self._draw_grid(kind, scale, [one.axis for one in curves])
@@ -73,7 +76,7 @@ class AllanPlot:
 
     def _draw_grid(self, kind: Kind, scale: Scale, axes: Sequence[str]) -> None:
         """Log frame, decade lines and tick labels of a plot, and a legend above the right end of the box."""
-        path, lines = f"{self._path}/{kind}", grid(scale)
+        path, lines = f"{self._path}/{kind}", grid_lines(scale)
         for name, strips, colour, order in (
             ("minor", lines.minor, colours.MINOR, -30.0),
             ("major", lines.major, colours.MAJOR, -29.0),
@@ -97,7 +100,7 @@ class AllanPlot:
             scale.to_chart(curve.tau, part) for part in (curve.lo, curve.hi, curve.fitted, curve.model, curve.deviation)
         )
         fill = rr.LineStrips2D(
-            list(band(low, high)),
+            list(band_strokes(low, high)),
             colors=[colours.blend(colour, 0.22)],
             radii=[WIDTH / FILL_STEPS / 2],
             draw_order=-20.0,
@@ -132,7 +135,7 @@ class _Curve:
     si: dict[str, Floats]
 
     @property
-    def shown(self) -> tuple[Floats, ...]:
+    def curves_for_height(self) -> tuple[Floats, ...]:
         """Curves that determine the height of the plot; intervals may extend beyond it."""
         return self.deviation, self.fitted, self.model
 

@@ -38,7 +38,7 @@ class AllanHistory:
         self._sums: Floats = np.zeros((self.tau_s.size, len(AXES)))
         self._counts: Ints = np.zeros((self.tau_s.size, len(AXES)), np.int64)
 
-    def add(self, wall_s: float, estimate: Estimate) -> bool:
+    def add_estimate(self, wall_s: float, estimate: Estimate) -> bool:
         """Add an estimate, and return True if it completes a column.
 
         Parameters
@@ -74,7 +74,7 @@ class AllanHistory:
         self.ends_s = self.ends_s[1::2]
         self.column_s *= 2.0
 
-    def relative(self) -> Floats:
+    def log_ratio_to_median(self) -> Floats:
         """Return ln(deviation / median over time), shape [columns, m, 6]; NaN if there is no deviation."""
         whole = np.stack(self._columns) if self._columns else np.empty((0, self.tau_s.size, len(AXES)))
         there = np.isfinite(whole).any(axis=0)

@@ -14,11 +14,11 @@ from rerun.blueprint.encodings import TimelineColumn
 
 from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, KIND_NAMES, KINDS, SAMPLE_UNITS, Kind, axes_of
 from monitor.publishing.plots import colours
-from monitor.publishing.rerun import dynamic_surface
+from monitor.publishing.rerun import dynamic_heat_map
 from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH
 from monitor.publishing.rerun.scene import PANELS
 from monitor.publishing.rerun.viewer_settings import DeviceInfo
-from monitor.publishing.rerun.views import RAW_SAMPLES_S, TIMELINE, temperature_series, time_series
+from monitor.publishing.rerun.views import RAW_SAMPLES_S, TIMELINE, temperature_view, time_series_view
 
 NOW_COEFFICIENTS: Final = ("N", "B")
 DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")
@@ -57,7 +57,7 @@ def blueprint(devices: Sequence[DeviceInfo], fleet: bool = False) -> rrb.Bluepri
 
 def _device(device: DeviceInfo) -> rrb.Container:
     """Return the tabs of one device."""
-    tabs = [tab for panel in PANELS if (tab := panel.tab(device)) is not None]
+    tabs = [tab for panel in PANELS if (tab := panel.tab_layout(device)) is not None]
     return rrb.Tabs(_now(device), _dynamic(device.name), *tabs, active_tab=0, name=device.name)
 
 
@@ -74,7 +74,7 @@ def _now(device: DeviceInfo) -> rrb.Container:
         (5.0, rrb.Horizontal(*(_allan(name, kind) for kind in KINDS))),
         (2.2, rrb.Horizontal(*(_coefficient(name, kind, symbol) for kind in KINDS for symbol in NOW_COEFFICIENTS))),
         (1.6, rrb.Horizontal(*(_gap(name, kind) for kind in KINDS))),
-        (2.2, rrb.Horizontal(*(_raw(name, kind) for kind in KINDS), temperature_series(name), column_shares=[2, 2, 1])),
+        (2.2, rrb.Horizontal(*(_raw(name, kind) for kind in KINDS), temperature_view(name), column_shares=[2, 2, 1])),
     ]
     if not device.has_model:
         del rows[2]
@@ -132,7 +132,7 @@ def _event_log(origin: str) -> rrb.View:
 
 def _surface(device: str, axis: str) -> rrb.View:
     """Return the view of the Allan surface of one axis."""
-    x, y = dynamic_surface.bounds(TYPICAL_TAU_COUNT)
+    x, y = dynamic_heat_map.view_bounds(TYPICAL_TAU_COUNT)
     return rrb.Spatial2DView(
         origin=f"/{device}/dynamic/{axis}",
         contents="$origin/**",
@@ -158,24 +158,24 @@ def _allan(device: str, kind: Kind, prefix: str = "") -> rrb.View:
 def _coefficient(device: str, kind: Kind, symbol: str) -> rrb.View:
     """Return the view of one coefficient over time."""
     name = f"{SHORT_KIND_NAMES[kind]} {symbol}, {COEFFICIENT_UNITS[kind][symbol].name}"
-    return time_series(f"/{device}/coefficients/{symbol}", name, [f"$origin/{axis}/**" for axis in axes_of(kind)])
+    return time_series_view(f"/{device}/coefficients/{symbol}", name, [f"$origin/{axis}/**" for axis in axes_of(kind)])
 
 
 def _raw(device: str, kind: Kind) -> rrb.View:
     """Return the view of the raw samples."""
     name = f"{KIND_NAMES[kind]}: samples, {SAMPLE_UNITS[kind].name}"
     contents = [f"$origin/{axis}" for axis in axes_of(kind)]
-    return time_series(f"/{device}/samples", name, contents, RAW_SAMPLES_S, legend=True)
+    return time_series_view(f"/{device}/samples", name, contents, RAW_SAMPLES_S, legend=True)
 
 
 def _gap(device: str, kind: Kind) -> rrb.View:
     """Return the view of the gap to the model."""
     name = f"{KIND_NAMES[kind]}: gap to the model, σ, and its threshold"
     contents = ["$origin/threshold", *(f"$origin/{axis}" for axis in axes_of(kind))]
-    return time_series(f"/{device}/gap", name, contents)
+    return time_series_view(f"/{device}/gap", name, contents)
 
 
-def send(stream: rr.RecordingStream, devices: Sequence[DeviceInfo], fleet: bool = False) -> None:
+def send_layout(stream: rr.RecordingStream, devices: Sequence[DeviceInfo], fleet: bool = False) -> None:
     """Send the layout to the viewer of a stream and activate it.
 
     Parameters

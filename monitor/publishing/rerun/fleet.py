@@ -19,7 +19,7 @@ from monitor.publishing.messages.results import AllanMessage, EventMessage, Stat
 from monitor.publishing.remote_devices import DeviceStates, split_key
 from monitor.publishing.rerun.panel_text import fleet_text
 from monitor.publishing.rerun.view import RerunView
-from monitor.publishing.result_kinds import OverviewText, SampleRows
+from monitor.publishing.result_kinds import DeviceTableText, SampleRows
 from monitor.publishing.terminal.watch import connection_note
 from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
 
@@ -29,11 +29,11 @@ MAX_ROWS: Final = 40
 """Largest number of rows of the table, about one screen; the devices left out have the fewest problems."""
 
 
-def detail_key(device: str, keyexpr: str) -> str:
+def full_device_key(device: str, keyexpr: str) -> str:
     """Return the key of a device that is given in full or relative to the fixed start of a key expression.
 
-    >>> detail_key("nose", "imu/**"), detail_key("fleet/a7/nose", "fleet/**"), detail_key("a7/nose", "fleet/**")
-    ('imu/nose', 'fleet/a7/nose', 'fleet/a7/nose')
+    >>> full_device_key("nose", "imu/**"), full_device_key("fleet/a7/nose", "fleet/**")
+    ('imu/nose', 'fleet/a7/nose')
 
     Parameters
     ----------
@@ -87,19 +87,19 @@ class FleetView:
         table_s, reported = 0.0, ""
         while not stop.is_set() and (end_s is None or time.monotonic() < end_s):
             for message in self._subscriber.take(RECEIVE_TIMEOUT_S):
-                self.take(message)
+                self.process_message(message)
             now_s = time.monotonic()
             if now_s - table_s < TABLE_PERIOD_S:
                 continue
             table_s = now_s
-            self.draw(time.time(), now_s)
+            self.draw_device_table(time.time(), now_s)
             page = self._viewer.url if self._viewer.url.startswith("http") else ""
             report = "; ".join(part for part in (page, self._problems()) if part)
             if report != reported:
                 reported = report
                 tell(report)
 
-    def take(self, message: Message) -> None:
+    def process_message(self, message: Message) -> None:
         """Process a message: update the table, and the viewer if the device is shown in detail."""
         if message.payload is None:
             self.board.set_token(message.key, message.there)
@@ -119,7 +119,7 @@ class FleetView:
             except (ValueError, DecodeError):
                 self.malformed += 1
 
-    def draw(self, wall_s: float, now_s: float) -> None:
+    def draw_device_table(self, wall_s: float, now_s: float) -> None:
         """Draw the table of all devices.
 
         Parameters
@@ -131,7 +131,7 @@ class FleetView:
         """
         devices = self.board.devices(now_s)
         note = connection_note(self.board, self._subscriber)
-        self._viewer.put("", wall_s, OverviewText(fleet_text(devices, now_s, MAX_ROWS, note)))
+        self._viewer.put("", wall_s, DeviceTableText(fleet_text(devices, now_s, MAX_ROWS, note)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
         """Pass samples or a curve of a device shown in detail to the viewer."""

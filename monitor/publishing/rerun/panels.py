@@ -23,24 +23,24 @@ from monitor.common.units import (
     sensor_kind,
 )
 from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
-from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
+from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import SYMBOLS, Status
 from monitor.history.reading import HistoryTable
 from monitor.publishing.plots import colours
 from monitor.publishing.plots.colours import Colour
-from monitor.publishing.rerun import allan_drawing, dynamic_surface, past_points
+from monitor.publishing.rerun import allan_drawing, dynamic_heat_map, past_points
 from monitor.publishing.rerun.allan_history import AllanHistory
 from monitor.publishing.rerun.decimation import average_buckets, decimate_extremes
 from monitor.publishing.rerun.panel_text import drift_text, health_text, noise_text, overview_text
 from monitor.publishing.rerun.viewer_settings import DeviceInfo
-from monitor.publishing.rerun.views import RAW_SAMPLES_S, temperature_series, time_series
+from monitor.publishing.rerun.views import RAW_SAMPLES_S, temperature_view, time_series_view
 
 if TYPE_CHECKING:
     from monitor.publishing.rerun.scene import Scene
-    from monitor.publishing.result_kinds import CompensatedRows, OverviewText, SampleRows
+    from monitor.publishing.result_kinds import CompensatedRows, DeviceTableText, SampleRows
 
 TEMPERATURES_PER_S: Final = 5.0
 MAX_INTERMEDIATE_POINTS: Final = 20
@@ -79,7 +79,7 @@ class Panel:
         self.scene = scene
         self.device = device
 
-    def style(self) -> None:
+    def log_styles(self) -> None:
         """Log the names, colours and widths of the lines, which do not change."""
 
     def draw(self, unix_s: Floats, results: Sequence[Any]) -> None:
@@ -98,29 +98,31 @@ class Panel:
         """Draw the stored history of the device."""
 
     @classmethod
-    def tab(cls, device: DeviceInfo) -> rrb.Container | None:
+    def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
         """Return the layout of a tab of its own; None if the panel is part of the tab Now or Dynamic."""
         return None
 
-    def path(self, name: str) -> str:
+    def entity_path(self, name: str) -> str:
         """Return the path of an entity of the device."""
         return f"{self.device}/{name}"
 
     def _style_lines(self, name: str, lines: Sequence[tuple[str, Colour, float]]) -> None:
         """Log the name, colour and width of each time series of an entity."""
         names, line_colours, widths = zip(*lines, strict=True)
-        self.scene.log(self.path(name), rr.SeriesLines(colors=line_colours, widths=widths, names=names), static=True)
+        self.scene.log(
+            self.entity_path(name), rr.SeriesLines(colors=line_colours, widths=widths, names=names), static=True
+        )
 
     def _log_text(self, name: str, unix_s: float, text: str) -> None:
         """Log a Markdown text at a Unix time [s]."""
         self.scene.set_time(unix_s)
-        self.scene.log(self.path(name), rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+        self.scene.log(self.entity_path(name), rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
 
 
 class SamplesPanel(Panel):
     """Time series of the samples, at most 200 rows per second and axis, and of the temperature."""
 
-    def style(self) -> None:
+    def log_styles(self) -> None:
         """Log the styles of the lines."""
         for axis in AXES:
             unit = SAMPLE_UNITS[sensor_kind(axis)].name
@@ -132,22 +134,24 @@ class SamplesPanel(Panel):
         times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
         for i, axis in enumerate(AXES):
             t, y = decimate_extremes(times, values[:, i])
-            self.scene.log_scalars(self.path(f"samples/{axis}"), t, y * SAMPLE_UNITS[sensor_kind(axis)].factor)
+            self.scene.log_scalars(self.entity_path(f"samples/{axis}"), t, y * SAMPLE_UNITS[sensor_kind(axis)].factor)
         temperature_c = np.concatenate([one.temperature_c for one in results])
-        self.scene.log_scalars(self.path("temperature"), *average_buckets(times, temperature_c, TEMPERATURES_PER_S))
+        self.scene.log_scalars(
+            self.entity_path("temperature"), *average_buckets(times, temperature_c, TEMPERATURES_PER_S)
+        )
 
     def draw_history(self, history: HistoryTable) -> None:
         """Draw the stored history."""
         temperature = history.column("temperature")
         if np.isfinite(temperature.last).any():
             at, values = past_points.history_points(history, temperature, temperature.last, temperature.last)
-            self.scene.log_scalars(self.path("temperature"), at, values[:, 0])
+            self.scene.log_scalars(self.entity_path("temperature"), at, values[:, 0])
 
 
 class CompensatedPanel(Panel):
     """Time series of the angular rates without their drift, thinned like the samples."""
 
-    def style(self) -> None:
+    def log_styles(self) -> None:
         """Log the styles of the lines."""
         for axis in axes_of("gyro"):
             line = (f"{axis}, {SAMPLE_UNITS['gyro'].name}", colours.AXIS_COLOURS[axis], 1.0)
@@ -158,13 +162,13 @@ class CompensatedPanel(Panel):
         times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
         for i, axis in enumerate(axes_of("gyro")):
             t, y = decimate_extremes(times, values[:, i])
-            self.scene.log_scalars(self.path(f"compensated/{axis}"), t, y * SAMPLE_UNITS["gyro"].factor)
+            self.scene.log_scalars(self.entity_path(f"compensated/{axis}"), t, y * SAMPLE_UNITS["gyro"].factor)
 
 
 class DriftPanel(Panel):
     """Means at rest, predicted drift, innovations, and the table of the drift models."""
 
-    def style(self) -> None:
+    def log_styles(self) -> None:
         """Log the styles of the lines."""
         unit = DEVIATION_UNITS["gyro"].name
         for axis in axes_of("gyro"):
@@ -182,13 +186,13 @@ class DriftPanel(Panel):
             mean = np.array([one.mean[i] for one in results])
             rows = np.column_stack([mean, expected, expected - half, expected + half])
             if np.isfinite(rows).any():
-                self.scene.log_scalars(self.path(f"drift/{axis}"), unix_s, rows * DEVIATION_UNITS["gyro"].factor)
+                self.scene.log_scalars(self.entity_path(f"drift/{axis}"), unix_s, rows * DEVIATION_UNITS["gyro"].factor)
                 innovation = np.array([one.innovation[i] for one in results])
-                self.scene.log_scalars(self.path(f"innovation/{axis}"), unix_s, innovation)
+                self.scene.log_scalars(self.entity_path(f"innovation/{axis}"), unix_s, innovation)
         self._log_text("drift", float(unix_s[-1]), drift_text(results[-1]))
 
     @classmethod
-    def tab(cls, device: DeviceInfo) -> rrb.Container | None:
+    def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
         """Return the tab, if the device has results of this kind."""
         if not device.compensated:
             return None
@@ -198,10 +202,10 @@ class DriftPanel(Panel):
             title = f"{axis}: rate as measured, and without drift, {SAMPLE_UNITS['gyro'].name}"
             contents = (f"$origin/samples/{axis}", f"$origin/compensated/{axis}")
             dimmed = {f"/{name}/samples/{axis}": rr.SeriesLines(colors=[colours.FRAME], widths=[0.75])}
-            rates = time_series(f"/{name}", title, contents, RAW_SAMPLES_S, styles=dimmed)
+            rates = time_series_view(f"/{name}", title, contents, RAW_SAMPLES_S, styles=dimmed)
             title = f"{axis}: means at rest, and the drift expected, {DEVIATION_UNITS['gyro'].name}"
-            drift = time_series(f"/{name}/drift/{axis}", title)
-            innovation = time_series(f"/{name}/innovation/{axis}", f"{axis}: innovation, σ")
+            drift = time_series_view(f"/{name}/drift/{axis}", title)
+            innovation = time_series_view(f"/{name}/innovation/{axis}", f"{axis}: innovation, σ")
             rows.append(rrb.Horizontal(rates, drift, innovation, column_shares=[3, 3, 2]))
         text = rrb.TextDocumentView(origin=f"/{name}/drift", contents="$origin", name="Drift of the gyros")
         return rrb.Vertical(*rows, text, row_shares=[3, 3, 3, 2.5], name="Drift")
@@ -210,7 +214,7 @@ class DriftPanel(Panel):
 class ThermalPanel(Panel):
     """Mean bias of each axis, and its one-step prediction with the interval that events are based on."""
 
-    def style(self) -> None:
+    def log_styles(self) -> None:
         """Log the styles of the lines."""
         for axis in AXES:
             colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
@@ -220,32 +224,32 @@ class ThermalPanel(Panel):
                 f"thermal/{axis}", [*lines, (f"{axis} 95 % low", dim, 0.75), (f"{axis} 95 % high", dim, 0.75)]
             )
 
-    def draw(self, unix_s: Floats, results: Sequence[ThermalUpdate]) -> None:
+    def draw(self, unix_s: Floats, results: Sequence[ThermalIntervalResult]) -> None:
         """Draw the results."""
         for axis in AXES:
             rows = np.array([self._row(one.axes.get(axis)) for one in results])
             if np.isfinite(rows).any():
                 factor = DEVIATION_UNITS[sensor_kind(axis)].factor
-                self.scene.log_scalars(self.path(f"thermal/{axis}"), unix_s, rows * factor)
+                self.scene.log_scalars(self.entity_path(f"thermal/{axis}"), unix_s, rows * factor)
 
     @staticmethod
-    def _row(one: AxisThermalUpdate | None) -> tuple[float, float, float, float]:
+    def _row(one: PredictedAxisInterval | None) -> tuple[float, float, float, float]:
         """Return measured bias, predicted bias, and the ends of its interval."""
         if one is None or one.one_step is None:
             return (np.nan if one is None else one.bias), np.nan, np.nan, np.nan
         return one.bias, one.one_step.bias, one.one_step.lo, one.one_step.hi
 
     @classmethod
-    def tab(cls, device: DeviceInfo) -> rrb.Container | None:
+    def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
         """Return the tab, if the device has results of this kind."""
         if not device.has_thermal:
             return None
         columns = []
         for kind in KINDS:
             title = f"bias, and what its temperature lets expect, {DEVIATION_UNITS[kind].name}"
-            views = [time_series(f"/{device.name}/thermal/{axis}", f"{axis}: {title}") for axis in axes_of(kind)]
+            views = [time_series_view(f"/{device.name}/thermal/{axis}", f"{axis}: {title}") for axis in axes_of(kind)]
             columns.append(rrb.Vertical(*views))
-        temperature = temperature_series(device.name)
+        temperature = temperature_view(device.name)
         return rrb.Vertical(rrb.Horizontal(*columns), temperature, row_shares=[4, 1], name="Temperature")
 
 
@@ -254,7 +258,7 @@ class GapPanel(Panel):
 
     newest: ModelGap | None = None
 
-    def style(self) -> None:
+    def log_styles(self) -> None:
         """Log the styles of the lines."""
         for axis in AXES:
             self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", colours.AXIS_COLOURS[axis], 1.5)])
@@ -264,11 +268,11 @@ class GapPanel(Panel):
         """Draw the results."""
         self.newest = results[-1]
         highest = [max((axis.threshold for axis in one.axes.values()), default=np.nan) for one in results]
-        self.scene.log_scalars(self.path("gap/threshold"), unix_s, np.array(highest))
+        self.scene.log_scalars(self.entity_path("gap/threshold"), unix_s, np.array(highest))
         for axis in AXES:
             gap = np.array([one.axes[axis].gap if axis in one.axes else np.nan for one in results])
             if np.isfinite(gap).any():
-                self.scene.log_scalars(self.path(f"gap/{axis}"), unix_s, gap)
+                self.scene.log_scalars(self.entity_path(f"gap/{axis}"), unix_s, gap)
 
 
 class AllanPanel(Panel):
@@ -276,7 +280,7 @@ class AllanPanel(Panel):
 
     def __init__(self, scene: "Scene", device: str) -> None:
         super().__init__(scene, device)
-        self._plot = allan_drawing.AllanPlot(scene.log, self.path("allan"))
+        self._plot = allan_drawing.AllanPlot(scene.log, self.entity_path("allan"))
         self._surface = AllanHistory()
 
     def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
@@ -284,14 +288,14 @@ class AllanPanel(Panel):
         at_s, estimate = float(unix_s[-1]), results[-1]
         self._log_text("coefficients", at_s, noise_text(estimate))
         self._plot.draw(estimate, self.scene.panel(self.device, GapPanel).newest)
-        if self._surface.add(at_s, estimate):
-            dynamic_surface.draw(self.scene.log, self.path("dynamic"), self._surface)
+        if self._surface.add_estimate(at_s, estimate):
+            dynamic_heat_map.draw_heat_maps(self.scene.log, self.entity_path("dynamic"), self._surface)
 
 
 class CoefficientsPanel(Panel):
     """Time series of the coefficients: a point with interval per estimate, and the values between the estimates."""
 
-    def style(self) -> None:
+    def log_styles(self) -> None:
         """Log the styles of the lines."""
         for axis in AXES:
             colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
@@ -302,7 +306,7 @@ class CoefficientsPanel(Panel):
                 mark = rr.SeriesPoints(
                     colors=[colour], markers=["diamond"], marker_sizes=[7.0], names=[f"{axis} changed"]
                 )
-                self.scene.log(self.path(f"coefficients/{symbol}/{axis}/changed"), mark, static=True)
+                self.scene.log(self.entity_path(f"coefficients/{symbol}/{axis}/changed"), mark, static=True)
 
     def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
         """Draw the results."""
@@ -339,7 +343,7 @@ class CoefficientsPanel(Panel):
             End of the name of the entity.
         """
         factor = COEFFICIENT_UNITS[sensor_kind(axis)][symbol].factor
-        self.scene.log_scalars(self.path(f"coefficients/{symbol}/{axis}{name}"), unix_s, values * factor)
+        self.scene.log_scalars(self.entity_path(f"coefficients/{symbol}/{axis}{name}"), unix_s, values * factor)
 
 
 class EventsPanel(Panel):
@@ -355,7 +359,7 @@ class EventsPanel(Panel):
                 line = rr.TextLog(f"{clock_time}  {self.device}: {event.text}", level=level)
                 self.scene.log("overview/events", line)
             if self.device in self.scene.devices:
-                self.scene.log(self.path("events"), rr.TextLog(f"{clock_time}  {event.text}", level=level))
+                self.scene.log(self.entity_path("events"), rr.TextLog(f"{clock_time}  {event.text}", level=level))
                 self._mark_changes(at_s, event)
 
     def draw_history(self, history: HistoryTable) -> None:
@@ -386,17 +390,17 @@ class HealthPanel(Panel):
         about = devices[self.device].about if self.device in devices else ""
         self._log_text("status", at_s, health_text(self.device, health, about))
         if len(devices) > 1 and not self.scene.fleet:
-            self.scene.panel("", OverviewPanel).log_overview(at_s, overview_text(self.scene.healths))
+            self.scene.panel("", DeviceTablePanel).log_device_table(at_s, overview_text(self.scene.healths))
 
 
-class OverviewPanel(Panel):
+class DeviceTablePanel(Panel):
     """Table of all devices."""
 
-    def draw(self, unix_s: Floats, results: "Sequence[OverviewText]") -> None:
+    def draw(self, unix_s: Floats, results: "Sequence[DeviceTableText]") -> None:
         """Draw the results."""
-        self.log_overview(float(unix_s[-1]), results[-1].text)
+        self.log_device_table(float(unix_s[-1]), results[-1].text)
 
-    def log_overview(self, unix_s: float, text: str) -> None:
+    def log_device_table(self, unix_s: float, text: str) -> None:
         """Log the table.
 
         Parameters

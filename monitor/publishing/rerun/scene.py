@@ -45,13 +45,13 @@ class Scene:
         self._stream = stream
         self._panels: dict[tuple[str, type[Panel]], Panel] = {}
 
-    def show(self, devices: Sequence[DeviceInfo]) -> None:
+    def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
         """Set the devices to show. Data of a removed device that still arrive are drawn."""
         self.devices = {one.name: one for one in devices}
         self.healths = {name: health for name, health in self.healths.items() if name in self.devices}
         for name in self.devices:
             for kind in PANELS:
-                self.panel(name, kind).style()
+                self.panel(name, kind).log_styles()
 
     def panel(self, device: str, kind: type[P]) -> P:
         """Return a panel of a device, which is created if it does not exist.

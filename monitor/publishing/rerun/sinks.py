@@ -117,7 +117,7 @@ class Output:
     note: str = ""  # configured ports that were in use, and their replacements
     lock: IO[bytes] | None = None  # open while a file is written, so that no other process writes it
 
-    def check(self) -> None:
+    def check_viewer(self) -> None:
         """Check that the viewer is still open.
 
         Raises
@@ -130,12 +130,12 @@ class Output:
         if self.child is not None and self.child.exited_normally():
             raise ViewerClosed(CLOSED)
         trouble = self.child.exit_reason() if self.child is not None else None
-        if trouble is None and self.port is not None and not listens(self.port):
+        if trouble is None and self.port is not None and not is_listening(self.port):
             trouble = f"the viewer on port {self.port} was closed"
         if trouble is not None:
             raise ViewerError(trouble)
 
-    def confirm(self, patience_s: float) -> bool:
+    def confirm_delivery(self, patience_s: float) -> bool:
         """Return True if all logged data were sent within ``patience_s`` seconds and the viewer answers.
 
         Sending alone is not sufficient: sockets accept two more megabytes for a viewer that is stopped.
@@ -177,7 +177,7 @@ def _death_signal_prefix() -> list[str]:
     return [] if setpriv is None else [setpriv, "--pdeathsig", "TERM", "--"]
 
 
-def listens(port: int) -> bool:
+def is_listening(port: int) -> bool:
     """Return True if a program accepts connections on this port of the loopback interface."""
     with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), 0.5):
         return True
@@ -295,7 +295,7 @@ def _open_file(path: Path, recording_id: str) -> Output:
 def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
     """Join the Rerun server on the port, or open a window."""
     port = settings.port
-    if listens(port):
+    if is_listening(port):
         if not is_rerun(port):
             raise ViewerError(f"cannot listen on {port}: busy")
         return _connected(port, recording_id)
@@ -305,7 +305,7 @@ def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable
         raise ViewerError('no desktop here (DISPLAY and WAYLAND_DISPLAY are not set): use viewer mode "web"')
     child = ViewerProcess([
         *("--bind", LOOPBACK, "--port", str(port)),
-        *("--memory-limit", total_memory_limit(settings.memory), "--server-memory-limit", "64MiB"),
+        *("--memory-limit", add_program_memory(settings.memory), "--server-memory-limit", "64MiB"),
         *("--hide-welcome-screen", "--expect-data-soon"),
     ])  # fmt: skip
     _wait_for(port, child, given_up)
@@ -330,10 +330,10 @@ def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[]
     return output
 
 
-def total_memory_limit(memory: str) -> str:
+def add_program_memory(memory: str) -> str:
     """Return the memory limit of a window, increased by the memory of the program; a percentage is not changed.
 
-    >>> total_memory_limit("256MiB"), total_memory_limit("1GiB"), total_memory_limit("25%")
+    >>> add_program_memory("256MiB"), add_program_memory("1GiB"), add_program_memory("25%")
     ('512MiB', '1280MiB', '25%')
     """
     found = re.fullmatch(r"(\d+(?:\.\d+)?)\s*(MiB|GiB)", memory.strip())
@@ -379,7 +379,7 @@ def _wait_for(port: int, child: ViewerProcess, given_up: Callable[[], bool]) -> 
         if trouble is not None:
             child.end()
             raise ViewerError(trouble)
-        if listens(port):
+        if is_listening(port):
             return
         time.sleep(0.05)
     child.end()

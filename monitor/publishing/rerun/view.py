@@ -192,8 +192,8 @@ class RerunView:
         """Send the layout for the devices and create their entities."""
         from monitor.publishing.rerun import blueprint
 
-        blueprint.send(output.stream, devices, self._fleet)
-        scene.show(devices)
+        blueprint.send_layout(output.stream, devices, self._fleet)
+        scene.set_devices(devices)
         self._phase = f"ok, but {output.note}" if output.note else "ok"
 
     def _draw_history(self, scene: "Scene", device: str) -> None:
@@ -229,14 +229,14 @@ class RerunView:
             self._inside_since = None
             if closing:
                 return
-            output.check()
+            output.check_viewer()
             self._closing.wait(output.flush_every_s)
 
     def _confirm(self, output: "Output") -> None:
         """Wait until all drawn data have reached the viewer, which limits the data held by Rerun to one second."""
-        while not output.confirm(PATIENCE_S):
+        while not output.confirm_delivery(PATIENCE_S):
             self._stalled = not self._closing.is_set()
-            output.check()
+            output.check_viewer()
             if self._closing.is_set():
                 return
         self._stalled = False

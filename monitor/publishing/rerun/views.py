@@ -13,7 +13,7 @@ HALF_LABEL_SHARE: Final = 0.08
 """Width of half a tick label, as a share of the width of the plot."""
 
 
-def time_series(
+def time_series_view(
     origin: str,
     name: str,
     contents: Sequence[str] = ("$origin",),
@@ -48,9 +48,9 @@ def time_series(
     )
 
 
-def temperature_series(device: str) -> rrb.TimeSeriesView:
+def temperature_view(device: str) -> rrb.TimeSeriesView:
     """Return the view of the temperature of a device."""
-    return time_series(f"/{device}/temperature", "Temperature, °C")
+    return time_series_view(f"/{device}/temperature", "Temperature, °C")
 
 
 def _before_cursor(seconds: float) -> rrb.TimeAxis:

@@ -6,7 +6,7 @@ import numpy as np
 from rich.console import Console
 from rich.padding import Padding
 
-from monitor.common.units import DEVIATION_UNITS, format_duration, format_number
+from monitor.common.units import DEVIATION_UNITS, format_count, format_duration, format_number
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult
 from monitor.drift.compensation.compensation_score import SPANS_S, RestScore
@@ -24,14 +24,14 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
 
     Parameters
     ----------
-    result
-        The results.
-    console
-        Destination.
+    result : CompensationResult
+        Results to print.
+    console : Console
+        Terminal or file.
     """
     console.print(
-        f"{result.recording}: {result.samples} samples at {result.rate_hz:g} Hz, {result.method}; judged on "
-        f"{format_duration(result.evaluated_rest_s)} at rest, after {format_duration(result.learning_rest_s)}",
+        f"{result.recording}: {result.samples} samples at {result.rate_hz:g} Hz, method {result.method}; evaluated "
+        f"on {format_duration(result.evaluated_rest_s)} at rest, after {format_duration(result.learning_rest_s)}",
         highlight=False,
     )
     rows = plain_table(
@@ -46,7 +46,7 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
         rows.add_row(axis, "—" if one.model is None else one.model.name, *(_format_pair(*pair) for pair in pairs))
     console.print(Padding(rows, (1, 0)))
     console.print(
-        "before → after, at rest; 1 min and more: rms of means over so long, by which heading would go wrong.",
+        "Values before → after compensation, at rest. 1 min, 10 min, 60 min: rms of the mean rate over this time.",
         style="dim",
     )
     for axis, one in result.axes.items():
@@ -128,10 +128,11 @@ def _format_pair(before: float, after: float) -> str:
 
 
 def _describe_exceptions(one: AxisCompensation, interval_s: float) -> str:
-    """Describe the intervals that were left out and the steps of the bias."""
+    """Describe the rejected intervals and the steps of the bias."""
     parts = []
     if one.rejected_intervals:
-        parts.append(f"{one.rejected_intervals} intervals of {interval_s:g} s left out, as no drift explains them")
+        count = format_count(one.rejected_intervals, "interval")
+        parts.append(f"{count} of {interval_s:g} s rejected, because drift does not explain the mean or the scatter")
     if one.steps:
-        parts.append(f"{one.steps} step{'s' if one.steps > 1 else ''} of the bias")
+        parts.append(f"{format_count(one.steps, 'step')} of the bias")
     return "; ".join(parts)

@@ -58,7 +58,7 @@ def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str,
         shown = [axis for axis in axes_of(kind) if axis in axes and axis in past.axes()]
         if shown:
             console.print(Padding(_summary(past, kind, shown, symbols), (1, 0, 0, 0)))
-    for line in status_lines(past):
+    for line in temperature_and_loss_lines(past):
         console.print(line, highlight=False)
     _print_events(past, console)
 
@@ -125,7 +125,7 @@ def summary_line(past: HistoryTable) -> str:
     )
 
 
-def status_lines(past: HistoryTable) -> list[str]:
+def temperature_and_loss_lines(past: HistoryTable) -> list[str]:
     """Return lines with temperature range, lost samples, and the time during which the device was not running."""
     lines = []
     temperature = past.column("temperature")

@@ -87,12 +87,12 @@ class LiveTable:
         self._live: Live | None = None
         self._ended = False
 
-    def render(self, lines: Sequence[str], last: bool) -> str:
+    def render(self, log_lines: Sequence[str], last: bool) -> str:
         """Return the text and control codes that print the lines above the table and redraw the table.
 
         Parameters
         ----------
-        lines : sequence of str
+        log_lines : sequence of str
             Lines of the log, with colours as ANSI codes.
         last : bool
             True to show the cursor again and leave the final table.
@@ -108,8 +108,8 @@ class LiveTable:
                 )
                 live.start()
                 self._live = live
-            if lines:
-                self._console.print(Text.from_ansi("".join(lines)))
+            if log_lines:
+                self._console.print(Text.from_ansi("".join(log_lines)))
             if not last and self._live is not None and self.states is not None:
                 self._live.update(device_table(self.states, time.monotonic()), refresh=True)
             if last and not self._ended:
@@ -131,7 +131,7 @@ def device_table(states: DeviceStates, now_s: float) -> RenderableType:
     now_s
         Current time on the clock of the messages [s].
     """
-    devices, events = states.devices(now_s), states.events()
+    devices, events = states.devices(now_s), states.newest_events()
     names = display_names([*(one.key for one in devices), *(key for key, _ in events)])
     parts: list[RenderableType] = [_summary(states, devices, now_s)]
     if devices:

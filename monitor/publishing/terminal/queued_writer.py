@@ -148,7 +148,7 @@ class QueuedWriter:
             self._thread.join(timeout_s)
         self._given_up = self._thread.is_alive()
         if self._given_up or not can_write(self._descriptor):
-            detach(self._stream)
+            redirect_to_null_device(self._stream)
         return not self._given_up
 
     # --- methods of the thread
@@ -280,7 +280,7 @@ def descriptor_of(stream: TextIO | None) -> int | None:
     return descriptor if descriptor >= 0 else None
 
 
-def detach(stream: TextIO | None) -> None:
+def redirect_to_null_device(stream: TextIO | None) -> None:
     """Point the descriptor of a stream to the null device, so that no later write to it can block."""
     descriptor = descriptor_of(stream)
     if descriptor is not None:

@@ -18,8 +18,8 @@ from monitor.common.units import format_duration
 from monitor.publishing.reports import comparison_sentences
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.terminal.tables import plain_table
-from monitor.reconcile.result import AxisResult, Reconciliation, ReconciliationStep
-from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect
+from monitor.reconcile.result import AddedOrResizedEffect, AxisResult, Reconciliation
+from monitor.reconcile.several_recordings.comparison import AxisComparison, Comparison, MatchedEffect
 
 RESULT_STYLES: Final = {
     "agrees": ("●", "green"),
@@ -42,12 +42,12 @@ def print_report(r: Reconciliation, console: Console) -> None:
     """
     console.print(f"{r.samples} samples at {r.rate_hz:g} Hz, {format_duration(r.duration_s)}", highlight=False)
     console.print(_verdict(r.verdict), Text(words.summarize(r)))
-    console.print(table(r))
+    console.print(_axes_table(r))
     for note in r.notes:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 
 
-def table(r: Reconciliation) -> RenderableType:
+def _axes_table(r: Reconciliation) -> RenderableType:
     """Return a table with a row per axis, followed by its steps and its unexplained remainder."""
     rows = plain_table("axis", "verdict")
     for head in ("gap", "conf."):
@@ -65,14 +65,14 @@ def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
         ("", "", Text(f"left over: {words.describe_gap(one, result.axis)}", style="yellow")) for one in result.left_over
     ]
     head = (Text(result.axis, style="bold"), _verdict(result.verdict))
-    if not lines and result.start.scores:
-        most = max(result.start.scores, key=words.gap_ratio)
+    if not lines and result.start.gaps:
+        most = max(result.start.gaps, key=words.gap_to_threshold_ratio)
         lines.append(("", "", Text(f"largest: {words.describe_gap(most, result.axis)}", style="dim")))
     for i, line in enumerate(lines or [("", "", Text())]):
         rows.add_row(*(head if i == 0 else ("", "")), *line)
 
 
-def _step(r: Reconciliation, axis: str, step: ReconciliationStep) -> tuple[str, str, Text]:
+def _step(r: Reconciliation, axis: str, step: AddedOrResizedEffect) -> tuple[str, str, Text]:
     """Return the gap, confidence and description of one step."""
     what = Text.assemble(f"{step.kind} ", words.describe_step(step, axis, r.baseline))
     what.highlight_words([words.readable_name(step.effect)], "bold")
@@ -156,7 +156,7 @@ def _single(c: Comparison) -> list[tuple[str, Text]]:
     return [line for axis, one in c.axes.items() for line in _single_on(c, axis, one)]
 
 
-def _single_on(c: Comparison, axis: str, one: AxisRuns) -> list[tuple[str, Text]]:
+def _single_on(c: Comparison, axis: str, one: AxisComparison) -> list[tuple[str, Text]]:
     """Return the lines of effects on one axis that only some recordings show, with reasons for their absence."""
     found = []
     for seen in one.single:
@@ -172,6 +172,6 @@ def _single_on(c: Comparison, axis: str, one: AxisRuns) -> list[tuple[str, Text]
 
 def _effect(c: Comparison, axis: str, seen: MatchedEffect) -> Text:
     """Return the description of an effect, with its name in bold."""
-    said = Text(f"{seen.kind} {words.describe_step(seen.step(), axis, c.baseline)}")
+    said = Text(f"{seen.kind} {words.describe_step(seen.pooled_step(), axis, c.baseline)}")
     said.highlight_words([words.readable_name(seen.effect)], "bold")
     return said

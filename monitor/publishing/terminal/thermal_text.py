@@ -9,11 +9,11 @@ from rich.padding import Padding
 
 from monitor.common.units import DEVIATION_UNITS, format_duration, format_rate, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.temperature_share import SLOW_LETTERS, TemperatureShare
+from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemoval
 from monitor.drift.thermal.thermal_fit import ThermalFit
 from monitor.drift.thermal.thermal_model import Prediction
 from monitor.drift.thermal.thermal_response import ThermalModelForm
-from monitor.drift.thermal.thermal_study import ModelComparison, ThermalFitReport, ThermalPredictionReport
+from monitor.drift.thermal.thermal_study import ComparisonWithMeans, ThermalFitReport, ThermalPredictionReport
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import encode_json
 from monitor.publishing.terminal.tables import plain_table
@@ -48,7 +48,7 @@ def print_thermal_fit(study: ThermalFitReport, console: Console) -> None:
             "a cubic).",
             style="dim",
         )
-    one_way = [axis for axis, one in study.fits.items() if not one.both_ways]
+    one_way = [axis for axis, one in study.fits.items() if not one.temperature_rose_and_fell]
     notes = (*study.notes, *notes_on_hysteresis(study), *([ONE_WAY] if one_way else []))
     _print_notes(study.refused, notes, console)
 
@@ -75,14 +75,15 @@ def print_thermal_prediction(outlook: ThermalPredictionReport, console: Console)
     _print_notes(outlook.refused, outlook.notes, console)
 
 
-def temperature_notes(found: TemperatureShare) -> list[str]:
+def temperature_notes(found: TemperatureRemoval) -> list[str]:
     """Return a sentence for each axis whose slow variance, or whose K or R, is largely due to temperature."""
     notes = []
     for axis, one in found.dependences.items():
         fallen = [
             f"{letter} falls from {before.value} to {after.value} {after.unit} ({100.0 * share:.0f} % of its variance)"
             for letter in SLOW_LETTERS
-            if found.is_significant(letter, axis) and (share := found.variance_share(letter, axis)) is not None
+            if found.has_decreased_significantly(letter, axis)
+            and (share := found.variance_share(letter, axis)) is not None
             for before, after in [
                 (format_coefficient(found.before, letter, axis), format_coefficient(found.coefficients, letter, axis))
             ]
@@ -122,10 +123,10 @@ def encode_thermal_fit(study: ThermalFitReport) -> bytes:
             "sizes": model.coefficients.tolist(),
             "time_constants": list(model.shape.constants_s),
             "equation": model.equation,
-            "slope": model.slope,
+            "slope": model.mean_slope,
             "hysteresis": one.hysteresis,
             "hysteresis_p": one.hysteresis_p,
-            "both_directions": one.both_ways,
+            "both_directions": one.temperature_rose_and_fell,
             "explained": one.explained,
             "phi": model.phi,
             "candidates": [
@@ -145,7 +146,7 @@ def encode_thermal_prediction(outlook: ThermalPredictionReport) -> bytes:
     return _json(PREDICT_SCHEMA, outlook.recording, outlook.interval_s, axes, outlook.refused, outlook.notes)
 
 
-def _prediction_of_axis(means: IntervalMeans, one: ModelComparison) -> dict[str, Any]:
+def _prediction_of_axis(means: IntervalMeans, one: ComparisonWithMeans) -> dict[str, Any]:
     """Return the prediction errors and the predicted and measured bias of one axis."""
     return {
         "rms": one.rms,
@@ -196,7 +197,7 @@ def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
     cubic = next((each.validated for each in one.candidates if each.shape == ThermalModelForm(3, ())), None)
     return (
         model.shape.name,
-        _format_deviation(axis, model.slope) if model.shape != ThermalModelForm(0, ()) else "—",
+        _format_deviation(axis, model.mean_slope) if model.shape != ThermalModelForm(0, ()) else "—",
         ", ".join(format_duration(each) for each in model.shape.constants_s) or "—",
         "—" if not one.hysteresis else _format_deviation(axis, one.hysteresis),
         _format_deviation(axis, best.rms),

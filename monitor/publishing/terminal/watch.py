@@ -104,7 +104,7 @@ def connection_note(states: DeviceStates, subscriber: ZenohSubscriber) -> str:
     """
     state, dropped = subscriber.state, subscriber.dropped
     notes = [state] if state != "ok" else []
-    if state == "ok" and subscriber.open_s > SILENCE_NOTE_S and not states.devices(time.monotonic()):
+    if state == "ok" and subscriber.all_connected_s > SILENCE_NOTE_S and not states.devices(time.monotonic()):
         notes.append("connected, but nothing comes: no daemon there, or no right to listen")
     notes += [f"{dropped:,} messages dropped: too slow here"] if dropped else []
     return "; ".join(notes)

@@ -1,14 +1,14 @@
 """Publisher of results over zenoh: the topics of ``monitor.common.topics``, liveliness tokens and commands.
 
-By default the session is closed to other hosts: a peer without scouting that listens on the loopback interface only. If
-the port is in use, a free port is used and reported. If the session cannot be opened for another reason, the attempt is
-repeated. ``state`` reports the reason, and messages are dropped meanwhile. The processing of samples continues. zenoh
-queues outgoing messages and drops those of a slow subscriber, so ``put`` never waits. Advanced publishers keep the last
-values for late subscribers, and plain subscribers are not affected.
+By default the session is closed to other hosts: it is a peer without scouting that listens only on the loopback
+interface. If the port is in use, the session listens on a free port and reports it. If the session cannot be opened for
+another reason, the attempt is repeated. Until the session is open, ``state`` reports the reason and messages are
+dropped. The processing of samples continues. ``put`` never waits, because zenoh queues outgoing messages and drops the
+messages of a slow subscriber. Advanced publishers keep the last values for late subscribers. Plain subscribers are not
+affected.
 
-Each device has a thread that answers queries of ``history``, because these read a file. A second thread takes commands
-from a queryable and passes them through a queue to the main loop of the service, which answers them. Both threads read
-from channels of zenoh, because a Python callback that is alive at exit would hang the process.
+Each device has a thread that answers queries of ``history``, because an answer requires reading a file. A second thread
+takes commands from a queryable and passes them through a queue to the main loop of the service, which answers them.
 """
 
 import atexit
@@ -27,46 +27,44 @@ from typing import TYPE_CHECKING, Any, Final
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError, ImuError, NotReady
 from drivers.zenoh.connection_errors import explain_refusals
-from drivers.zenoh.session import (
+from drivers.zenoh.session_config import (
     DEFAULT_CONFIGURATION,
     build_session_config,
     find_connect_endpoints,
-    format_error,
+    format_zenoh_error,
     is_unconnected,
 )
 from monitor.common import topics
+from monitor.publishing.zenoh.retried_session import REFUSAL_CHECK_S, RetriedSession, zenoh_errors
 from monitor.settings.loading import ZenohTable
 
 if TYPE_CHECKING:
     import zenoh
     from zenoh.ext import AdvancedPublisher
 
-RETRY_S: Final = 2.0
 MAX_QUEUED_QUERIES: Final = 64
 """Capacity of the queue of commands and of each channel of queries."""
-REFUSAL_CHECK_S: Final = 3.0
-"""Interval between two checks of why a router refuses the connection."""
 DUPLICATE_REPORT_S: Final = 10.0
-"""Time for which another program that publishes under the key of a device is reported after its last message."""
+"""Time after the last message of another program that publishes under the same key, during which it is reported."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Query on ``command/<verb>``; it must be answered exactly once, by ``answer`` or ``refuse``."""
+    """Query on ``command/<verb>``. It must be answered exactly once, with ``reply_result`` or ``reply_refusal``."""
 
     device: str
     verb: str
-    answer: Callable[[bytes], None]
-    refuse: Callable[[str], None]
+    reply_result: Callable[[bytes], None]
+    reply_refusal: Callable[[str], None]
 
 
 HistoryFunction = Callable[[str, str], bytes]
-"""Function that returns the history of a device as a payload, given its name and the parameters of a selector; it
-raises ImuError if there is none."""
+"""Function that returns the payload with the history of a device, given the name of the device and the parameters of a
+selector. The function raises ImuError if there is no history."""
 
 
-class ZenohPublisher:
-    """Publisher: the zenoh session of the daemon and all its declarations for each device.
+class ZenohPublisher(RetriedSession):
+    """zenoh session of the daemon, with the publishers, queryables and liveliness tokens of all devices.
 
     Parameters
     ----------
@@ -81,6 +79,7 @@ class ZenohPublisher:
     def __init__(
         self, settings: ZenohTable, devices: Sequence[str], read_history: HistoryFunction | None = None
     ) -> None:
+        super().__init__("open")
         self.settings = settings
         self._read_history = read_history
         self._session_state = "off" if settings.mode == "none" else "not open yet"
@@ -88,18 +87,15 @@ class ZenohPublisher:
         self.commands: queue.Queue[Command] = queue.Queue(MAX_QUEUED_QUERIES)
         self._devices = tuple(devices)
         self._alive: dict[str, bool] = dict.fromkeys(devices, False)
-        self._session: zenoh.Session | None = None
-        self._refusal = ""  # reason found by the newest check why the connection is refused
+        self._refusal = ""  # reason why the connection is refused, from the newest check
         self._connect: tuple[str, ...] = settings.connect
         self._publishers: dict[str, zenoh.Publisher | AdvancedPublisher] = {}
         self._tokens: dict[str, Any] = {}
         self._queryables: dict[str, list[Any]] = {}
         self._duplicates = _DuplicatePublishers(settings.prefix)
-        self._declaring = threading.Lock()  # the opener declares all devices; the main loop adds and removes devices
-        self._showing = threading.Lock()  # the opener and the main loop both declare liveliness tokens
-        self._opener = threading.Thread(target=self._keep_open, name="zenoh open", daemon=True)
-        self._query_threads: list[threading.Thread] = []
-        self._closing = threading.Event()
+        # The thread that opens the session declares all devices. The main loop adds and removes devices.
+        self._declaring = threading.Lock()
+        self._token_lock = threading.Lock()  # both threads declare liveliness tokens
 
     @property
     def state(self) -> str:
@@ -109,21 +105,21 @@ class ZenohPublisher:
             return self._unsent or self._session_state
         if self._connect and is_unconnected(session):
             return f"{self._refusal or 'nobody at ' + mask_secrets(', '.join(self._connect))}; trying again"
-        duplicates = self._duplicates.found(time.monotonic())
+        duplicates = self._duplicates.duplicate_publisher_message(time.monotonic())
         if not duplicates:
             return self._session_state
         return f"{self._session_state}{'; ' if self._session_state != 'ok' else ', but '}{duplicates}"
 
     def start(self) -> None:
-        """Open the session in a separate thread, so that a missing router does not delay the samples."""
+        """Open the session in a separate thread, unless the mode is ``none``."""
         if self.settings.mode == "none":
             return
         # A thread that still receives from zenoh while the interpreter exits would abort the process.
         atexit.register(self.close)
-        self._opener.start()
+        super().start()
 
     def put(self, topic: topics.Topic, device: str, payload: bytes) -> None:
-        """Publish a message; it is dropped if there is no session.
+        """Publish a message. The message is dropped if there is no session.
 
         Parameters
         ----------
@@ -142,12 +138,12 @@ class ZenohPublisher:
         try:
             publisher.put(payload)
         except zenoh.ZError as error:
-            self._unsent = f"cannot send: {format_error(error)}"
+            self._unsent = f"cannot send: {format_zenoh_error(error)}"
         else:
             self._unsent = ""
 
     def put_key(self, key: str, payload: bytes) -> str:
-        """Publish JSON under a key that the user has chosen; return "" or the reason why it was not sent.
+        """Publish JSON under a key that the user has chosen. Return "" or the reason why the text was not sent.
 
         Parameters
         ----------
@@ -164,7 +160,7 @@ class ZenohPublisher:
         try:
             session.put(key, payload, encoding=zenoh.Encoding(topics.JSON), express=True)
         except zenoh.ZError as error:
-            return f"not sent: zenoh: {format_error(error)}"
+            return f"not sent: zenoh: {format_zenoh_error(error)}"
         return ""
 
     def set_alive(self, device: str, flowing: bool) -> None:
@@ -181,82 +177,66 @@ class ZenohPublisher:
             self._alive[device] = flowing
             self._update_token(device)
 
-    def add(self, device: str) -> None:
+    def add_device(self, device: str) -> None:
         """Add a device and declare its keys."""
         with self._declaring:
             self._devices += (device,)
             self._alive[device] = False
             if self._session is not None:
-                with contextlib.suppress(*_zenoh_errors()):  # the session may be closing
+                with contextlib.suppress(*zenoh_errors()):  # the session may be closing
                     self._declare(self._session, device)
 
-    def remove(self, device: str) -> None:
+    def remove_device(self, device: str) -> None:
         """Remove a device and undeclare its keys."""
         self.set_alive(device, False)
-        with self._declaring, contextlib.suppress(*_zenoh_errors()):  # the session may be closing
+        with self._declaring, contextlib.suppress(*zenoh_errors()):  # the session may be closing
             self._devices = tuple(one for one in self._devices if one != device)
             del self._alive[device]
             keys = {topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
             removed = [self._publishers[key] for key in keys & self._publishers.keys()]
             self._publishers = {key: one for key, one in self._publishers.items() if key not in keys}
-            for one in [*removed, *self._queryables.pop(device, []), *self._duplicates.remove(device)]:
+            for one in [*removed, *self._queryables.pop(device, []), *self._duplicates.forget_device(device)]:
                 one.undeclare()
 
     def close(self) -> None:
-        """Close the session, which removes its liveliness tokens, and stop the threads."""
+        """Close the session, which removes all liveliness tokens, and stop the threads."""
         atexit.unregister(self.close)
-        self._closing.set()
-        if self._opener.is_alive():
-            self._opener.join(RETRY_S)
-        self._close_session()
+        super().close()
 
     # --- opening of the session
 
-    def _keep_open(self) -> None:
-        """Open the session, then check at intervals why the connection is refused (runs in a thread)."""
-        errors: tuple[type[Exception], ...] = (*_zenoh_errors(), OSError)
-        while not self._closing.is_set():
-            try:
-                self._open()
-            except errors as error:
-                self._session_state = f"{self._find_refusal() or format_error(error)}; trying again"
-                self._close_session()
-                self._closing.wait(RETRY_S)
-            else:
-                break
-        while self._connect and not self._closing.wait(REFUSAL_CHECK_S):
-            session = self._session
-            self._refusal = self._find_refusal() if session is not None and is_unconnected(session) else ""
-        if self._closing.is_set():  # close() may have stopped waiting before the session was open
-            self._close_session()
-
-    def _find_refusal(self) -> str:
-        """Return why the endpoints refuse the connection; "" if no program listens there."""
-        with contextlib.suppress(*_zenoh_errors()):  # zenoh has reported an invalid file already
-            return explain_refusals(self._connect, self._configuration(None))
-        return ""
-
-    def _close_session(self) -> None:
-        """Close the session, which stops the threads that receive from it."""
-        session, self._session = self._session, None
-        self._publishers, self._queryables = {}, {}
-        self._duplicates.clear()
-        if session is not None:
-            session.close()  # type: ignore[no-untyped-call]
-        with self._showing:
-            self._tokens = {}  # they were removed with the session
-        threads, self._query_threads = self._query_threads, []
-        for thread in threads:
-            thread.join(RETRY_S)
-
-    def _open(self) -> None:
+    def _open_session(self) -> None:
         """Open the session and declare all devices."""
-        session, state = self._open_session()
+        session, state = self._open_on_free_port()
         with self._declaring:
             self._session = session
             for device in self._devices:
                 self._declare(session, device)
             self._session_state = state
+
+    def _report_failure(self, error: Exception) -> None:
+        """Store the reason why the session could not be opened."""
+        self._session_state = f"{self._find_refusal() or format_zenoh_error(error)}; trying again"
+
+    def _monitor_connection(self) -> None:
+        """Check at intervals why the connection is refused."""
+        while self._connect and not self.closing.wait(REFUSAL_CHECK_S):
+            session = self._session
+            self._refusal = self._find_refusal() if session is not None and is_unconnected(session) else ""
+
+    def _find_refusal(self) -> str:
+        """Return why the endpoints refuse the connection; "" if no program listens there."""
+        with contextlib.suppress(*zenoh_errors()):  # zenoh has already reported an invalid file
+            return explain_refusals(self._connect, self._configuration(None))
+        return ""
+
+    def _close_session(self) -> None:
+        """Close the session and forget all declarations, which end with the session."""
+        self._publishers, self._queryables = {}, {}
+        self._duplicates.forget_devices()
+        super()._close_session()
+        with self._token_lock:
+            self._tokens = {}
 
     def _declare(self, session: "zenoh.Session", device: str) -> None:
         """Declare all keys of a device."""
@@ -265,15 +245,15 @@ class ZenohPublisher:
         new = {key: self._publisher(session, topic, key) for topic, key in published.items()}
         command_key = f"{self.settings.prefix}/{device}/command/*"
         self._declare_queryable(session, device, command_key, partial(self._queue_command, device))
-        self._duplicates.add(session, device)
+        self._duplicates.watch_other_publishers(session, device)
         if self._read_history is not None:
             answer = partial(self._answer_history, device, self._read_history)
             self._declare_queryable(session, device, keys[topics.HISTORY], answer)
         self._publishers = {**self._publishers, **new}
         self._update_token(device)
 
-    def _open_session(self) -> tuple["zenoh.Session", str]:
-        """Open the session, on a free port if the configured port is in use. Return the session and its state."""
+    def _open_on_free_port(self) -> tuple["zenoh.Session", str]:
+        """Open the session, on a free port if the configured port is in use; return the session and its state."""
         import zenoh
 
         listen = self.settings.listen
@@ -289,7 +269,7 @@ class ZenohPublisher:
             return session, f"ok, but {', '.join(listen)} is busy: listening on {', '.join(free)}"
 
     def _configuration(self, listen: tuple[str, ...] | None) -> "zenoh.Config":
-        """Return the configuration of zenoh. The settings override the file, and the file overrides the defaults."""
+        """Return the configuration of zenoh. Settings override the zenoh file, and the file overrides the defaults."""
         own = self.settings
         keys: dict[str, Any] = {
             "mode": own.mode,
@@ -302,7 +282,7 @@ class ZenohPublisher:
     def _publisher(
         self, session: "zenoh.Session", topic: topics.Topic, key: str
     ) -> "zenoh.Publisher | AdvancedPublisher":
-        """Declare the publisher of a key; an advanced publisher if the topic keeps values."""
+        """Declare the publisher of a key, which is an advanced publisher if the topic keeps values."""
         import zenoh
         from zenoh import ext
 
@@ -323,67 +303,55 @@ class ZenohPublisher:
     # --- liveliness and commands
 
     def _update_token(self, device: str) -> None:
-        """Declare or remove the liveliness token of a device to match its state."""
+        """Declare the liveliness token of a device if samples arrive, and remove it otherwise."""
         session = self._session
         if session is None:
             return
         key = topics.ALIVE.key(self.settings.prefix, device)
         # An error here means that the session is closing, which removes the token.
-        with self._showing, contextlib.suppress(*_zenoh_errors()):
+        with self._token_lock, contextlib.suppress(*zenoh_errors()):
             if self._alive[device] and device not in self._tokens:
                 self._tokens[device] = session.liveliness().declare_token(key)
             elif not self._alive[device] and device in self._tokens:
                 self._tokens.pop(device).undeclare()
 
     def _declare_queryable(
-        self, session: "zenoh.Session", device: str, key: str, handle: Callable[[Any], None]
+        self, session: "zenoh.Session", device: str, key: str, process: Callable[[Any], None]
     ) -> None:
-        """Declare a queryable of a device, and start the thread that handles its queries."""
+        """Declare a queryable of a device and start the thread that processes queries."""
         import zenoh
 
         queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(MAX_QUEUED_QUERIES))
-        name = f"queries of {key}"
-        thread = threading.Thread(target=self._handle_queries, args=(queryable, handle), name=name, daemon=True)
-        thread.start()
+        self._start_receiving(key, queryable, process)
         self._queryables.setdefault(device, []).append(queryable)
-        self._query_threads = [*(one for one in self._query_threads if one.is_alive()), thread]
-
-    def _handle_queries(self, queryable: Any, handle: Callable[[Any], None]) -> None:
-        """Handle queries until the session is closed (runs in a thread)."""
-        handler = queryable.handler
-        while not self._closing.is_set():
-            try:
-                query = handler.recv()
-            except _zenoh_errors():
-                return
-            handle(query)
 
     def _answer_history(self, device: str, read_history: HistoryFunction, query: Any) -> None:
         """Answer a query of ``history``."""
-        answer, _ = _reply_functions(query, topics.HISTORY.key(self.settings.prefix, device))
-        with contextlib.suppress(*_zenoh_errors()):  # the session may have been closed meanwhile
+        reply_result, _ = _reply_functions(query, topics.HISTORY.key(self.settings.prefix, device))
+        with contextlib.suppress(*zenoh_errors()):  # the session may have been closed meanwhile
             try:
                 payload = read_history(device, str(query.parameters))
             except ImuError as error:
                 _reply_error(query, error)
             else:
-                answer(payload)
+                reply_result(payload)
 
     def _queue_command(self, device: str, query: Any) -> None:
         """Pass a command to the queue."""
         verb = str(query.key_expr).rsplit("/", 1)[-1]
-        key = f"{self.settings.prefix}/{device}/command/{verb}"  # the key of the query may match several devices
+        key = f"{self.settings.prefix}/{device}/command/{verb}"  # the query itself may select several devices
         command = Command(device, verb, *_reply_functions(query, key))
         try:
             self.commands.put_nowait(command)
         except queue.Full:
-            command.refuse("busy: too many commands wait")
+            command.reply_refusal("busy: too many commands are waiting")
 
 
 class _DuplicatePublishers:
     """Detector of other sessions that publish the status of a device under the same key.
 
-    A subscriber would receive both mixed, and a command would reach both.
+    If two programs publish under one key, a subscriber receives a mixture of messages, and both programs execute a
+    command.
 
     Parameters
     ----------
@@ -396,8 +364,8 @@ class _DuplicatePublishers:
         self._subscribers: dict[str, Any] = {}
         self._heard_s: dict[str, float] = {}
 
-    def add(self, session: "zenoh.Session", device: str) -> None:
-        """Subscribe to the status that other sessions publish for a device; the own messages are excluded."""
+    def watch_other_publishers(self, session: "zenoh.Session", device: str) -> None:
+        """Subscribe to the status messages that other sessions publish for a device."""
         import zenoh
 
         key = topics.STATUS.key(self._prefix, device)
@@ -405,21 +373,21 @@ class _DuplicatePublishers:
         one = session.declare_subscriber(key, ring, allowed_origin=zenoh.Locality.REMOTE)
         self._subscribers = {**self._subscribers, device: one}
 
-    def remove(self, device: str) -> list[Any]:
+    def forget_device(self, device: str) -> list[Any]:
         """Forget a device; return the subscribers to undeclare."""
         self._heard_s.pop(device, None)
         removed = [one for name, one in self._subscribers.items() if name == device]
         self._subscribers = {name: one for name, one in self._subscribers.items() if name != device}
         return removed
 
-    def clear(self) -> None:
+    def forget_devices(self) -> None:
         """Forget all devices; their subscribers are closed with the session."""
         self._subscribers, self._heard_s = {}, {}
 
-    def found(self, now_s: float) -> str:
+    def duplicate_publisher_message(self, now_s: float) -> str:
         """Return a message if another program published a device's status within DUPLICATE_REPORT_S; else ""."""
         for device, one in self._subscribers.items():
-            with contextlib.suppress(*_zenoh_errors()):  # the session is being closed
+            with contextlib.suppress(*zenoh_errors()):  # the session is being closed
                 if one.handler.try_recv() is not None:
                     self._heard_s[device] = now_s
         keys = [f"{self._prefix}/{one}" for one, at_s in self._heard_s.items() if now_s - at_s < DUPLICATE_REPORT_S]
@@ -432,15 +400,15 @@ def _reply_functions(query: Any, key: str) -> tuple[Callable[[bytes], None], Cal
     """Return functions that end a query with a result or with an error."""
     import zenoh
 
-    def answer(payload: bytes) -> None:
+    def reply_result(payload: bytes) -> None:
         with query:
             query.reply(key, payload, encoding=zenoh.Encoding(topics.JSON))
 
-    def refuse(why: str) -> None:
+    def reply_refusal(reason: str) -> None:
         with query:
-            query.reply_err(json.dumps({"error": why}).encode(), encoding=zenoh.Encoding(topics.JSON))
+            query.reply_err(json.dumps({"error": reason}).encode(), encoding=zenoh.Encoding(topics.JSON))
 
-    return answer, refuse
+    return reply_result, reply_refusal
 
 
 def _reply_error(query: Any, error: ImuError) -> None:
@@ -454,17 +422,10 @@ def _reply_error(query: Any, error: ImuError) -> None:
 
 
 def _free_port(endpoint: str) -> str:
-    """Return the endpoint with a port that is free now; endpoints other than tcp/host:port are not changed."""
+    """Return the endpoint with a free port. Endpoints other than tcp/host:port are not changed."""
     match = re.fullmatch(r"tcp/\[?([^\]]+?)\]?:\d+", endpoint)
     if match is None:
         return endpoint
     family = socket.AF_INET6 if ":" in match[1] else socket.AF_INET
     with socket.create_server((match[1], 0), family=family) as server:
         return re.sub(r":\d+$", f":{server.getsockname()[1]}", endpoint)
-
-
-def _zenoh_errors() -> tuple[type[Exception], ...]:
-    """Return the exceptions of zenoh, which is imported only when needed."""
-    import zenoh
-
-    return (zenoh.ZError,)

@@ -19,16 +19,16 @@ from scipy.fft import irfft, next_fast_len, rfft
 from drivers.sample import Floats
 from monitor.noise.effects import (
     PoissonSteps,
+    RandomSampleHold,
     RandomTelegraph,
     RateRamp,
     Resolution,
-    SampleHold,
     Saturation,
     TemperatureBias,
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.likelihood.variance_history import SpectrogramExtremes, find_least_constant_tiles
+from monitor.reconcile.likelihood.variance_history import LeastConstantTiles, find_least_constant_tiles
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, noise_deviation_over_time
 from monitor.reconcile.preparation.cosine_bins import frequency_bins, inverse_cosine_transform
 from monitor.reconcile.result import Location
@@ -61,17 +61,17 @@ Diagnostic = Callable[[WhitenedAxis], Finding]
 """Function that measures one kind of departure."""
 
 
-def diagnose_psd(seen: WhitenedAxis) -> Finding:
+def diagnose_psd(whitened: WhitenedAxis) -> Finding:
     """Find the range of frequency bins, of any width, whose power differs most from its expectation."""
-    bins = frequency_bins(seen.axis.n, seen.axis.rate_hz)  # the same bins for recordings with and without peaks
-    power = np.concatenate([[0.0], np.cumsum(bins.sums(seen.whitened**2))])
+    bins = frequency_bins(whitened.axis.n, whitened.axis.rate_hz)  # the same bins for recordings with and without peaks
+    power = np.concatenate([[0.0], np.cumsum(bins.sums(whitened.coefficients**2))])
     count = np.concatenate([[0.0], np.cumsum(bins.count)])
     best, place = 0.0, (0, 1)
     width = 1
     while width <= bins.count.size:
         first = np.arange(0, bins.count.size - width + 1, max(1, width // 4))
         c = count[first + width] - count[first]
-        gains = power_gain((power[first + width] - power[first]) / c, c)
+        gains = free_variance_gain_nats((power[first + width] - power[first]) / c, c)
         at = int(np.argmax(gains))
         if gains[at] > best:
             best, place = float(gains[at]), (int(first[at]), int(first[at]) + width)
@@ -80,7 +80,7 @@ def diagnose_psd(seen: WhitenedAxis) -> Finding:
     return Finding(best, Location(frequency=(float(lo), float(hi))))
 
 
-def power_gain(ratio: Floats, count: Floats) -> Floats:
+def free_variance_gain_nats(ratio: Floats, count: Floats) -> Floats:
     """Return the log-likelihood gain of a free variance: n/2 (ρ − 1 − ln ρ).
 
     Parameters
@@ -99,11 +99,11 @@ def power_gain(ratio: Floats, count: Floats) -> Floats:
     return np.asarray(0.5 * count * (safe - 1.0 - np.log(safe)))
 
 
-def diagnose_lines(seen: WhitenedAxis) -> Finding:
+def diagnose_lines(whitened: WhitenedAxis) -> Finding:
     """Find a steady oscillation: the largest value of the periodogram at twice the usual resolution."""
-    found = find_line_peaks(seen.white, seen.axis.rate_hz, 1)
+    found = find_line_peaks(whitened.series, whitened.axis.rate_hz, 1)
     gain, f_hz = found[0]
-    half = seen.axis.rate_hz / seen.axis.n
+    half = whitened.axis.rate_hz / whitened.axis.n
     return Finding(gain, Location(frequency=(f_hz - half, f_hz + half)))
 
 
@@ -151,27 +151,31 @@ def periodogram(white: Floats) -> Floats:
     return np.asarray(power)
 
 
-def diagnose_level(seen: WhitenedAxis) -> Finding:
+def diagnose_level_change(whitened: WhitenedAxis) -> Finding:
     """Find a change of the level: a step at any time, a slope, or a transient after the start.
 
     If the model itself contains jumps, a change of the level is no evidence, because whitening does not remove jumps.
     """
-    if any(isinstance(effect, (PoissonSteps, RandomTelegraph)) for effect in seen.effects):
+    if any(isinstance(effect, (PoissonSteps, RandomTelegraph)) for effect in whitened.effects):
         return NO_FINDING
-    axis = seen.axis
-    gains, times_s = step_gains(seen)
+    axis = whitened.axis
+    gains, times_s = level_step_gains(whitened)
     at = int(np.argmax(gains))
     found = [Finding(float(gains[at]), Location(time=(float(times_s[at]), float(times_s[at]))))]
     for fraction in TRANSIENT_TIME_FRACTIONS:
         effect = TurnOnTransient(amplitude=1.0, time_constant=float(fraction * axis.length_s))
-        found.append(Finding(_regressor_gain(seen, axis.columns(effect)), Location(time=(0.0, effect.time_constant))))
-    ramp = axis.columns(RateRamp(R=1.0))
-    curved = _regressor_gain(seen, [*ramp, axis.regressors.curvature]) - CURVE_PENALTY_NATS
-    found.append(Finding(max(_regressor_gain(seen, ramp), curved), Location(time=(0.0, axis.length_s))))
+        found.append(
+            Finding(
+                _regressor_gain(whitened, axis.regressor_transforms(effect)), Location(time=(0.0, effect.time_constant))
+            )
+        )
+    ramp = axis.regressor_transforms(RateRamp(R=1.0))
+    curved = _regressor_gain(whitened, [*ramp, axis.regressors.curvature]) - CURVE_PENALTY_NATS
+    found.append(Finding(max(_regressor_gain(whitened, ramp), curved), Location(time=(0.0, axis.length_s))))
     return max(found, key=lambda one: one.gain)
 
 
-def step_gains(seen: WhitenedAxis) -> tuple[Floats, Floats]:
+def level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats]:
     """Return the gain of a step at each time, by two Fourier transforms.
 
     The coefficients of a step at sample s are −√(2/n) sin(πks/n)/(2 sin(πk/2n)). Their weighted sum of squares is Σ W_k
@@ -184,12 +188,12 @@ def step_gains(seen: WhitenedAxis) -> tuple[Floats, Floats]:
     times_s : ndarray of float64, shape (k,)
         Time of the step in seconds from the start.
     """
-    axis = seen.axis
+    axis = whitened.axis
     n = axis.n
-    weighted = inverse_cosine_transform(seen.whitened * seen.weight)
+    weighted = inverse_cosine_transform(whitened.coefficients * whitened.weights)
     product = np.cumsum(weighted[::-1])[::-1]  # [n] product of the data with a step at each sample
     u = np.zeros(n)
-    u[1:] = seen.weight**2 * axis.regressors.step_power
+    u[1:] = whitened.weights**2 * axis.regressors.step_power
     cosines = rfft(u).real  # for s up to n/2; the values beyond are the mirror image
     square = u.sum() - np.concatenate([cosines, cosines[1 : n - cosines.size + 1][::-1]])
     margin = ceil(STEP_MARGIN_FRACTION * n)
@@ -198,20 +202,20 @@ def step_gains(seen: WhitenedAxis) -> tuple[Floats, Floats]:
     return gains, np.arange(n)[inside] / axis.rate_hz
 
 
-def _regressor_gain(seen: WhitenedAxis, columns: list[Floats]) -> float:
+def _regressor_gain(whitened: WhitenedAxis, columns: list[Floats]) -> float:
     """Return the log-likelihood gain in nats of regressors, each of shape (n − 1,), with free sizes."""
-    stacked = np.stack([column * seen.weight for column in columns])
-    normal, right = stacked @ stacked.T, stacked @ seen.whitened
+    stacked = np.stack([column * whitened.weights for column in columns])
+    normal, right = stacked @ stacked.T, stacked @ whitened.coefficients
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
     solved, *_ = np.linalg.lstsq(normal / np.outer(scale, scale), right / scale, rcond=1e-9)
     return float(0.5 * solved @ (right / scale))
 
 
-def diagnose_autocorrelation(seen: WhitenedAxis) -> Finding:
+def diagnose_autocorrelation(whitened: WhitenedAxis) -> Finding:
     """Find the lag at which the whitened series is most strongly correlated with itself."""
-    gains = 0.5 * autocorrelation(seen.white) ** 2 * seen.axis.n
+    gains = 0.5 * autocorrelation(whitened.series) ** 2 * whitened.axis.n
     at = int(np.argmax(gains))
-    lag_s = (at + 1) / seen.axis.rate_hz
+    lag_s = (at + 1) / whitened.axis.rate_hz
     return Finding(float(gains[at]), Location(tau=(lag_s, lag_s)))
 
 
@@ -223,15 +227,15 @@ def autocorrelation(white: Floats) -> Floats:
     return np.asarray(products[1 : MAX_LAG_SAMPLES + 1] / white.size)
 
 
-def diagnose_temperature(seen: WhitenedAxis) -> Finding:
+def diagnose_temperature(whitened: WhitenedAxis) -> Finding:
     """Find a dependence of the level on the temperature, with and without delay."""
-    temperature_c = seen.axis.temperature_c
+    temperature_c = whitened.axis.temperature_c
     if temperature_c is None:
         return NO_FINDING
     reference = float(temperature_c.mean())
 
     def gain(effect: TemperatureBias | TemperatureLag) -> float:
-        return _regressor_gain(seen, seen.axis.columns(effect))
+        return _regressor_gain(whitened, whitened.axis.regressor_transforms(effect))
 
     gains = [
         gain(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0)) - CURVE_PENALTY_NATS,
@@ -241,61 +245,67 @@ def diagnose_temperature(seen: WhitenedAxis) -> Finding:
     return Finding(max(gains), Location(temperature=(float(temperature_c.min()), float(temperature_c.max()))))
 
 
-def diagnose_other_axes(seen: WhitenedAxis) -> Finding:
+def diagnose_other_axes(whitened: WhitenedAxis) -> Finding:
     """Find the axis that leaks most strongly into this axis."""
     best = NO_FINDING
-    for name, coefficients in seen.axis.others.items():
-        gain = _regressor_gain(seen, [coefficients])
+    for name, coefficients in whitened.axis.leak_sources.items():
+        gain = _regressor_gain(whitened, [coefficients])
         if gain > best.gain:
             best = Finding(gain, Location(source=name))
     return best
 
 
-def diagnose_variance(seen: WhitenedAxis) -> Finding:
+def diagnose_variance(whitened: WhitenedAxis) -> Finding:
     """Find a variation of the noise variance in time: a step, a trend, a period or a slow random variation."""
-    found = seen.variance_history
+    found = whitened.variance_changes
     gain = max(found.step.gain, found.trend, found.periodic, found.wander)
     return Finding(gain, Location(time=(found.step.time.lo, found.step.time.hi)))
 
 
-def diagnose_spectrogram(seen: WhitenedAxis) -> Finding:
+def diagnose_spectrogram(whitened: WhitenedAxis) -> Finding:
     """Find the rectangle of time and frequency, or the frequency range, whose power is least constant in time."""
-    found = least_constant_tiles(seen)
+    found = least_constant_tiles(whitened)
     if found.gain >= found.row_gain:
         return Finding(found.gain, Location(time=found.time, frequency=found.frequency))
     return Finding(found.row_gain, Location(frequency=found.row))
 
 
-def least_constant_tiles(seen: WhitenedAxis) -> SpectrogramExtremes:
+def least_constant_tiles(whitened: WhitenedAxis) -> LeastConstantTiles:
     """Return the least constant parts of the spectrogram, corrected for the noise steps of the axis."""
-    return find_least_constant_tiles(seen.white / noise_deviation_over_time(seen.fit), 1.0 / seen.axis.rate_hz)
+    return find_least_constant_tiles(
+        whitened.series / noise_deviation_over_time(whitened.fit), 1.0 / whitened.axis.rate_hz
+    )
 
 
-def diagnose_tails(seen: WhitenedAxis) -> Finding:
+def diagnose_tails(whitened: WhitenedAxis) -> Finding:
     """Find outliers in the distribution of the samples."""
-    found = seen.outliers
+    found = whitened.outliers
     return Finding(found.gain if found else 0.0, Location())
 
 
-def diagnose_values(seen: WhitenedAxis) -> Finding:
+def diagnose_quantization_clipping_repeats(whitened: WhitenedAxis) -> Finding:
     """Find quantization, clipping or repeats in the measured values that the model does not contain."""
-    have = {type(effect) for effect in seen.effects}
-    shown = seen.axis.shown
+    have = {type(effect) for effect in whitened.effects}
+    statistics = whitened.axis.value_statistics
     best = NO_FINDING
-    for kind, found in ((Resolution, shown.levels), (Saturation, shown.clipped), (SampleHold, shown.repeats)):
+    for kind, found in (
+        (Resolution, statistics.quantization),
+        (Saturation, statistics.clipping),
+        (RandomSampleHold, statistics.repeats),
+    ):
         if found is not None and kind not in have and found.gain > best.gain:
             best = Finding(found.gain, Location())
-    if best.gain and shown.clipped is not None and best.gain == shown.clipped.gain:
-        return Finding(best.gain, Location(value=(shown.clipped.limit.lo, shown.clipped.limit.hi)))
+    if best.gain and statistics.clipping is not None and best.gain == statistics.clipping.gain:
+        return Finding(best.gain, Location(value=(statistics.clipping.limit.lo, statistics.clipping.limit.hi)))
     return best
 
 
 DIAGNOSTICS: Final[dict[str, Diagnostic]] = {
-    "values": diagnose_values,
+    "values": diagnose_quantization_clipping_repeats,
     "psd": diagnose_psd,
     "lines": diagnose_lines,
     "autocorrelation": diagnose_autocorrelation,
-    "level": diagnose_level,
+    "level": diagnose_level_change,
     "temperature": diagnose_temperature,
     "other_axes": diagnose_other_axes,
     "tails": diagnose_tails,

@@ -21,7 +21,7 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
-from monitor.reconcile.result import Score
+from monitor.reconcile.result import DiagnosticGap
 
 FALSE_ALARM_PROBABILITY: Final = 0.01
 """Fraction of the recordings of a true model that pass a threshold in any diagnostic on any axis."""
@@ -48,25 +48,23 @@ AxisNull = Mapping[str, NullDistribution]
 """Null distributions of all diagnostics on one axis, by the name of the diagnostic."""
 
 
-def run_diagnostics(seen: WhitenedAxis) -> Findings:
+def run_diagnostics(whitened: WhitenedAxis) -> Findings:
     """Run all diagnostics on a whitened axis."""
-    return {name: diagnose(seen) for name, diagnose in DIAGNOSTICS.items()}
+    return {name: diagnose(whitened) for name, diagnose in DIAGNOSTICS.items()}
 
 
-def null_distributions(simulated: Mapping[str, Sequence[Findings]], axes: int) -> dict[str, AxisNull]:
+def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> dict[str, AxisNull]:
     """Return the null distributions of each axis.
 
     Parameters
     ----------
     simulated : mapping of str to sequence of Findings
         For each axis, the findings of the simulated recordings.
-    axes : int
-        Number of axes that are tested together.
     """
     found: dict[str, dict[str, NullDistribution]] = {axis: {} for axis in simulated}
     for lens in DIAGNOSTICS:
         gains = {axis: np.array([one[lens].gain for one in seen]) for axis, seen in simulated.items()}
-        pooled = _tail_quantiles(np.concatenate(list(gains.values())), axes)
+        pooled = _tail_quantiles(np.concatenate(list(gains.values())), len(simulated))
         for axis, own in gains.items():
             largest = float(own.max(initial=0.0))
             if largest + AXIS_MARGIN_NATS <= pooled.threshold:
@@ -76,16 +74,16 @@ def null_distributions(simulated: Mapping[str, Sequence[Findings]], axes: int) -
     return dict(found)
 
 
-def _tail_quantiles(gains: Floats, axes: int) -> NullDistribution:
+def _tail_quantiles(gains: Floats, axis_count: int) -> NullDistribution:
     """Return the quantiles of the null distribution from pooled gains."""
     quartile = float(np.quantile(gains, 1.0 - UPPER_QUANTILE)) if gains.size else 0.0
     beyond = gains[gains > quartile] - quartile
     scale = float(np.clip(beyond.mean() if beyond.size else EXCESS_RANGE_NATS[0], *EXCESS_RANGE_NATS))
-    p = FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * axes)
+    p = FALSE_ALARM_PROBABILITY / (len(DIAGNOSTICS) * axis_count)
     return NullDistribution(quartile + scale * log(UPPER_QUANTILE / 0.05), quartile + scale * log(UPPER_QUANTILE / p))
 
 
-def score_findings(findings: Findings, null: AxisNull) -> tuple[Score, ...]:
+def measure_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:
     """Return the scores of an axis, in the order of the diagnostics.
 
     Parameters
@@ -96,6 +94,6 @@ def score_findings(findings: Findings, null: AxisNull) -> tuple[Score, ...]:
         Null distribution of each diagnostic.
     """
     return tuple(
-        Score(lens, one.where, *(sqrt(2.0 * x) for x in (one.gain, null[lens].null95, null[lens].threshold)))
+        DiagnosticGap(lens, one.where, *(sqrt(2.0 * x) for x in (one.gain, null[lens].null95, null[lens].threshold)))
         for lens, one in findings.items()
     )

@@ -29,112 +29,112 @@ LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}
 """Unit of the level by the first letter of the axis."""
 
 
-def plot_data(seen: WhitenedAxis) -> tuple[PlotData, ...]:
+def plot_data(whitened: WhitenedAxis) -> tuple[PlotData, ...]:
     """Return the plot data of every diagnostic that has a plot."""
-    fitted = _deterministic_series(seen)
+    fitted = _deterministic_series(whitened)
     plots = [
-        _plot_psd(seen),
-        _plot_allan_deviation(seen, fitted),
-        _plot_level(seen, fitted),
-        _plot_variance(seen),
-        _plot_tails(seen),
-        _plot_autocorrelation(seen),
+        _plot_psd(whitened),
+        _plot_allan_deviation(whitened, fitted),
+        _plot_level(whitened, fitted),
+        _plot_variance(whitened),
+        _plot_tails(whitened),
+        _plot_autocorrelation(whitened),
     ]
-    if seen.axis.temperature_c is not None and np.ptp(seen.axis.temperature_c) > 0.0:
-        plots.append(_plot_level_over_temperature(seen, fitted, seen.axis.temperature_c))
+    if whitened.axis.temperature_c is not None and np.ptp(whitened.axis.temperature_c) > 0.0:
+        plots.append(_plot_level_over_temperature(whitened, fitted, whitened.axis.temperature_c))
     return tuple(plots)
 
 
-def _deterministic_series(seen: WhitenedAxis) -> Floats:
+def _deterministic_series(whitened: WhitenedAxis) -> Floats:
     """Return the sum of the fitted deterministic effects, shape (n,), without its mean."""
-    repaired = seen.axis.repaired
-    return np.asarray(repaired - repaired.mean() - inverse_cosine_transform(seen.fit.residual()))
+    repaired = whitened.axis.repaired
+    return np.asarray(repaired - repaired.mean() - inverse_cosine_transform(whitened.fit.residual_coefficients()))
 
 
-def _plot_psd(seen: WhitenedAxis) -> PlotData:
+def _plot_psd(whitened: WhitenedAxis) -> PlotData:
     """Return the plot of the spectral density."""
-    bins, tau0_s = seen.axis.bins, 1.0 / seen.axis.rate_hz
-    used = np.flatnonzero(seen.axis.used_bins)
+    bins, tau0_s = whitened.axis.bins, 1.0 / whitened.axis.rate_hz
+    used = np.flatnonzero(whitened.axis.used_bins)
     # average neighbouring bins to about SPECTRUM_POINTS points that are evenly spaced in the logarithm of frequency
     f = np.log(bins.f_hz[used])
     cell = np.floor((f - f[0]) / max(f[-1] - f[0], 1e-9) * SPECTRUM_POINTS)
     first = np.flatnonzero(np.diff(cell, prepend=-1.0))
     count = np.add.reduceat(bins.count[used], first)
-    expected = np.add.reduceat((bins.count * seen.fit.fitted.variance)[used], first) / count * tau0_s
-    measured = np.add.reduceat(seen.fit.fitted.residual[used], first) / count * tau0_s
+    expected = np.add.reduceat((bins.count * whitened.fit.whittle.variance)[used], first) / count * tau0_s
+    measured = np.add.reduceat(whitened.fit.whittle.residual[used], first) / count * tau0_s
     middle = np.exp(np.add.reduceat((bins.count * np.log(bins.f_hz))[used], first) / count)
     lo, hi = _chi2_band(count)
-    unit = f"({_level_unit(seen)})²/Hz"
+    unit = f"({_level_unit(whitened)})²/Hz"
     names = ("psd", "frequency", "Hz", "spectral density", unit)
     return PlotData(*names, True, middle, measured, expected, lo * expected, hi * expected)
 
 
-def _plot_allan_deviation(seen: WhitenedAxis, fitted: Floats) -> PlotData:
+def _plot_allan_deviation(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
     """Return the plot of the Allan deviation."""
-    axis, tau0_s = seen.axis, 1.0 / seen.axis.rate_hz
+    axis, tau0_s = whitened.axis, 1.0 / whitened.axis.rate_hz
     m = cluster_sizes(axis.n, axis.rate_hz)
     measured, _ = overlapping_avar_axis(axis.repaired, m)
     deterministic, _ = overlapping_avar_axis(fitted, m)
     tau_s = np.asarray(m * tau0_s, np.float64)
-    noise = allan_of_density(_density_function(seen), tau_s, tau0_s, ())
-    lo, hi = _chi2_band(_allan_degrees_of_freedom(seen, m))
+    noise = allan_of_density(_density_function(whitened), tau_s, tau0_s, ())
+    lo, hi = _chi2_band(_allan_degrees_of_freedom(whitened, m))
     curves = (measured, noise + deterministic, lo * noise + deterministic, hi * noise + deterministic)
-    names = ("allan", "averaging time", "s", "Allan deviation", _level_unit(seen))
+    names = ("allan", "averaging time", "s", "Allan deviation", _level_unit(whitened))
     return PlotData(*names, True, tau_s, *(np.sqrt(avar) for avar in curves))
 
 
-def _density_function(seen: WhitenedAxis) -> Callable[[Floats], Floats]:
+def _density_function(whitened: WhitenedAxis) -> Callable[[Floats], Floats]:
     """Return the spectral density of the fitted noise as an interpolating function of the frequency in Hz."""
-    bins = seen.axis.bins
-    x, y = np.log(bins.f_hz), np.log(seen.fit.fitted.variance / seen.axis.rate_hz)
+    bins = whitened.axis.bins
+    x, y = np.log(bins.f_hz), np.log(whitened.fit.whittle.variance / whitened.axis.rate_hz)
     return lambda f: np.asarray(np.exp(np.interp(np.log(f), x, y)))
 
 
-def _allan_degrees_of_freedom(seen: WhitenedAxis, m: Ints) -> Floats:
+def _allan_degrees_of_freedom(whitened: WhitenedAxis, m: Ints) -> Floats:
     """Return the degrees of freedom of overlapping Allan variances.
 
     An Allan variance is a sum Σ a_k Y_k² of squared coefficients with variances v. The degrees of freedom are therefore
     2 E²/Var = (Σ a v)²/Σ (a v)². The weights are a_k ∝ sin⁴(πfτ)/sin²(πfτ0). If a bin contains more than a period of
     sin⁴, the mean 3/8 and the mean square 35/128 are used.
     """
-    bins, variance = seen.axis.bins, seen.fit.fitted.variance
+    bins, variance = whitened.axis.bins, whitened.fit.whittle.variance
     f, count = bins.f_hz, bins.count
-    width = count * 0.5 * seen.axis.rate_hz / seen.axis.n
+    width = count * 0.5 * whitened.axis.rate_hz / whitened.axis.n
     found = np.empty(m.size)
     for at, factor in enumerate(m.tolist()):
-        tau_s = factor / seen.axis.rate_hz
+        tau_s = factor / whitened.axis.rate_hz
         averaged = width * tau_s > 0.5
         square = np.sin(np.pi * f * tau_s) ** 2
         first, second = np.where(averaged, 0.375, square**2), np.where(averaged, 35.0 / 128.0, square**4)
-        rest = variance / np.sin(np.pi * f / seen.axis.rate_hz) ** 2
+        rest = variance / np.sin(np.pi * f / whitened.axis.rate_hz) ** 2
         found[at] = (count * first * rest).sum() ** 2 / (count * second * rest**2).sum()
     return np.maximum(found, 1.0)
 
 
-def _plot_level(seen: WhitenedAxis, fitted: Floats) -> PlotData:
+def _plot_level(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
     """Return the plot of the level over time."""
-    axis = seen.axis
+    axis = whitened.axis
     length = max(1, axis.n // TIME_BLOCKS)
     measured, expected = _block_means(axis.repaired, length), _block_means(fitted, length) + axis.repaired.mean()
-    spread = _level_spread(seen, length / axis.rate_hz)
-    names = ("level", "time", "s", "level", _level_unit(seen))
+    spread = _level_spread(whitened, length / axis.rate_hz)
+    names = ("level", "time", "s", "level", _level_unit(whitened))
     times_s = _block_times_s(measured.size, length, axis.rate_hz)
     return PlotData(*names, False, times_s, measured, expected, expected - spread, expected + spread)
 
 
-def _level_spread(seen: WhitenedAxis, length_s: float) -> float:
+def _level_spread(whitened: WhitenedAxis, length_s: float) -> float:
     """Return half the width of the 95 % band of the mean over a time, in the unit of the axis."""
-    bins = seen.axis.bins
+    bins = whitened.axis.bins
     weight = np.sinc(bins.f_hz * length_s) ** 2
-    return Z95 * float(np.sqrt((bins.count * seen.fit.fitted.variance * weight).sum() / seen.axis.n))
+    return Z95 * float(np.sqrt((bins.count * whitened.fit.whittle.variance * weight).sum() / whitened.axis.n))
 
 
-def _plot_variance(seen: WhitenedAxis) -> PlotData:
+def _plot_variance(whitened: WhitenedAxis) -> PlotData:
     """Return the plot of the noise standard deviation over time."""
-    axis = seen.axis
+    axis = whitened.axis
     length = max(1, axis.n // TIME_BLOCKS)
-    deviation = noise_deviation_over_time(seen.fit)
-    measured = np.sqrt(_block_means((seen.fast * deviation) ** 2, length))
+    deviation = noise_deviation_over_time(whitened.fit)
+    measured = np.sqrt(_block_means((whitened.flat_series * deviation) ** 2, length))
     expected = np.sqrt(_block_means(deviation**2, length))
     lo, hi = np.sqrt(_chi2_band(np.array([float(length)])))
     names = ("variance", "time", "s", "noise over its mean", "1")
@@ -142,9 +142,9 @@ def _plot_variance(seen: WhitenedAxis) -> PlotData:
     return PlotData(*names, False, times_s, measured, expected, lo * expected, hi * expected)
 
 
-def _plot_tails(seen: WhitenedAxis) -> PlotData:
+def _plot_tails(whitened: WhitenedAxis) -> PlotData:
     """Return the plot of the share of samples beyond a distance."""
-    magnitudes = np.sort(np.abs(seen.fast))
+    magnitudes = np.sort(np.abs(whitened.flat_series))
     n = magnitudes.size
     x = np.linspace(0.5, max(float(magnitudes[-1]), 4.0), 80)
     measured = 1.0 - np.searchsorted(magnitudes, x) / n
@@ -157,17 +157,17 @@ def _plot_tails(seen: WhitenedAxis) -> PlotData:
     return PlotData(*names, True, x, measured, expected, lo, hi)
 
 
-def _plot_autocorrelation(seen: WhitenedAxis) -> PlotData:
+def _plot_autocorrelation(whitened: WhitenedAxis) -> PlotData:
     """Return the plot of the autocorrelation of the whitened series."""
-    lag_s = np.arange(1, MAX_LAG_SAMPLES + 1) / seen.axis.rate_hz
-    zero, band = np.zeros(MAX_LAG_SAMPLES), np.full(MAX_LAG_SAMPLES, Z95 / seen.white.size**0.5)
+    lag_s = np.arange(1, MAX_LAG_SAMPLES + 1) / whitened.axis.rate_hz
+    zero, band = np.zeros(MAX_LAG_SAMPLES), np.full(MAX_LAG_SAMPLES, Z95 / whitened.series.size**0.5)
     names = ("autocorrelation", "lag", "s", "autocorrelation", "1")
-    return PlotData(*names, False, lag_s, autocorrelation(seen.white), zero, -band, band)
+    return PlotData(*names, False, lag_s, autocorrelation(whitened.series), zero, -band, band)
 
 
-def _plot_level_over_temperature(seen: WhitenedAxis, fitted: Floats, temperature_c: Floats) -> PlotData:
+def _plot_level_over_temperature(whitened: WhitenedAxis, fitted: Floats, temperature_c: Floats) -> PlotData:
     """Return the plot of the level over temperature."""
-    axis = seen.axis
+    axis = whitened.axis
     edges = np.linspace(float(temperature_c.min()), float(temperature_c.max()), TEMPERATURE_BINS + 1)
     cell = np.clip(np.searchsorted(edges, temperature_c, "right") - 1, 0, TEMPERATURE_BINS - 1)
     count = np.bincount(cell, minlength=TEMPERATURE_BINS)
@@ -177,15 +177,15 @@ def _plot_level_over_temperature(seen: WhitenedAxis, fitted: Floats, temperature
         return np.asarray(np.bincount(cell, weights=series, minlength=TEMPERATURE_BINS)[filled] / count[filled])
 
     expected = means(fitted) + axis.repaired.mean()
-    spread = np.array([_level_spread(seen, length_s) for length_s in count[filled] / axis.rate_hz])
-    names = ("temperature", "temperature", "°C", "level", _level_unit(seen))
+    spread = np.array([_level_spread(whitened, length_s) for length_s in count[filled] / axis.rate_hz])
+    names = ("temperature", "temperature", "°C", "level", _level_unit(whitened))
     middle = 0.5 * (edges[1:] + edges[:-1])[filled]
     return PlotData(*names, False, middle, means(axis.repaired), expected, expected - spread, expected + spread)
 
 
-def _level_unit(seen: WhitenedAxis) -> str:
+def _level_unit(whitened: WhitenedAxis) -> str:
     """Return the unit of the level of an axis."""
-    return LEVEL_UNITS[seen.axis.name[0]]
+    return LEVEL_UNITS[whitened.axis.name[0]]
 
 
 def _block_means(values: Floats, length: int) -> Floats:

@@ -21,18 +21,18 @@ from monitor.noise.effects import (
     BandwidthLimit,
     Bias,
     NoiseStep,
+    RandomSampleHold,
     Resolution,
-    SampleHold,
     Saturation,
 )
 from monitor.noise.spectrum import Spectrum, white_noise_spectrum
 from monitor.reconcile.likelihood.effect_terms import (
     DETERMINISTIC_SIZE_PARAMETERS,
     NOISE_SIZE_PARAMETERS,
-    regressors,
     size,
+    unit_regressors,
     unit_spectrum,
-    with_factors,
+    with_regressor_factors,
     with_size,
 )
 from monitor.reconcile.likelihood.whittle import BinSums, WhittleFit, maximise_whittle
@@ -69,8 +69,8 @@ CURVATURE: Final[Regressor] = (Bias(value=1.0), 0)
 class ValueStatistics:
     """Statistics of the measured values of an axis: quantization levels, clipping and repeated samples."""
 
-    levels: QuantizationGrid | None
-    clipped: Clipping | None
+    quantization: QuantizationGrid | None
+    clipping: Clipping | None
     repeats: RepeatedSamples | None
 
 
@@ -88,21 +88,21 @@ class RegressorCache:
     """
 
     def __init__(self, n: int, rate_hz: float, temperature_c: Floats | None) -> None:
-        def make(effect: Effect) -> list[Floats]:
-            return [cosine_transform(series) for series in regressors(effect, n, rate_hz, temperature_c)]
+        def transform_regressors(effect: Effect) -> list[Floats]:
+            return [cosine_transform(series) for series in unit_regressors(effect, n, rate_hz, temperature_c)]
 
         self.curvature = cosine_transform(np.linspace(-1.0, 1.0, n) ** 2)
         """[n − 1] transform of t², a drift that corresponds to no named effect."""
         self.step_power = 0.25 / n / np.sin(0.5 * np.pi * np.arange(1, n) / n) ** 2
         """[n − 1] mean squares of the coefficients of a unit step, averaged over all step times."""
-        self._make = lru_cache(max(MIN_CACHED_SERIES, MAX_CACHE_BYTES // (8 * n)))(make)
+        self._transform_regressors = lru_cache(max(MIN_CACHED_SERIES, MAX_CACHE_BYTES // (8 * n)))(transform_regressors)
 
-    def columns(self, effect: Effect) -> list[Floats]:
+    def regressor_transforms(self, effect: Effect) -> list[Floats]:
         """Return the transforms of the regressors of a deterministic effect with size one, each of shape (n − 1,)."""
-        return self._make(with_factors(effect, np.ones(2)))
+        return self._transform_regressors(with_regressor_factors(effect, np.ones(2)))
 
 
-class NoiseVariances(NamedTuple):
+class _NoiseVariances(NamedTuple):
     """Variances of the coefficients of each bin due to noise effects."""
 
     free: list[int]  # index of each fitted noise effect
@@ -120,9 +120,9 @@ class Axis:
     repaired: Floats  # [n] rad/s or m/s², repaired
     coefficients: Floats  # [n − 1] cosine transform of ``repaired``
     bins: Bins
-    others: Mapping[str, Floats]  # [n − 1] transforms of the axes that may leak into this axis
+    leak_sources: Mapping[str, Floats]  # [n − 1] transforms of the axes that may leak into this axis
     temperature_c: Floats | None  # [n] °C
-    shown: ValueStatistics
+    value_statistics: ValueStatistics
     regressors: RegressorCache  # shared by all axes of a recording and of its simulations
     used_bins: Floats = field(init=False)  # [m] 1 for bins that are used, 0 for bins deep in a stop band
     _products: dict[tuple[object, ...], Floats] = field(init=False, default_factory=dict)
@@ -156,17 +156,21 @@ class Axis:
         """Return a copy of the axis with other repaired samples, shape (n,)."""
         return replace(self, repaired=repaired, coefficients=cosine_transform(repaired))
 
-    def columns(self, effect: Effect) -> list[Floats]:
+    def regressor_transforms(self, effect: Effect) -> list[Floats]:
         """Return the transforms of the regressors of a deterministic effect with size one, each of shape (n − 1,)."""
-        return [self.others[effect.source]] if isinstance(effect, Leak) else self.regressors.columns(effect)
+        return (
+            [self.leak_sources[effect.source]]
+            if isinstance(effect, Leak)
+            else self.regressors.regressor_transforms(effect)
+        )
 
     def fit(
         self,
         effects: Sequence[Effect],
-        held: frozenset[int] = frozenset(),
-        extra: Floats | None = None,
-        curved: bool = False,
-        floor: bool = True,
+        fixed_noise: frozenset[int] = frozenset(),
+        extra_bases: Floats | None = None,
+        curvature: bool = False,
+        noise_floor: bool = True,
     ) -> "AxisFit":
         """Return the maximum of the likelihood over all sizes that are not fixed.
 
@@ -174,13 +178,13 @@ class Axis:
         ----------
         effects : sequence of Effect
             Effects of the axis. The shape parameters stay fixed, and the sizes are the starting values.
-        held : frozenset of int, optional
+        fixed_noise : frozenset of int, optional
             Indices of the noise effects whose size is fixed.
-        extra : ndarray of float64, shape (r, m), optional
+        extra_bases : ndarray of float64, shape (r, m), optional
             Additional variance bases without an effect.
-        curved : bool, optional
+        curvature : bool, optional
             If True, t² is an additional regressor without an effect.
-        floor : bool, optional
+        noise_floor : bool, optional
             If True and the effects contain a low-pass filter, white noise is added after the filter. A real sensor
             aliases and its converter is noisy. The null of a digital filter at half the sample rate is therefore never
             observed.
@@ -190,17 +194,17 @@ class Axis:
         AxisFit
             Effects with fitted sizes and the log-likelihood.
         """
-        transforms = _spectral_transforms(effects, self.shown)
-        floor = floor and any(isinstance(one, BandwidthLimit) for one in transforms)
-        noise = self._noise_variances(effects, held, transforms)
-        unnamed = [(np.ones_like(noise.constant), INITIAL_FLOOR_RATIO)] if floor else []
-        unnamed += [(row, INITIAL_EXTRA_RATIO) for row in (extra if extra is not None else ())]
+        transforms = _spectral_transforms(effects, self.value_statistics)
+        noise_floor = noise_floor and any(isinstance(one, BandwidthLimit) for one in transforms)
+        noise = self._noise_variances(effects, fixed_noise, transforms)
+        unnamed = [(np.ones_like(noise.constant), INITIAL_FLOOR_RATIO)] if noise_floor else []
+        unnamed += [(row, INITIAL_EXTRA_RATIO) for row in (extra_bases if extra_bases is not None else ())]
         bases = [*noise.bases, *(basis for basis, _ in unnamed)]
         start = [*noise.start, *(ratio * self._full_power_theta(basis) for basis, ratio in unnamed)]
         slices, columns = self._regressors_of(effects)
         fitted = maximise_whittle(
             self.bins.count * self.used_bins,
-            self.binned_sums([*columns, CURVATURE] if curved else columns),
+            self.binned_sums([*columns, CURVATURE] if curvature else columns),
             np.asarray(bases).reshape(len(bases), self.bins.count.size),
             noise.constant,
             np.asarray(start, np.float64),
@@ -208,25 +212,25 @@ class Axis:
         return AxisFit(
             self,
             _with_fitted_sizes(effects, noise.free, slices, fitted),
-            held,
+            fixed_noise,
             fitted.log_likelihood,
             fitted,
             tuple(noise.free),
             slices,
-            float(fitted.theta[len(noise.free)]) if floor else 0.0,
+            float(fitted.theta[len(noise.free)]) if noise_floor else 0.0,
         )
 
     def _noise_variances(
-        self, effects: Sequence[Effect], held: frozenset[int], transforms: Sequence[Transform]
-    ) -> NoiseVariances:
+        self, effects: Sequence[Effect], fixed_noise: frozenset[int], transforms: Sequence[Transform]
+    ) -> _NoiseVariances:
         """Return the variance bases of the fitted noise effects, and the variance of all other noise."""
         constant = _density_after(transforms, None, self.bins) / (1.0 / self.rate_hz)
-        found = NoiseVariances([], [], [], constant)
+        found = _NoiseVariances([], [], [], constant)
         for at, effect in enumerate(effects):
             if type(effect) not in NOISE_SIZE_PARAMETERS:
                 continue
             basis = self._variance_basis(effect, effects, transforms)
-            if at in held:
+            if at in fixed_noise:
                 constant += size(effect) ** 2 * basis
             else:
                 found.free.append(at)
@@ -250,7 +254,7 @@ class Axis:
         columns: list[Regressor] = []
         for at, effect in enumerate(effects):
             if type(effect) in DETERMINISTIC_SIZE_PARAMETERS:
-                count = len(self.columns(effect))
+                count = len(self.regressor_transforms(effect))
                 slices.append((at, slice(len(columns), len(columns) + count)))
                 columns += [(effect, i) for i in range(count)]
         return tuple(slices), columns
@@ -286,7 +290,11 @@ class Axis:
         """Return the transform of a regressor, or of the axis itself for None."""
         if regressor is None:
             return self.coefficients
-        return self.regressors.curvature if regressor is CURVATURE else self.columns(regressor[0])[regressor[1]]
+        return (
+            self.regressors.curvature
+            if regressor is CURVATURE
+            else self.regressor_transforms(regressor[0])[regressor[1]]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,54 +303,58 @@ class AxisFit:
 
     axis: Axis
     effects: Effects  # with fitted sizes
-    held: frozenset[int]  # indices of effects whose size was not fitted
+    fixed_noise: frozenset[int]  # indices of effects whose size was not fitted
     log_likelihood: float
-    fitted: WhittleFit
-    noises: tuple[int, ...]  # index in ``effects`` of each fitted θ
-    regressors: tuple[tuple[int, slice], ...]  # index in ``effects`` and slice of β of each deterministic effect
-    floor: float = 0.0  # variance of a coefficient due to the white noise floor after a low-pass filter
+    whittle: WhittleFit
+    fitted_noise: tuple[int, ...]  # index in ``effects`` of each fitted θ
+    regressor_slices: tuple[tuple[int, slice], ...]  # index in ``effects`` and slice of β of each deterministic effect
+    noise_floor_variance: float = 0.0  # variance of a coefficient due to the white noise floor after a low-pass filter
 
-    def error(self, at: int) -> float:
-        """Return the standard error of the size of the effect with index ``at``, or NaN if the size was fixed."""
-        if at in self.noises:
-            noise = self.noises.index(at)
-            covariance = np.linalg.pinv(self.fitted.theta_information)
-            theta = float(self.fitted.theta[noise])
+    def size_error(self, index: int) -> float:
+        """Return the standard error of the size of the effect with the given index, or NaN if the size was fixed."""
+        if index in self.fitted_noise:
+            noise = self.fitted_noise.index(index)
+            covariance = np.linalg.pinv(self.whittle.theta_information)
+            theta = float(self.whittle.theta[noise])
             return 0.5 * float(np.sqrt(covariance[noise, noise] / theta)) if theta > 0.0 else float("nan")
-        for index, place in self.regressors:
-            if index == at:  # the two columns of one effect, a sine and its cosine, have equal errors
-                return float(np.sqrt(np.diag(self.fitted.beta_covariance)[place].mean()))
+        for at, place in self.regressor_slices:
+            if at == index:  # the two columns of one effect, a sine and its cosine, have equal errors
+                return float(np.sqrt(np.diag(self.whittle.beta_covariance)[place].mean()))
         return float("nan")
 
-    def with_beta(self, beta: Floats) -> "AxisFit":
+    def with_regressor_sizes(self, beta: Floats) -> "AxisFit":
         """Return the fit with given sizes, shape (q,), of the deterministic effects and unchanged noise."""
-        axis, fitted = self.axis, self.fitted
-        sums = axis.binned_sums([(self.effects[at], i) for at, p in self.regressors for i in range(p.stop - p.start)])
+        axis, whittle = self.axis, self.whittle
+        sums = axis.binned_sums(
+            [(self.effects[at], i) for at, p in self.regressor_slices for i in range(p.stop - p.start)]
+        )
         residual = sums.power - 2.0 * beta @ sums.cross + np.einsum("i,j,ijb->b", beta, beta, sums.gram)
         count = axis.bins.count * axis.used_bins
-        value = -0.5 * float((count * np.log(fitted.variance) + residual / fitted.variance).sum())
-        changed = replace(fitted, beta=beta, residual=np.maximum(residual, 0.0), log_likelihood=value)
-        return replace(self, fitted=changed, log_likelihood=value)
+        value = -0.5 * float((count * np.log(whittle.variance) + residual / whittle.variance).sum())
+        changed = replace(whittle, beta=beta, residual=np.maximum(residual, 0.0), log_likelihood=value)
+        return replace(self, whittle=changed, log_likelihood=value)
 
-    def residual(self) -> Floats:
+    def residual_coefficients(self) -> Floats:
         """Return the coefficients, shape (n − 1,), with all fitted deterministic effects removed."""
         left = self.axis.coefficients.copy()
-        for at, place in self.regressors:
-            for factor, column in zip(self.fitted.beta[place], self.axis.columns(self.effects[at]), strict=True):
+        for at, place in self.regressor_slices:
+            for factor, column in zip(
+                self.whittle.beta[place], self.axis.regressor_transforms(self.effects[at]), strict=True
+            ):
                 left -= factor * column
         return left
 
 
-def _spectral_transforms(effects: Sequence[Effect], shown: ValueStatistics) -> list[Transform]:
+def _spectral_transforms(effects: Sequence[Effect], statistics: ValueStatistics) -> list[Transform]:
     """Return the transforms that change the spectrum, in the order in which they act.
 
     Repeated samples at known positions have been replaced and do not change the spectrum.
     """
-    replaced = shown.repeats is not None and bool(shown.repeats.mask.any())
+    replaced = statistics.repeats is not None and bool(statistics.repeats.mask.any())
     found = [
         effect
         for effect in effects
-        if isinstance(effect, Transform) and not (replaced and isinstance(effect, SampleHold))
+        if isinstance(effect, Transform) and not (replaced and isinstance(effect, RandomSampleHold))
     ]
     return sorted(found, key=lambda effect: TRANSFORM_ORDER.index(type(effect)))
 
@@ -355,7 +367,7 @@ def _with_fitted_sizes(
     for theta, at in zip(fitted.theta, noises, strict=False):  # bases without an effect come last
         found[at] = with_size(found[at], float(theta) ** 0.5)
     for at, place in slices:
-        found[at] = with_factors(found[at], fitted.beta[place])
+        found[at] = with_regressor_factors(found[at], fitted.beta[place])
     return tuple(found)
 
 
@@ -379,4 +391,4 @@ def _regressor_key(regressor: Regressor | None) -> tuple[object, int] | None:
     if regressor is None or regressor is CURVATURE:
         return regressor
     effect, at = regressor
-    return (with_size(effect, 1.0) if isinstance(effect, Leak) else with_factors(effect, np.ones(2)), at)
+    return (with_size(effect, 1.0) if isinstance(effect, Leak) else with_regressor_factors(effect, np.ones(2)), at)

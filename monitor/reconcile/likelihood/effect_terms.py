@@ -133,7 +133,7 @@ def unit_spectrum(effect: Effect, f_hz: Floats, tau0_s: float) -> Floats:
     return np.asarray(with_size(effect, 1.0).psd(f_hz, tau0_s))  # type: ignore[attr-defined]
 
 
-def regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
+def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
     """Return the regressors whose linear combinations give a deterministic effect of any size.
 
     Effects with a phase or a quadratic term have two regressors.
@@ -174,7 +174,7 @@ def regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | N
     return [_series_of(one, n, rate_hz, temperature_c) for one in variants]
 
 
-def with_factors(effect: Effect, factors: Floats) -> Effect:
+def with_regressor_factors(effect: Effect, factors: Floats) -> Effect:
     """Return the effect whose regressors have the given factors.
 
     Parameters

@@ -38,14 +38,14 @@ class Hypothesis:
         return self.fit.axis
 
     @property
-    def given(self) -> int:
+    def given_count(self) -> int:
         """Number of effects in the model under test."""
         return len(self.model)
 
     @property
-    def found(self) -> Effects:
+    def added(self) -> Effects:
         """Effects that are not in the model under test."""
-        return self.fit.effects[self.given :]
+        return self.fit.effects[self.given_count :]
 
     @property
     def effects(self) -> Effects:
@@ -53,21 +53,21 @@ class Hypothesis:
         return self.fit.effects
 
     @property
-    def freed(self) -> int:
+    def refitted_size_count(self) -> int:
         """Number of noise effects of the model whose size was fitted."""
-        return sum(at < self.given for at in self.fit.noises)
+        return sum(at < self.given_count for at in self.fit.fitted_noise)
 
     @property
     def score(self) -> float:
         """Log-likelihood less the penalty for the fitted sizes of the model, in nats."""
-        return self.fit.log_likelihood - RESIZE_PENALTY_NATS * self.freed
+        return self.fit.log_likelihood - RESIZE_PENALTY_NATS * self.refitted_size_count
 
-    def refit(self, found: Sequence[Effect]) -> "Hypothesis":
+    def refit_with_added_effects(self, added: Sequence[Effect]) -> "Hypothesis":
         """Return the same model with other effects added, as ``fit_with_fewest_changes`` fits them."""
-        return fit_with_fewest_changes(self.axis, found, self.model)
+        return fit_with_fewest_changes(self.axis, added, self.model)
 
 
-def fit_with_given_sizes(axis: Axis, model: Effects) -> Hypothesis:
+def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
     """Fit the deterministic effects of a model and keep the sizes of its noise effects.
 
     The sizes of deterministic effects differ from recording to recording.
@@ -82,32 +82,32 @@ def fit_with_given_sizes(axis: Axis, model: Effects) -> Hypothesis:
     return Hypothesis(model, axis.fit(model, noise_indices(model)))
 
 
-def fit_with_fewest_changes(axis: Axis, found: Sequence[Effect], model: Effects) -> Hypothesis:
+def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects) -> Hypothesis:
     """Fit new effects together with a model and change as few sizes of the model as the data require.
 
     Parameters
     ----------
     axis : Axis
         Axis to fit.
-    found : sequence of Effect
+    added : sequence of Effect
         Effects that are added to the model.
     model : tuple of Effect
         Effects of the axis in the model under test.
     """
-    effects = (*model, *found)
-    held = noise_indices(model)
-    best = Hypothesis(model, axis.fit(effects, held))
-    if not held:
+    effects = (*model, *added)
+    fixed_noise = noise_indices(model)
+    best = Hypothesis(model, axis.fit(effects, fixed_noise))
+    if not fixed_noise:
         return best
     free = Hypothesis(model, axis.fit(effects))
     if free.fit.log_likelihood - best.fit.log_likelihood < RESIZE_PENALTY_NATS:
         return best
-    while held:
-        trials = [Hypothesis(model, axis.fit(effects, held - {at})) for at in sorted(held)]
+    while fixed_noise:
+        trials = [Hypothesis(model, axis.fit(effects, fixed_noise - {at})) for at in sorted(fixed_noise)]
         better = max(trials, key=lambda one: one.score)
         if better.score <= best.score:
             break
-        best, held = better, better.fit.held
+        best, fixed_noise = better, better.fit.fixed_noise
     # The loop misses the case that two sizes are wrong together.
     return free if free.score > best.score else best
 
@@ -145,7 +145,7 @@ def refine_shape(axis: Axis, effects: Effects, index: int, names: Sequence[str],
         for name in names:
             width = log(reach) / (turn + 1)
             middle = log(getattr(found[index], name))
-            best = _golden_section(axis, found, index, name, middle - width, middle + width)
+            best = _find_best_shape(axis, found, index, name, middle - width, middle + width)
             found = _with_shape(found, index, name, exp(best))
     return found
 
@@ -157,7 +157,7 @@ def _with_shape(effects: Effects, index: int, name: str, value: float) -> Effect
     return (*effects[:index], changed, *effects[index + 1 :])
 
 
-def golden_section(function: Callable[[float], float], lo: float, hi: float, iterations: int) -> float:
+def find_maximum_by_golden_section(function: Callable[[float], float], lo: float, hi: float, iterations: int) -> float:
     """Return the position of the maximum of a function with one maximum, by golden-section search.
 
     Parameters
@@ -175,10 +175,10 @@ def golden_section(function: Callable[[float], float], lo: float, hi: float, ite
     return 0.5 * (lo + hi)
 
 
-def _golden_section(axis: Axis, effects: Effects, index: int, name: str, lo: float, hi: float) -> float:
+def _find_best_shape(axis: Axis, effects: Effects, index: int, name: str, lo: float, hi: float) -> float:
     """Return the logarithm of the shape parameter with the largest likelihood within an interval.
 
-    Unlike ``golden_section``, this search evaluates the likelihood once per iteration.
+    Unlike ``find_maximum_by_golden_section``, this search evaluates the likelihood once per iteration.
     """
 
     def value(x: float) -> float:
@@ -198,7 +198,7 @@ def _golden_section(axis: Axis, effects: Effects, index: int, name: str, lo: flo
     return 0.5 * (lo + hi)
 
 
-def size_bounds(fit: AxisFit, index: int) -> ParameterInterval:
+def size_interval(fit: AxisFit, index: int) -> ParameterInterval:
     """Return the size of an effect with its 95 % interval.
 
     The logarithm of a standard deviation, and the value of a signed size, is taken as Gaussian.
@@ -210,7 +210,7 @@ def size_bounds(fit: AxisFit, index: int) -> ParameterInterval:
     index : int
         Index of the effect.
     """
-    value, error = size(fit.effects[index]), fit.error(index)
+    value, error = size(fit.effects[index]), fit.size_error(index)
     if type(fit.effects[index]) in DETERMINISTIC_SIZE_PARAMETERS:
         return ParameterInterval(value, value - Z95 * error, value + Z95 * error)
     if not value > 0.0 or not np.isfinite(error):
@@ -218,7 +218,7 @@ def size_bounds(fit: AxisFit, index: int) -> ParameterInterval:
     return ParameterInterval(value, value * exp(-Z95 * error / value), value * exp(Z95 * error / value))
 
 
-def shape_bounds(fit: AxisFit, index: int, name: str) -> ParameterInterval:
+def shape_interval(fit: AxisFit, index: int, name: str) -> ParameterInterval:
     """Return a shape parameter with its 95 % interval from the profile likelihood.
 
     Each end of the interval is the value at which the log-likelihood has fallen by ``HALF_CHI2_95``.
@@ -236,7 +236,7 @@ def shape_bounds(fit: AxisFit, index: int, name: str) -> ParameterInterval:
 
     def fall(factor: float) -> float:
         changed = _with_shape(fit.effects, index, name, value * factor)
-        return fit.log_likelihood - fit.axis.fit(changed, fit.held).log_likelihood
+        return fit.log_likelihood - fit.axis.fit(changed, fit.fixed_noise).log_likelihood
 
     ends = []
     for sign in (-1.0, 1.0):

@@ -20,7 +20,7 @@ from scipy.special import bdtrc, chdtrc, gammaln, ndtr, ndtri, pdtrc
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import NORMAL_QUARTILE, Z95
-from monitor.reconcile.preparation.value_statistics import Interval, Mask
+from monitor.reconcile.preparation.value_statistics import Mask, ValueWithInterval
 
 LINEAR_BINS: Final = 240
 """Number of bins with equal width."""
@@ -55,8 +55,8 @@ MAX_Z: Final = 37.0
 class OutlierFit:
     """Fit of a mixture of two Gaussians, with its alternatives."""
 
-    fraction: Interval
-    scale: Interval  # standard deviation of the error that is added to a sample
+    fraction: ValueWithInterval
+    scale: ValueWithInterval  # standard deviation of the error that is added to a sample
     noise: float  # standard deviation of the other samples
     mask: Mask  # [n] True for samples that are more likely outliers than not
     count: int  # number of samples in the mask
@@ -110,7 +110,7 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
     fraction, scale = _parameter_intervals(counts, squares, narrow, wide, share)
     return OutlierFit(
         fraction=fraction,
-        scale=Interval(unit * scale.value, unit * scale.lo, unit * scale.hi),
+        scale=ValueWithInterval(unit * scale.value, unit * scale.lo, unit * scale.hi),
         noise=unit * float(narrow**0.5),
         mask=mask,
         count=int(mask.sum()),
@@ -242,7 +242,7 @@ def _outlier_threshold(narrow: float, wide: float, share: float) -> float:
 
 def _parameter_intervals(
     counts: Floats, squares: Floats, narrow: float, wide: float, share: float
-) -> tuple[Interval, Interval]:
+) -> tuple[ValueWithInterval, ValueWithInterval]:
     """Return fraction and scale with 95 % intervals, from the curvature of the likelihood in ln s, ln scale and logit
     f.
     """
@@ -265,7 +265,7 @@ def _parameter_intervals(
     with np.errstate(over="ignore"):
         f = 1.0 / (1.0 + np.exp(-(at[2] + half[2] * np.array([0.0, -1.0, 1.0]))))
         scale = np.exp(at[1] + half[1] * np.array([0.0, -1.0, 1.0]))
-    return Interval(*map(float, f)), Interval(*map(float, scale))
+    return ValueWithInterval(*map(float, f)), ValueWithInterval(*map(float, scale))
 
 
 def _vuong_statistic(counts: Floats, log_density_difference: Floats) -> float:

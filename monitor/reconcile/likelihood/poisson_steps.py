@@ -16,19 +16,19 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.reconcile.likelihood.hidden_state import (
+from monitor.reconcile.likelihood.event_process_comparison import (
     TARGET_BLOCKS,
     BackgroundNoise,
+    EventProcessComparison,
     EventProcessFit,
-    ModelComparison,
     StateSpaceNoise,
     block_means,
-    fit_process,
+    fit_event_process,
     initial_covariance,
-    innovation_of,
+    innovation_of_block,
     kalman_log_likelihood,
     maximise,
-    predict_block,
+    predict_block_mean_variance,
     prior_level_variance,
     state_space_noise,
 )
@@ -49,7 +49,9 @@ START_RATES: Final = 6
 """Number of starting rates."""
 
 
-def compare_steps_with_random_walk(y: Floats, tau0_s: float, rest: BackgroundNoise, K: float) -> ModelComparison:
+def compare_poisson_with_random_walk(
+    y: Floats, tau0_s: float, rest: BackgroundNoise, K: float
+) -> EventProcessComparison:
     """Compare Poisson steps with a random walk.
 
     Parameters
@@ -65,7 +67,7 @@ def compare_steps_with_random_walk(y: Floats, tau0_s: float, rest: BackgroundNoi
 
     Returns
     -------
-    ModelComparison
+    EventProcessComparison
         Gain, ``rate`` and ``height`` of the Poisson steps, and the number of jumps.
 
     Raises
@@ -123,7 +125,7 @@ def fit_jumps(means: Floats, block_s: float, rest: BackgroundNoise, K: float) ->
 
     rates = np.geomspace(2.0 / span_s, max(MAX_START_JUMPS * K / rest.white**0.5, 4.0 / span_s), START_RATES)
     rate = max(rates, key=lambda rate: poisson(rate, K / rate**0.5))
-    return fit_process(poisson, {"rate": rate, "height": K / rate**0.5})
+    return fit_event_process(poisson, {"rate": rate, "height": K / rate**0.5})
 
 
 def _log_likelihood(
@@ -135,10 +137,10 @@ def _log_likelihood(
     """
     some = -expm1(-jumps)
     variance = jumps / some * height**2  # variance of the sum of all jumps in a block with at least one jump
-    return float(_jump_log_likelihood(means, noise, start, JumpProbabilities(exp(-jumps), odds * some, variance)))
+    return float(_jump_log_likelihood(means, noise, start, _JumpProbabilities(exp(-jumps), odds * some, variance)))
 
 
-class JumpProbabilities(NamedTuple):
+class _JumpProbabilities(NamedTuple):
     """Probabilities of jumps in a block."""
 
     none: float  # probability of no jump
@@ -146,7 +148,7 @@ class JumpProbabilities(NamedTuple):
     variance: float  # variance of the sum of all jumps in a block with at least one jump
 
 
-class GaussianMixture(NamedTuple):
+class _GaussianMixture(NamedTuple):
     """Mixture of Gaussian distributions of the state of the background noise."""
 
     weight: Floats  # [k] probability of each component, or its logarithm
@@ -155,12 +157,12 @@ class GaussianMixture(NamedTuple):
 
 
 @compiled
-def _jump_log_likelihood(means: Floats, noise: StateSpaceNoise, start: float, jumps: JumpProbabilities) -> float:
+def _jump_log_likelihood(means: Floats, noise: StateSpaceNoise, start: float, jumps: _JumpProbabilities) -> float:
     """Return the log-likelihood of a level that jumps at random times."""
     d = noise.table.shape[0]
-    by_age = GaussianMixture(np.zeros(JUMP_AGES), np.zeros((JUMP_AGES, d)), np.zeros((JUMP_AGES, d, d)))
+    by_age = _GaussianMixture(np.zeros(JUMP_AGES), np.zeros((JUMP_AGES, d)), np.zeros((JUMP_AGES, d, d)))
     # for each hypothesis: entries below JUMP_AGES without a jump, the others with a jump
-    branches = GaussianMixture(np.empty(2 * JUMP_AGES), np.zeros((2 * JUMP_AGES, d)), np.zeros((2 * JUMP_AGES, d, d)))
+    branches = _GaussianMixture(np.empty(2 * JUMP_AGES), np.zeros((2 * JUMP_AGES, d)), np.zeros((2 * JUMP_AGES, d, d)))
     by_age.weight[JUMP_AGES - 1] = 1.0
     by_age.covariance[JUMP_AGES - 1] = initial_covariance(noise, start)
     total: float = -0.5 * means.size * np.log(2.0 * np.pi)
@@ -181,10 +183,10 @@ def _jump_log_likelihood(means: Floats, noise: StateSpaceNoise, start: float, ju
 def _branch(
     z: float,
     age: int,
-    by_age: GaussianMixture,
-    branches: GaussianMixture,
+    by_age: _GaussianMixture,
+    branches: _GaussianMixture,
     noise: StateSpaceNoise,
-    jumps: JumpProbabilities,
+    jumps: _JumpProbabilities,
 ) -> None:
     """Update one hypothesis by a block mean ``z``, once without a jump in the block and once with a jump.
 
@@ -197,8 +199,8 @@ def _branch(
     table = noise.table
     d = table.shape[0]
     covariance, reach = by_age.covariance[age], np.empty(d)
-    seen = predict_block(noise, covariance, reach)
-    innovation = innovation_of(z, noise, by_age.mean[age])
+    seen = predict_block_mean_variance(noise, covariance, reach)
+    innovation = innovation_of_block(z, noise, by_age.mean[age])
     for jump in range(2):
         to, chance = (JUMP_AGES + age, jumps.some) if jump else (age, jumps.none)
         if jump:
@@ -233,7 +235,7 @@ def _normalise(weight: Floats) -> float:
 
 
 @compiled
-def _merge(branches: GaussianMixture, first: int, end: int, merged: GaussianMixture, to: int) -> None:
+def _merge(branches: _GaussianMixture, first: int, end: int, merged: _GaussianMixture, to: int) -> None:
     """Merge branches ``first`` to ``end`` − 1 into one Gaussian with their mean and covariance, at index ``to``."""
     share = 0.0
     for k in range(first, end):

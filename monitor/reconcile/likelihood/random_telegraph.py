@@ -15,20 +15,20 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
-from monitor.reconcile.likelihood.hidden_state import (
+from monitor.reconcile.likelihood.event_process_comparison import (
     TARGET_BLOCKS,
     BackgroundNoise,
+    EventProcessComparison,
     EventProcessFit,
-    ModelComparison,
     StateSpaceNoise,
     block_markov_noise,
     block_means,
-    fit_process,
+    fit_event_process,
     initial_covariance,
-    innovation_of,
+    innovation_of_block,
     kalman_log_likelihood,
     maximise,
-    predict_block,
+    predict_block_mean_variance,
     prior_level_variance,
     state_space_noise,
 )
@@ -52,9 +52,9 @@ MIN_WEIGHT: Final = 1e-300
 """Lower limit of the weight of a case relative to the likeliest one. It avoids a division by zero."""
 
 
-def compare_telegraph_with_correlated(
+def compare_telegraph_with_correlated_noise(
     y: Floats, tau0_s: float, rest: BackgroundNoise, sigma: float, correlation_time: float
-) -> ModelComparison:
+) -> EventProcessComparison:
     """Compare a random telegraph with exponentially correlated noise.
 
     Parameters
@@ -72,7 +72,7 @@ def compare_telegraph_with_correlated(
 
     Returns
     -------
-    ModelComparison
+    EventProcessComparison
         Gain, ``amplitude`` and ``dwell_time`` of the telegraph, and the number of switches.
 
     Raises
@@ -122,7 +122,7 @@ def _fit_telegraph(
         for d in START_DWELL_FACTORS
     ]
     amplitude, dwell_s = max(starts, key=lambda start: two_levels(start[0], start[1], 1.0))
-    return fit_process(two_levels, {"amplitude": amplitude, "dwell_time": dwell_s})
+    return fit_event_process(two_levels, {"amplitude": amplitude, "dwell_time": dwell_s})
 
 
 def _log_likelihood(
@@ -149,7 +149,7 @@ def _log_likelihood(
     return float(np.logaddexp(heads[0], heads[1]) - log(2.0) + rest)
 
 
-class SwitchingState(NamedTuple):
+class _SwitchingFilterState(NamedTuple):
     """State of the filter in each of the two levels."""
 
     share: Floats  # [2] probability of each level
@@ -157,7 +157,7 @@ class SwitchingState(NamedTuple):
     covariance: Floats  # [2, d, d]
 
 
-class CaseUpdate(NamedTuple):
+class _BlockFilterUpdate(NamedTuple):
     """Update of the filter in each level and in each of the three cases of a block."""
 
     weight: Floats  # [2, 3] probability
@@ -167,24 +167,26 @@ class CaseUpdate(NamedTuple):
 
 
 @compiled
-def _initial_state(noise: StateSpaceNoise, start: float, first: int) -> SwitchingState:
+def _initial_state(noise: StateSpaceNoise, start: float, first: int) -> _SwitchingFilterState:
     """Return the state for a known first level."""
     d = noise.table.shape[0]
-    state = SwitchingState(np.zeros(2), np.zeros((2, d)), np.empty((2, d, d)))
+    state = _SwitchingFilterState(np.zeros(2), np.zeros((2, d)), np.empty((2, d, d)))
     state.share[first] = 1.0
     state.covariance[:] = initial_covariance(noise, start)
     return state
 
 
 @compiled
-def _switching_log_likelihood(means: Floats, noise: StateSpaceNoise, cases: Floats, state: SwitchingState) -> float:
+def _switching_log_likelihood(
+    means: Floats, noise: StateSpaceNoise, cases: Floats, state: _SwitchingFilterState
+) -> float:
     """Return the log-likelihood of two levels and update the filter state in place.
 
     ``cases`` [3, 3] holds the probability, the mean (from the upper level) and the variance of the contribution to a
     block mean. The first two cases end in the level in which they began. The third case ends in the other level.
     """
     d = noise.table.shape[0]
-    update = CaseUpdate(np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, d)))
+    update = _BlockFilterUpdate(np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, d)))
     moved, merged = np.empty((2, d)), np.empty((2, d, d))
     total: float = -0.5 * means.size * np.log(2.0 * np.pi)
     for z in means:
@@ -201,7 +203,7 @@ def _switching_log_likelihood(means: Floats, noise: StateSpaceNoise, cases: Floa
 
 @compiled
 def _weigh_cases(
-    z: float, noise: StateSpaceNoise, cases: Floats, state: SwitchingState, update: CaseUpdate
+    z: float, noise: StateSpaceNoise, cases: Floats, state: _SwitchingFilterState, update: _BlockFilterUpdate
 ) -> tuple[float, float]:
     """Update the filter by a block mean ``z`` in each level and case.
 
@@ -209,8 +211,8 @@ def _weigh_cases(
     """
     weight, pull, known = update.weight, update.pull, update.known
     for level in range(2):
-        variance = predict_block(noise, state.covariance[level], update.reach[level])
-        innovation = innovation_of(z, noise, state.at[level])
+        variance = predict_block_mean_variance(noise, state.covariance[level], update.reach[level])
+        innovation = innovation_of_block(z, noise, state.at[level])
         sign = 1.0 - 2.0 * level
         for k in range(3):
             apart = innovation - sign * cases[k, 1]
@@ -238,7 +240,13 @@ def _merge_returning_cases(weight: Floats, pull: Floats, known: Floats) -> None:
 
 @compiled
 def _merge_into_level(
-    level: int, density: float, table: Floats, state: SwitchingState, update: CaseUpdate, moved: Floats, merged: Floats
+    level: int,
+    density: float,
+    table: Floats,
+    state: _SwitchingFilterState,
+    update: _BlockFilterUpdate,
+    moved: Floats,
+    merged: Floats,
 ) -> None:
     """Merge the cases that end in one level into one Gaussian with the mean ``moved`` and covariance ``merged``."""
     d, other = table.shape[0], 1 - level

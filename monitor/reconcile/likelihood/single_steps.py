@@ -20,13 +20,13 @@ import numpy as np
 from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.reconcile.likelihood import poisson_steps
-from monitor.reconcile.likelihood.hidden_state import (
+from monitor.reconcile.likelihood.event_process_comparison import (
     BackgroundNoise,
-    ModelComparison,
+    EventProcessComparison,
     StateSpaceNoise,
     block_means,
     innovation_variances,
-    innovations_of,
+    innovations_of_series,
     kalman_log_likelihood,
     prior_level_variance,
     state_space_noise,
@@ -36,16 +36,16 @@ TIMES_PER_BLOCK: Final = 8
 """Number of times that are tried within a block."""
 
 
-class SingleStepsFit(NamedTuple):
+class _SingleStepsFit(NamedTuple):
     """Best fit of single steps."""
 
     score: float  # log-likelihood less the penalties for times and heights
     times: Floats  # [k] in blocks since the start
 
 
-def compare_steps_with_single_steps(
+def compare_poisson_with_single_steps(
     y: Floats, tau0_s: float, rest: BackgroundNoise, K: float, most: int = 5
-) -> ModelComparison:
+) -> EventProcessComparison:
     """Compare Poisson steps with a few single steps.
 
     Parameters
@@ -63,7 +63,7 @@ def compare_steps_with_single_steps(
 
     Returns
     -------
-    ModelComparison
+    EventProcessComparison
         Gain, ``rate`` and ``height`` of the Poisson steps, the number of jumps, and the number of single steps.
 
     Raises
@@ -76,10 +76,10 @@ def compare_steps_with_single_steps(
     return poisson_steps.fit_jumps(means, block_s, rest, K).compare(single.score, single.times.size)
 
 
-def _fit_single_steps(means: Floats, noise: StateSpaceNoise, most: int) -> SingleStepsFit:
+def _fit_single_steps(means: Floats, noise: StateSpaceNoise, most: int) -> _SingleStepsFit:
     """Fit the number of single steps that explains the block means with the smallest penalty."""
     blocks: list[int] = []
-    best = SingleStepsFit(kalman_log_likelihood(means, noise, prior_level_variance(means)), np.empty(0))
+    best = _SingleStepsFit(kalman_log_likelihood(means, noise, prior_level_variance(means)), np.empty(0))
     for _ in range(most):
         blocks.append(int(np.argmax(_shock_gains(means, noise, blocks))))
         for k in range(len(blocks)):
@@ -102,7 +102,7 @@ def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Fl
     return scores
 
 
-def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> SingleStepsFit:
+def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> _SingleStepsFit:
     """Refine the times of the steps within their blocks and return the fit with its penalties."""
     times = np.array(blocks, np.float64)
     places = np.arange(-TIMES_PER_BLOCK, TIMES_PER_BLOCK + 1) / TIMES_PER_BLOCK
@@ -113,7 +113,7 @@ def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> S
         times = max(tried, key=lambda t: _fit_heights(means, noise, t)[0])
     total, heights, deviations = _fit_heights(means, noise, times)
     cost = times.size * log(means.size) + 0.5 * float(np.log1p((heights / deviations) ** 2).sum())
-    return SingleStepsFit(total - cost, times)
+    return _SingleStepsFit(total - cost, times)
 
 
 def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[float, Floats, Floats]:
@@ -137,7 +137,7 @@ def _whiten(columns: Floats, noise: StateSpaceNoise, start: float) -> float:
     variances, reaches = innovation_variances(np.zeros(columns.shape[0]), noise, start)
     total = 0.0
     for c in range(columns.shape[1]):
-        innovations = innovations_of(columns[:, c].copy(), noise, variances, reaches)
+        innovations = innovations_of_series(columns[:, c].copy(), noise, variances, reaches)
         for k in range(innovations.size):
             columns[k, c] = innovations[k] / np.sqrt(variances[k])
     for variance in variances:
@@ -156,7 +156,7 @@ def _shock_statistics(means: Floats, noise: StateSpaceNoise, start: float, free:
     table = noise.table
     d, m = table.shape[0], means.size
     variances, reaches = innovation_variances(free, noise, start)
-    innovations = innovations_of(means, noise, variances, reaches)
+    innovations = innovations_of_series(means, noise, variances, reaches)
     r, N, scores = np.zeros(d), np.zeros((d, d)), np.empty(m)
     L = np.empty((d, d))
     for k in range(m - 1, -1, -1):

@@ -1,6 +1,6 @@
 """Variance of white residuals as a function of time, for all frequencies together and for each band.
 
-``fit_variance_history`` fits a step of the variance at every time, and three alternatives to a step: a trend, a
+``fit_variance_changes`` fits a step of the variance at every time, and three alternatives to a step: a trend, a
 periodic variation and a slow random variation. The alternatives are fitted to the energies of blocks, which are
 distributed as χ². Every gain is a log-likelihood gain over a constant variance, so that the gains are comparable.
 
@@ -25,7 +25,7 @@ from scipy.special import gammaincc, gammaln, polygamma, psi
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
-from monitor.reconcile.preparation.value_statistics import Interval
+from monitor.reconcile.preparation.value_statistics import ValueWithInterval
 
 MIN_SEGMENT_SAMPLES: Final = 16
 """Smallest number of samples on each side of a step."""
@@ -54,12 +54,12 @@ class VarianceStep:
     """Step of the variance."""
 
     gain: float  # log-likelihood gain over a constant variance, nats
-    time: Interval  # s from the first sample
-    ratio: Interval  # standard deviation after the step over the one before it
+    time: ValueWithInterval  # s from the first sample
+    ratio: ValueWithInterval  # standard deviation after the step over the one before it
 
 
 @dataclass(frozen=True, slots=True)
-class VarianceHistory:
+class VarianceChangeFit:
     """Best step of the variance, and the gains of its alternatives over a constant variance in nats."""
 
     step: VarianceStep
@@ -69,7 +69,7 @@ class VarianceHistory:
 
 
 @dataclass(frozen=True, slots=True)
-class SpectrogramExtremes:
+class LeastConstantTiles:
     """Rectangle and row of a spectrogram that are least constant in time."""
 
     gain: float  # gain of the best rectangle over the rest of its row, nats
@@ -79,7 +79,7 @@ class SpectrogramExtremes:
     row: tuple[float, float]  # frequency range of the row, Hz
 
 
-def fit_variance_history(w: Floats, tau0_s: float) -> VarianceHistory:
+def fit_variance_changes(w: Floats, tau0_s: float) -> VarianceChangeFit:
     """Fit steps and other variations of the variance of white residuals.
 
     Parameters
@@ -99,7 +99,7 @@ def fit_variance_history(w: Floats, tau0_s: float) -> VarianceHistory:
     >>> rng = np.random.default_rng(0)
     >>> w = rng.standard_normal(60_000)
     >>> w[20_000:] *= 1.2
-    >>> found = fit_variance_history(w, 0.01)
+    >>> found = fit_variance_changes(w, 0.01)
     >>> print(f"{found.step.gain > 100} {found.step.time.value:.1f} {found.step.ratio.value:.1f}")
     True 200.5 1.2
     """
@@ -111,7 +111,7 @@ def fit_variance_history(w: Floats, tau0_s: float) -> VarianceHistory:
     energy = squares[: count * length].reshape(count, length).mean(axis=1)
     scores = energy / energy.mean() - 1.0
     time = np.linspace(-1.0, 1.0, count)
-    return VarianceHistory(
+    return VarianceChangeFit(
         step=_best_step(squares, tau0_s),
         trend=_log_linear_gain(energy, length, np.stack([time, time**2 - 1.0 / 3.0])),
         periodic=_periodic_gain(energy, scores, length),
@@ -119,7 +119,7 @@ def fit_variance_history(w: Floats, tau0_s: float) -> VarianceHistory:
     )
 
 
-def find_least_constant_tiles(w: Floats, tau0_s: float) -> SpectrogramExtremes:
+def find_least_constant_tiles(w: Floats, tau0_s: float) -> LeastConstantTiles:
     """Find the rectangle of time and frequency, and the row, in which the power of white residuals is least constant.
 
     Parameters
@@ -148,7 +148,7 @@ def find_least_constant_tiles(w: Floats, tau0_s: float) -> SpectrogramExtremes:
     pieces = [piece for piece in PIECE_SAMPLES if w.size >= MIN_VARIANCE_BLOCKS * piece]
     tiles, rows = zip(*(_best_tiles(_piece_spectra(w, piece), piece) for piece in pieces), strict=True)
     best, row = max(tiles), max(rows)
-    return SpectrogramExtremes(
+    return LeastConstantTiles(
         best.gain, best.time_s(tau0_s), best.frequency_hz(tau0_s), row.gain, row.frequency_hz(tau0_s)
     )
 
@@ -180,8 +180,8 @@ def _best_step(squares: Floats, tau0_s: float) -> VarianceStep:
     ends = (at, min(int(k[lo]), at) - stride + 1, max(int(k[hi]), at) + stride - 1)
     return VarianceStep(
         float(gains[best]),
-        Interval(*(one * tau0_s for one in ends)),
-        Interval(ratio, ratio / half, ratio * half),
+        ValueWithInterval(*(one * tau0_s for one in ends)),
+        ValueWithInterval(ratio, ratio / half, ratio * half),
     )
 
 
@@ -236,7 +236,7 @@ def _slow_variation_gain(scores: Floats, length: int) -> float:
     return float(np.where(means > 1.0, gains, 0.0).max())
 
 
-class TileScore(NamedTuple):
+class _TileScore(NamedTuple):
     """Part of a spectrogram, and how much its power differs from the rest of its frequencies."""
 
     gain: float  # nats
@@ -267,9 +267,9 @@ def _piece_spectra(w: Floats, piece: int) -> Floats:
     return np.asarray(lines.real**2 + lines.imag**2)
 
 
-def _best_tiles(power: Floats, piece: int) -> tuple[TileScore, TileScore]:
+def _best_tiles(power: Floats, piece: int) -> tuple[_TileScore, _TileScore]:
     """Return the best rectangle and the best row of powers, shape (pieces, frequencies)."""
-    best = row = TileScore(-1.0, piece, 1, 0, 1, 0)
+    best = row = _TileScore(-1.0, piece, 1, 0, 1, 0)
     b, total = 1, power.sum(axis=0)
     while True:
         tall, a = power, 1
@@ -277,10 +277,10 @@ def _best_tiles(power: Floats, piece: int) -> tuple[TileScore, TileScore]:
             low, low_at, high, high_at, logs = _column_extremes(tall)
             for x, at in ((low, low_at), (high, high_at)):
                 gain, j = _best_contrast(x, total, 2 * a * b, 2 * power.shape[0] * b)
-                best = max(best, TileScore(gain, piece, a, int(at[j]), b, j))
+                best = max(best, _TileScore(gain, piece, a, int(at[j]), b, j))
             if 2 * a * b >= MIN_SQUARES_PER_CELL or a == 1:
                 gain, j = _bartlett_test(tall.sum(axis=0), logs, tall.shape[0], 2 * a * b)
-                row = max(row, TileScore(gain, piece, a, 0, b, j))
+                row = max(row, _TileScore(gain, piece, a, 0, b, j))
             even = tall.shape[0] // 2 * 2
             tall, a = tall[0:even:2] + tall[1:even:2], 2 * a
         if power.shape[1] == 1:

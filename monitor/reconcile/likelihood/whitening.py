@@ -11,11 +11,11 @@ from typing import Final
 import numpy as np
 
 from drivers.sample import Floats, Ints
-from monitor.noise.effect import Effect, first_sample
+from monitor.noise.effect import Effect, first_sample_index
 from monitor.noise.effects import NoiseStep
 from monitor.reconcile.likelihood.axis import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.outlier_statistics import OutlierFit, fit_outliers
-from monitor.reconcile.likelihood.variance_history import VarianceHistory, fit_variance_history
+from monitor.reconcile.likelihood.variance_history import VarianceChangeFit, fit_variance_changes
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 
 SLOW_BAND_FRACTION: Final = 0.01
@@ -37,10 +37,10 @@ class WhitenedAxis:
     """Axis whitened by a model."""
 
     fit: AxisFit
-    whitened: Floats  # [n − 1] coefficients divided by their standard deviation; random draws in stop bands
-    weight: Floats  # [n − 1] inverse of the standard deviation; 0 in stop bands
-    white: Floats  # [n] series of the whitened coefficients
-    fast: Floats  # [n] the same without low frequencies and with each bin at unit power, for tails and variance
+    coefficients: Floats  # [n − 1] coefficients divided by their standard deviation; random draws in stop bands
+    weights: Floats  # [n − 1] inverse of the standard deviation; 0 in stop bands
+    series: Floats  # [n] series of the whitened coefficients
+    flat_series: Floats  # [n] the same without low frequencies and with each bin at unit power, for tails and variance
 
     @property
     def axis(self) -> Axis:
@@ -58,21 +58,21 @@ class WhitenedAxis:
         return {type(effect) for effect in self.effects}
 
     @cached_property
-    def variance_history(self) -> VarianceHistory:
+    def variance_changes(self) -> VarianceChangeFit:
         """Variance of the whitened series as a function of time."""
-        return fit_variance_history(self.fast, 1.0 / self.axis.rate_hz)
+        return fit_variance_changes(self.flat_series, 1.0 / self.axis.rate_hz)
 
     @cached_property
     def outliers(self) -> OutlierFit | None:
         """Outlier statistics of the whitened series, or None if a Gaussian fits no worse."""
-        return fit_outliers(self.fast)
+        return fit_outliers(self.flat_series)
 
 
 def whiten_axis(fit: AxisFit) -> WhitenedAxis:
     """Whiten an axis by a fitted model."""
     axis = fit.axis
-    weight = axis.bins.spread(axis.used_bins / np.sqrt(fit.fitted.variance))
-    whitened = fit.residual() * weight
+    weight = axis.bins.spread(axis.used_bins / np.sqrt(fit.whittle.variance))
+    whitened = fit.residual_coefficients() * weight
     _replace_by_noise(whitened, np.flatnonzero(weight == 0.0))  # a gap in the spectrum would itself be detected
     return WhitenedAxis(fit, whitened, weight, inverse_cosine_transform(whitened), _flattened_series(fit, whitened))
 
@@ -88,7 +88,7 @@ def _flattened_series(fit: AxisFit, whitened: Floats) -> Floats:
     smoothed = np.convolve(sums, window, "same") / np.convolve(count, window, "same")
     power = np.where(count >= MIN_COEFFICIENTS_PER_BIN, sums / count, smoothed)
     flat = whitened * axis.bins.spread(1.0 / np.sqrt(power))
-    density = power * fit.fitted.variance
+    density = power * fit.whittle.variance
     _replace_by_noise(flat, np.flatnonzero(axis.bins.spread(density) < MIN_DENSITY_RATIO * np.median(density)))
     _replace_by_noise(flat, np.arange(int(SLOW_BAND_FRACTION * axis.n)))
     return inverse_cosine_transform(flat) / noise_deviation_over_time(fit)
@@ -104,5 +104,5 @@ def noise_deviation_over_time(fit: AxisFit) -> Floats:
     deviation = np.ones(fit.axis.n)
     for effect in fit.effects:
         if isinstance(effect, NoiseStep):
-            deviation[min(first_sample(effect.time, fit.axis.rate_hz), fit.axis.n) :] *= effect.ratio
+            deviation[min(first_sample_index(effect.time, fit.axis.rate_hz), fit.axis.n) :] *= effect.ratio
     return np.asarray(deviation / np.sqrt(np.mean(deviation**2)))

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr, xlogy
 
-from drivers.quantities import HOUR_S
+from drivers.number_ranges import HOUR_S
 from drivers.sample import Floats
 from drivers.units import DEGREE, G0
 from monitor.common.compiled import compiled
@@ -63,7 +63,7 @@ PREDICTOR_TAPS: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Interval:
+class ValueWithInterval:
     """Value with its 95 % interval."""
 
     value: float
@@ -75,7 +75,7 @@ class Interval:
 class QuantizationGrid:
     """Grid that all values lie on."""
 
-    step: Interval
+    step: ValueWithInterval
     offset: float  # offset of the grid from zero, in [−step/2, step/2]
     levels: int  # number of grid levels from the smallest to the largest value
     noise: float  # standard deviation from sample to sample, including the steps
@@ -91,7 +91,7 @@ class QuantizationGrid:
 class Clipping:
     """Values that accumulate at an end of the range."""
 
-    limit: Interval
+    limit: ValueWithInterval
     count: int  # number of clipped samples
     upper: bool  # True if values are clipped at the largest value
     lower: bool  # True if values are clipped at the smallest value
@@ -103,7 +103,7 @@ class Clipping:
 class RepeatedSamples:
     """Samples that repeat the sample before them."""
 
-    fraction: Interval
+    fraction: ValueWithInterval
     count: float  # number of repeats in excess of chance
     mask: Mask  # [n] True for each repeat of a continuous value; all False for stepped values
     gain: float  # log-likelihood gain over chance, nats
@@ -185,7 +185,7 @@ def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
     piled = (gains > 0.0) & (np.abs(ends - limit) <= near)
     at = [int(np.count_nonzero(sign * values >= end - near)) for sign, end in zip((1, -1), ends, strict=True)]
     return Clipping(
-        limit=Interval(abs(limit), abs(limit) - near, abs(limit) + near),
+        limit=ValueWithInterval(abs(limit), abs(limit) - near, abs(limit) + near),
         count=int(np.dot(at, piled)),
         upper=bool(piled[0]),
         lower=bool(piled[1]),
@@ -331,7 +331,7 @@ def _fit_grid(values: Floats, step: float, blur: float, noise: float) -> Quantiz
     gain = told * np.log(step / (2.0 * most)) - 2.0 * np.log(between + 1.0)
     error = 2.0 * most / between
     return QuantizationGrid(
-        step=Interval(step, step - error, step + error),
+        step=ValueWithInterval(step, step - error, step + error),
         offset=offset - step * float(np.rint(offset / step)),
         levels=int(between) + 1,
         noise=noise,
@@ -429,7 +429,7 @@ def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: f
             _share_difference_gain(np.array([count, n * chance]), np.full(2, n)), _excess_gain(count, n * chance, 0.0)
         )
         error = Z95 * (count + n * again) ** 0.5 / n
-        size = Interval(share, max(share - error, 0.0), share + error)
+        size = ValueWithInterval(share, max(share - error, 0.0), share + error)
         return RepeatedSamples(size, n * share, np.zeros_like(mask), gain) if gain > 0.0 else None
     # probability density of a difference at zero, times the spacing of the numbers
     chance = max(
@@ -460,7 +460,7 @@ def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: in
         return None
     error = (counts[0] + 3.0 * chance**2 / max(counts[1:].sum(), 1.0)) ** 0.5
     lo, hi = ((excess + sign * Z95 * error) / differences.size for sign in (-1.0, 1.0))
-    fraction = Interval(excess / differences.size, max(float(lo), 0.0), float(hi))
+    fraction = ValueWithInterval(excess / differences.size, max(float(lo), 0.0), float(hi))
     return RepeatedSamples(fraction, excess, np.zeros(n, dtype=np.bool_), gain)
 
 
@@ -542,9 +542,9 @@ def _poisson_gain(count: float, expected: float) -> float:
     return float(count * np.log(count / expected) - count + expected) if count > expected else 0.0
 
 
-def _wilson_interval(count: int, trials: int) -> Interval:
+def _wilson_interval(count: int, trials: int) -> ValueWithInterval:
     """Return a share with its 95 % interval (Wilson 1927)."""
     share, extra = count / trials, Z95**2 / trials
     middle = (share + 0.5 * extra) / (1.0 + extra)
     half = Z95 / (1.0 + extra) * (share * (1.0 - share) / trials + 0.25 * extra / trials) ** 0.5
-    return Interval(share, max(middle - half, 0.0), middle + half)
+    return ValueWithInterval(share, max(middle - half, 0.0), middle + half)

@@ -32,7 +32,7 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.diagnostics.diagnostics import find_line_peaks, power_gain, step_gains
+from monitor.reconcile.diagnostics.diagnostics import find_line_peaks, free_variance_gain_nats, level_step_gains
 from monitor.reconcile.likelihood.axis import Axis, Effects
 from monitor.reconcile.likelihood.hypothesis import refine_shape
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
@@ -87,19 +87,19 @@ CandidateFunction = Callable[[WhitenedAxis], list[Effect]]
 """Function that proposes effects of one family."""
 
 
-def propose_classic_terms(seen: WhitenedAxis) -> list[Effect]:
+def propose_classic_terms(whitened: WhitenedAxis) -> list[Effect]:
     """Return the classic terms Q, N, B and K that the axis does not have yet."""
-    small = start_size(seen.axis)
+    small = initial_size(whitened.axis)
     every = (QuantizationNoise(Q=small), AngleRandomWalk(N=small), BiasInstability(B=small), RateRandomWalk(K=small))
-    return [effect for effect in every if type(effect) not in seen.types]
+    return [effect for effect in every if type(effect) not in whitened.types]
 
 
-def propose_correlated_noise(seen: WhitenedAxis) -> list[Effect]:
+def propose_correlated_noise(whitened: WhitenedAxis) -> list[Effect]:
     """Return the best exponentially correlated noise, or nothing if its correlation time is out of range."""
-    return correlated_noise(seen.axis, seen.effects)
+    return fit_correlated_noise(whitened.axis, whitened.effects)
 
 
-def correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
+def fit_correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
     """Return the best exponentially correlated noise, or nothing if its correlation time is out of range.
 
     Parameters
@@ -114,22 +114,22 @@ def correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
         return []
     times_s = np.geomspace(shortest, longest, max(3, round(SHAPES_PER_DECADE * np.log10(longest / shortest))))
     best = _most_likely(
-        axis, effects, [ExponentiallyCorrelated(sigma=start_size(axis), correlation_time=float(t)) for t in times_s]
+        axis, effects, [ExponentiallyCorrelated(sigma=initial_size(axis), correlation_time=float(t)) for t in times_s]
     )
     found = refine_shape(axis, (*effects, best), -1, ["correlation_time"], 2.0)[-1]
     assert isinstance(found, ExponentiallyCorrelated)
     return [found] if shortest <= found.correlation_time <= longest else []
 
 
-def propose_resonances(seen: WhitenedAxis) -> list[Effect]:
+def propose_resonances(whitened: WhitenedAxis) -> list[Effect]:
     """Return resonances at the peaks of the whitened spectrum."""
-    axis, found = seen.axis, list[Effect]()
-    for middle, width in find_spectral_peaks(seen):
+    axis, found = whitened.axis, list[Effect]()
+    for middle, width in find_spectral_peaks(whitened):
         trials = [
-            Narrowband(sigma=start_size(axis), frequency=middle, bandwidth=float(width * factor))
+            Narrowband(sigma=initial_size(axis), frequency=middle, bandwidth=float(width * factor))
             for factor in (0.3, 0.6, 1.0, 1.8)
         ]
-        effects = (*seen.effects, _most_likely(axis, seen.effects, trials))
+        effects = (*whitened.effects, _most_likely(axis, whitened.effects, trials))
         effects = refine_shape(axis, effects, -1, ["bandwidth"], 2.5)
         peak = effects[-1]
         assert isinstance(peak, Narrowband)
@@ -138,12 +138,12 @@ def propose_resonances(seen: WhitenedAxis) -> list[Effect]:
     return found
 
 
-def find_spectral_peaks(seen: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple[float, float]]:
+def find_spectral_peaks(whitened: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple[float, float]]:
     """Return the peaks of the whitened spectrum that are wider than a line, strongest first.
 
     Parameters
     ----------
-    seen : WhitenedAxis
+    whitened : WhitenedAxis
         Whitened axis.
     most : int, optional
         Largest number of peaks.
@@ -153,15 +153,15 @@ def find_spectral_peaks(seen: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple
     list of tuple of float
         Centre frequency and width of each peak in Hz.
     """
-    n = seen.axis.n
-    step_hz = 0.5 * seen.axis.rate_hz / n
-    running = np.concatenate([[0.0], np.cumsum(seen.whitened**2)])
+    n = whitened.axis.n
+    step_hz = 0.5 * whitened.axis.rate_hz / n
+    running = np.concatenate([[0.0], np.cumsum(whitened.coefficients**2)])
     found: list[tuple[float, float, float]] = []
     width = 8
     while width < n // 8:
         first = np.arange(width, n - 1 - width, max(1, width // 4))
         power = np.maximum((running[first + width] - running[first]) / width, 1.0)
-        gains = power_gain(power, np.full(first.size, width))
+        gains = free_variance_gain_nats(power, np.full(first.size, width))
         for _ in range(most):
             at = int(np.argmax(gains))
             middle = (first[at] + 0.5 * width) * step_hz
@@ -177,22 +177,22 @@ def find_spectral_peaks(seen: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple
     return chosen
 
 
-def propose_sinusoids(seen: WhitenedAxis) -> list[Effect]:
+def propose_sinusoids(whitened: WhitenedAxis) -> list[Effect]:
     """Return sinusoids at the lines of the spectrum."""
     return [
-        Sinusoidal(amplitude=start_size(seen.axis), frequency=_line_frequency(seen, f_hz), phase=0.0)
-        for gain, f_hz in find_line_peaks(seen.white, seen.axis.rate_hz, MAX_PEAKS)
+        Sinusoidal(amplitude=initial_size(whitened.axis), frequency=_line_frequency(whitened, f_hz), phase=0.0)
+        for gain, f_hz in find_line_peaks(whitened.series, whitened.axis.rate_hz, MAX_PEAKS)
         if gain > PENALTY_NATS["sinusoidal"] / 2.0
     ]
 
 
-def _line_frequency(seen: WhitenedAxis, f_hz: float) -> float:
+def _line_frequency(whitened: WhitenedAxis, f_hz: float) -> float:
     """Return the frequency of the maximum of the periodogram near a given frequency, by golden-section search."""
-    t = np.arange(seen.axis.n) / seen.axis.rate_hz
-    half = 0.5 * seen.axis.rate_hz / seen.axis.n
+    t = np.arange(whitened.axis.n) / whitened.axis.rate_hz
+    half = 0.5 * whitened.axis.rate_hz / whitened.axis.n
 
     def power(f: float) -> float:
-        return float(abs(np.exp(-2j * np.pi * f * t) @ seen.white))
+        return float(abs(np.exp(-2j * np.pi * f * t) @ whitened.series))
 
     lo, hi = f_hz - half, f_hz + half
     for _ in range(16):
@@ -201,74 +201,74 @@ def _line_frequency(seen: WhitenedAxis, f_hz: float) -> float:
     return 0.5 * (lo + hi)
 
 
-def propose_low_pass(seen: WhitenedAxis) -> list[Effect]:
+def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
     """Return the best low-pass filter, or nothing if the effects already contain one or no filter fits."""
-    if BandwidthLimit in seen.types:
+    if BandwidthLimit in whitened.types:
         return []
-    axis = seen.axis
+    axis = whitened.axis
     nyquist = 0.5 * axis.rate_hz
     cutoffs = nyquist * np.geomspace(0.04, 0.95, 11)
     found: list[Effect] = []
     for order in FILTER_ORDERS:
-        best = _most_likely(axis, seen.effects, [BandwidthLimit(cutoff=float(f), order=order) for f in cutoffs])
-        refined = refine_shape(axis, (*seen.effects, best), -1, ["cutoff"], 1.4)[-1]
+        best = _most_likely(axis, whitened.effects, [BandwidthLimit(cutoff=float(f), order=order) for f in cutoffs])
+        refined = refine_shape(axis, (*whitened.effects, best), -1, ["cutoff"], 1.4)[-1]
         assert isinstance(refined, BandwidthLimit)
         if refined.cutoff < 0.99 * nyquist:
             found.append(refined)
-    return [_most_likely(axis, seen.effects, found)] if found else []
+    return [_most_likely(axis, whitened.effects, found)] if found else []
 
 
-def propose_drifts(seen: WhitenedAxis) -> list[Effect]:
+def propose_drifts(whitened: WhitenedAxis) -> list[Effect]:
     """Return effects that follow time: a ramp, a transient after the start, and a step."""
     found: list[Effect] = []
-    if RateRamp not in seen.types:
-        found.append(RateRamp(R=start_size(seen.axis)))
-    if TurnOnTransient not in seen.types:
-        times_s = np.geomspace(0.003, MAX_TIME_CONSTANT_FRACTION, 9) * seen.axis.length_s
+    if RateRamp not in whitened.types:
+        found.append(RateRamp(R=initial_size(whitened.axis)))
+    if TurnOnTransient not in whitened.types:
+        times_s = np.geomspace(0.003, MAX_TIME_CONSTANT_FRACTION, 9) * whitened.axis.length_s
         trials = [TurnOnTransient(amplitude=1.0, time_constant=float(t)) for t in times_s]
-        found += _best_time_constant(seen, trials, 1.6, 0.0)
-    if not seen.types & {PoissonSteps, RandomTelegraph}:
-        gains, times_s = step_gains(seen)
+        found += _best_time_constant(whitened, trials, 1.6, 0.0)
+    if not whitened.types & {PoissonSteps, RandomTelegraph}:
+        gains, times_s = level_step_gains(whitened)
         found.append(BiasStep(time=float(times_s[int(np.argmax(gains))]), height=1.0))
     return found
 
 
-def propose_temperature_effects(seen: WhitenedAxis) -> list[Effect]:
+def propose_temperature_effects(whitened: WhitenedAxis) -> list[Effect]:
     """Return effects that follow the temperature: linearly, quadratically or with a delay."""
-    temperature_c = seen.axis.temperature_c
+    temperature_c = whitened.axis.temperature_c
     if temperature_c is None or np.ptp(temperature_c) == 0.0:
         return []
     reference = float(round(temperature_c.mean(), 2))
     found: list[Effect] = []
-    if TemperatureBias not in seen.types:
+    if TemperatureBias not in whitened.types:
         found.append(TemperatureBias(coefficient=1.0, reference=reference))
         found.append(TemperatureBias(coefficient=1.0, reference=reference, quadratic=1.0))
-    if TemperatureLag not in seen.types:
-        shortest_s = MIN_DELAY_FRACTION * seen.axis.length_s
-        times_s = np.geomspace(shortest_s, MAX_TIME_CONSTANT_FRACTION * seen.axis.length_s, 9)
+    if TemperatureLag not in whitened.types:
+        shortest_s = MIN_DELAY_FRACTION * whitened.axis.length_s
+        times_s = np.geomspace(shortest_s, MAX_TIME_CONSTANT_FRACTION * whitened.axis.length_s, 9)
         lags = [TemperatureLag(coefficient=1.0, reference=reference, time_constant=float(t)) for t in times_s]
-        found += _best_time_constant(seen, lags, 2.2, shortest_s)
+        found += _best_time_constant(whitened, lags, 2.2, shortest_s)
     return found
 
 
 def _best_time_constant(
-    seen: WhitenedAxis, trials: Sequence[TurnOnTransient | TemperatureLag], reach: float, shortest_s: float
+    whitened: WhitenedAxis, trials: Sequence[TurnOnTransient | TemperatureLag], reach: float, shortest_s: float
 ) -> list[Effect]:
     """Return the best effect with a refined time constant, or nothing if the time constant is out of range."""
-    best = _most_likely(seen.axis, seen.effects, trials)
-    refined = refine_shape(seen.axis, (*seen.effects, best), -1, ["time_constant"], reach)[-1]
+    best = _most_likely(whitened.axis, whitened.effects, trials)
+    refined = refine_shape(whitened.axis, (*whitened.effects, best), -1, ["time_constant"], reach)[-1]
     assert isinstance(refined, (TurnOnTransient, TemperatureLag))
-    longest_s = MAX_TIME_CONSTANT_FRACTION * seen.axis.length_s
+    longest_s = MAX_TIME_CONSTANT_FRACTION * whitened.axis.length_s
     return [refined] if shortest_s < refined.time_constant <= longest_s else []
 
 
-def propose_leaks(seen: WhitenedAxis) -> list[Effect]:
+def propose_leaks(whitened: WhitenedAxis) -> list[Effect]:
     """Return leaks from the other axes."""
-    known = {getattr(effect, "source", None) for effect in seen.effects}
+    known = {getattr(effect, "source", None) for effect in whitened.effects}
     found: list[Effect] = []
-    for source in seen.axis.others:
+    for source in whitened.axis.leak_sources:
         if source not in known:
-            same_kind = (source in GYROS) == (seen.axis.name in GYROS)
+            same_kind = (source in GYROS) == (whitened.axis.name in GYROS)
             leak = CrossAxis if same_kind else GSensitivity
             found.append(leak(source=source, coefficient=1.0))
     return found
@@ -295,6 +295,6 @@ def _most_likely(axis: Axis, effects: Effects, trials: Sequence[Effect]) -> Effe
     return max(trials, key=lambda one: axis.fit((*effects, one)).log_likelihood)
 
 
-def start_size(axis: Axis) -> float:
+def initial_size(axis: Axis) -> float:
     """Return a starting size that is small compared with the standard deviation of the samples."""
     return 1e-3 * axis.rms

@@ -16,7 +16,7 @@ import numpy as np
 
 from drivers.sample import Floats
 from monitor.noise.effect import Effect
-from monitor.noise.effects import Outliers, Resolution, SampleHold, Saturation, Sinusoidal
+from monitor.noise.effects import Outliers, RandomSampleHold, Resolution, Saturation, Sinusoidal
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.likelihood.axis import Axis, AxisFit, Effects, RegressorCache
@@ -24,11 +24,11 @@ from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMET
 from monitor.reconcile.likelihood.hypothesis import Hypothesis, noise_indices
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins, inverse_cosine_transform
-from monitor.reconcile.search.axis_preparation import measure_value_statistics, repair_again
+from monitor.reconcile.search.axis_repair import measure_value_statistics, repair_axis_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
 """Smallest gain in nats that one half must be able to provide."""
-SAMPLE_EFFECTS: Final = (Resolution, Saturation, SampleHold, Outliers)
+SAMPLE_EFFECTS: Final = (Resolution, Saturation, RandomSampleHold, Outliers)
 """Effects that are visible in single samples and not in the spectrum."""
 TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too little evidence for the effect"
 """Reason why a weak effect is not validated."""
@@ -92,14 +92,14 @@ def cross_validate(
     return _exchange_halves(repaired, before, after, lens, null)
 
 
-def _fit_half(half: Axis, state: Hypothesis) -> AxisFit:
+def _fit_half(half: Axis, hypothesis: Hypothesis) -> AxisFit:
     """Fit the effects of a hypothesis to one half of the axis."""
-    return half.fit(state.effects, state.fit.held)
+    return half.fit(hypothesis.effects, hypothesis.fit.fixed_noise)
 
 
-def _summed_gap(halves: list[Axis], state: Hypothesis, lens: str) -> float:
+def _summed_gap(halves: list[Axis], hypothesis: Hypothesis, lens: str) -> float:
     """Return the gap of a diagnostic in both halves together, each with its own fit."""
-    return sqrt(sum(DIAGNOSTICS[lens](whiten_axis(_fit_half(half, state))).gain for half in halves))
+    return sqrt(sum(DIAGNOSTICS[lens](whiten_axis(_fit_half(half, hypothesis))).gain for half in halves))
 
 
 def _exchange_halves(
@@ -109,8 +109,8 @@ def _exchange_halves(
     gaps = np.zeros(2)
     better = 0.0
     for learn, test in ((0, 1), (1, 0)):
-        for at, state in enumerate((before, after)):
-            predicted = _predict_half(halves[test], _fit_half(halves[learn], state))
+        for at, hypothesis in enumerate((before, after)):
+            predicted = _predict_half(halves[test], _fit_half(halves[learn], hypothesis))
             gaps[at] += DIAGNOSTICS[lens](whiten_axis(predicted)).gain
             better += predicted.log_likelihood * (2 * at - 1)
     gap_before, gap_after = (sqrt(gain) for gain in gaps)
@@ -124,7 +124,7 @@ def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[st
     temperature_c = None if axis.temperature_c is None else axis.temperature_c[part]
     others = {
         name: cosine_transform(inverse_cosine_transform(one)[part])
-        for name, one in axis.others.items()
+        for name, one in axis.leak_sources.items()
         if name in sources
     }
     half = Axis(
@@ -138,14 +138,14 @@ def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[st
         measure_value_statistics(raw),
         RegressorCache(raw.size, axis.rate_hz, temperature_c),
     )
-    return repair_again(half, effects, rng)
+    return repair_axis_again(half, effects, rng)
 
 
 def _expected_gain(fit: AxisFit, effect: Effect) -> float:
     """Return the gain in nats of a deterministic effect of a given size beside the noise of a fit: ½ Σ (β R)²/v."""
     half = fit.axis
-    columns = half.columns(effect)
-    weight = half.bins.spread(half.used_bins / fit.fitted.variance)
+    columns = half.regressor_transforms(effect)
+    weight = half.bins.spread(half.used_bins / fit.whittle.variance)
     if isinstance(effect, Sinusoidal):
         return 0.5 * effect.amplitude**2 * float((columns[0] ** 2 * weight).sum())
     quadratic = getattr(effect, "quadratic", None)
@@ -163,25 +163,25 @@ def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
     """
     effects = learned.effects
     free = half.fit(effects, noise_indices(effects))
-    beta = free.fitted.beta.copy()
+    beta = free.whittle.beta.copy()
     known: list[int] = []
-    for at, place in free.regressors:
+    for at, place in free.regressor_slices:
         effect = effects[at]
         if isinstance(effect, Sinusoidal):  # the phase is fitted anew, the amplitude is kept
             beta[place] *= effect.amplitude / max(float(np.hypot(*beta[place])), 1e-300)
         else:
             known += range(place.start, place.stop)
-    free = free.with_beta(beta)
+    free = free.with_regressor_sizes(beta)
     if not known:
         return free
     pick = np.ix_(known, known)
-    here, there = (_regularised(one.fitted.beta_covariance[pick]) for one in (free, learned))
-    apart = free.fitted.beta[known] - learned.fitted.beta[known]
+    here, there = (_regularised(one.whittle.beta_covariance[pick]) for one in (free, learned))
+    apart = free.whittle.beta[known] - learned.whittle.beta[known]
     both = here + there
     penalty = 0.5 * float(apart @ np.linalg.pinv(both) @ apart)
     penalty += 0.5 * float(np.linalg.slogdet(both)[1] - np.linalg.slogdet(here)[1])
     beta[known] -= here @ np.linalg.pinv(both) @ apart
-    return replace(free.with_beta(beta), log_likelihood=free.log_likelihood - penalty)
+    return replace(free.with_regressor_sizes(beta), log_likelihood=free.log_likelihood - penalty)
 
 
 def _regularised(covariance: Floats) -> Floats:

@@ -22,14 +22,14 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.likelihood.axis import AxisFit, Effects
 from monitor.reconcile.likelihood.effect_terms import size
-from monitor.reconcile.likelihood.hidden_state import BackgroundNoise
+from monitor.reconcile.likelihood.event_process_comparison import BackgroundNoise
 from monitor.reconcile.likelihood.hypothesis import Hypothesis
-from monitor.reconcile.likelihood.poisson_steps import compare_steps_with_random_walk
-from monitor.reconcile.likelihood.random_telegraph import compare_telegraph_with_correlated
-from monitor.reconcile.likelihood.single_steps import compare_steps_with_single_steps
+from monitor.reconcile.likelihood.poisson_steps import compare_poisson_with_random_walk
+from monitor.reconcile.likelihood.random_telegraph import compare_telegraph_with_correlated_noise
+from monitor.reconcile.likelihood.single_steps import compare_poisson_with_single_steps
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.search.candidates import PENALTY_NATS, correlated_noise
+from monitor.reconcile.search.candidates import PENALTY_NATS, fit_correlated_noise
 from monitor.reconcile.search.trials import Trial
 
 MIN_ALTERNATIVE_GAIN_NATS: Final = 3.0
@@ -58,90 +58,96 @@ WALK_EFFECTS: Final = (BiasStep, RateRandomWalk)
 class NonGaussianAlternative:
     """Alternative effect with the same spectrum as an effect that was found, but another distribution."""
 
-    found: Effects  # effects beyond the model; the alternative comes last and replaces the original effect
+    added: Effects  # effects beyond the model; the alternative comes last and replaces the original effect
     gain: float  # log-likelihood gain over the original effect, nats
-    bounds: Mapping[str, ParameterInterval]  # parameters of the alternative
-    events: int  # number of switches or jumps
-    whole: float = 0.0  # log-likelihood with Poisson steps: that of a random walk plus their gain over it
-    rival: "NonGaussianAlternative | None" = None  # the alternative that this one was preferred to
+    intervals: Mapping[str, ParameterInterval]  # parameters of the alternative
+    event_count: int  # number of switches or jumps
+    poisson_log_likelihood: float = (
+        0.0  # log-likelihood with Poisson steps: that of a random walk plus their gain over it
+    )
+    runner_up: "NonGaussianAlternative | None" = None  # the alternative that this one was preferred to
 
-    def trials(self, value: float) -> tuple[Trial, ...]:
+    def as_trials(self, replaced_gain_nats: float) -> tuple[Trial, ...]:
         """Return the trials of this alternative to an effect with the given value in nats, and of the rival."""
-        effect = self.found[-1]
-        trial = Trial(effect.name, effect, value + self.gain, bounds=self.bounds, events=self.events)
-        return (trial, *(self.rival.trials(value) if self.rival else ()))
+        effect = self.added[-1]
+        trial = Trial(
+            effect.name, effect, replaced_gain_nats + self.gain, intervals=self.intervals, event_count=self.event_count
+        )
+        return (trial, *(self.runner_up.as_trials(replaced_gain_nats) if self.runner_up else ()))
 
 
-def resolve_distribution(state: Hypothesis, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
+def choose_distribution(hypothesis: Hypothesis, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
     """Replace a new effect by an effect with the same spectrum if this distribution fits better.
 
     Parameters
     ----------
-    state : Hypothesis
+    hypothesis : Hypothesis
         Fitted effects, of which the last one is new.
     trials : list of Trial
         Trials of which the first one was selected.
 
     Returns
     -------
-    state : Hypothesis
+    hypothesis : Hypothesis
         Fitted effects with the selected alternative.
     trials : list of Trial
         Trials with the alternatives included.
     """
     alternative, new = None, trials[0].effect
-    if isinstance(new, ExponentiallyCorrelated) and isinstance(state.effects[-1], ExponentiallyCorrelated):
-        alternative = fit_telegraph_alternative(state, len(state.effects) - 1)
+    if isinstance(new, ExponentiallyCorrelated) and isinstance(hypothesis.effects[-1], ExponentiallyCorrelated):
+        alternative = fit_telegraph_alternative(hypothesis, len(hypothesis.effects) - 1)
     elif isinstance(new, BiasStep):
-        alternative = compare_jump_processes(state)
+        alternative = compare_jump_processes(hypothesis)
     if alternative is None:
-        return state, trials
-    added = alternative.trials(trials[0].value)
+        return hypothesis, trials
+    added = alternative.as_trials(trials[0].score)
     if alternative.gain <= MIN_ALTERNATIVE_GAIN_NATS:
-        return state, [trials[0], *added, *trials[1:]]
-    return state.refit(alternative.found), [*added, *trials]
+        return hypothesis, [trials[0], *added, *trials[1:]]
+    return hypothesis.refit_with_added_effects(alternative.added), [*added, *trials]
 
 
-def compare_jump_processes(state: Hypothesis) -> NonGaussianAlternative | None:
+def compare_jump_processes(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
     """Return Poisson steps as alternative to a random walk or single steps, or a slow telegraph if it fits better.
 
     The result is None if the axis has no random walk and no steps that Poisson steps could replace.
     """
-    steps = fit_poisson_alternative(state)
+    steps = fit_poisson_alternative(hypothesis)
     if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return steps
     # Use the original random walk of the model. An increased random walk would leave nothing for a telegraph.
-    bare, held = _with_original_walks(state)
-    for noise in correlated_noise(state.axis, state.axis.fit(bare, held).effects):
-        other = Hypothesis(state.model, state.axis.fit((*bare, noise), held))
-        if size(other.found[-1]) == 0.0:
+    bare, fixed_noise = _with_original_walks(hypothesis)
+    for noise in fit_correlated_noise(hypothesis.axis, hypothesis.axis.fit(bare, fixed_noise).effects):
+        other = Hypothesis(hypothesis.model, hypothesis.axis.fit((*bare, noise), fixed_noise))
+        if size(other.added[-1]) == 0.0:
             continue
         telegraph = fit_telegraph_alternative(other, len(other.effects) - 1)
-        if telegraph is None or telegraph.events < MIN_SWITCHES:
+        if telegraph is None or telegraph.event_count < MIN_SWITCHES:
             continue
-        excess = other.fit.log_likelihood + telegraph.gain - steps.whole
+        excess = other.fit.log_likelihood + telegraph.gain - steps.poisson_log_likelihood
         excess -= PENALTY_NATS["random_telegraph"] - PENALTY_NATS["poisson_steps"]
         if excess > 0.0:
-            return replace(telegraph, gain=steps.gain + excess, rival=steps)
+            return replace(telegraph, gain=steps.gain + excess, runner_up=steps)
     return steps
 
 
-def _with_original_walks(state: Hypothesis) -> tuple[Effects, frozenset[int]]:
+def _with_original_walks(hypothesis: Hypothesis) -> tuple[Effects, frozenset[int]]:
     """Return the effects without found steps and walks, with the original walks of the model, and the fixed sizes."""
-    walks = frozenset(at for at, effect in enumerate(state.model) if isinstance(effect, WALK_EFFECTS))
-    known = [state.model[at] if at in walks else state.effects[at] for at in range(state.given)]
-    held = frozenset(at for at in range(state.given) if at in state.fit.held or at in walks)
-    return (*known, *(one for one in state.found if not isinstance(one, WALK_EFFECTS))), held
+    walks = frozenset(at for at, effect in enumerate(hypothesis.model) if isinstance(effect, WALK_EFFECTS))
+    known = [hypothesis.model[at] if at in walks else hypothesis.effects[at] for at in range(hypothesis.given_count)]
+    fixed_noise = frozenset(
+        at for at in range(hypothesis.given_count) if at in hypothesis.fit.fixed_noise or at in walks
+    )
+    return (*known, *(one for one in hypothesis.added if not isinstance(one, WALK_EFFECTS))), fixed_noise
 
 
-def fit_telegraph_alternative(state: Hypothesis, at: int) -> NonGaussianAlternative | None:
+def fit_telegraph_alternative(hypothesis: Hypothesis, index: int) -> NonGaussianAlternative | None:
     """Return a random telegraph as alternative to correlated noise.
 
     Parameters
     ----------
-    state : Hypothesis
+    hypothesis : Hypothesis
         Fitted effects.
-    at : int
+    index : int
         Index of the correlated noise.
 
     Returns
@@ -149,51 +155,53 @@ def fit_telegraph_alternative(state: Hypothesis, at: int) -> NonGaussianAlternat
     NonGaussianAlternative or None
         The alternative, or None if the axis has no white noise.
     """
-    noise = state.effects[at]
+    noise = hypothesis.effects[index]
     assert isinstance(noise, ExponentiallyCorrelated)
-    rest = background_noise((*state.effects[:at], *state.effects[at + 1 :]))
+    rest = background_noise((*hypothesis.effects[:index], *hypothesis.effects[index + 1 :]))
     if not rest.white > 0.0:
         return None
-    series, tau0_s = _residual_series(state.fit), 1.0 / state.axis.rate_hz
-    compared = compare_telegraph_with_correlated(series, tau0_s, rest, noise.sigma, noise.correlation_time)
+    series, tau0_s = _residual_series(hypothesis.fit), 1.0 / hypothesis.axis.rate_hz
+    compared = compare_telegraph_with_correlated_noise(series, tau0_s, rest, noise.sigma, noise.correlation_time)
     amplitude, dwell = (float(compared.parameters[name].value) for name in ("amplitude", "dwell_time"))
     effect = RandomTelegraph(amplitude=amplitude, dwell_time=dwell)
-    found = (*state.effects[state.given : at], *state.effects[at + 1 :], effect)
+    found = (*hypothesis.effects[hypothesis.given_count : index], *hypothesis.effects[index + 1 :], effect)
     return NonGaussianAlternative(found, compared.gain, compared.parameters, compared.events)
 
 
-def fit_poisson_alternative(state: Hypothesis) -> NonGaussianAlternative | None:
+def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
     """Return Poisson steps as alternative to single steps or to an increased random walk.
 
     The random walk of the model keeps the original size. The steps, or the increase of the random walk, are tested. The
     result is None if the axis has neither single steps nor an increased random walk.
     """
-    steps = sum(isinstance(effect, BiasStep) for effect in state.found)
-    walks = [at for at, effect in enumerate(state.effects) if isinstance(effect, RateRandomWalk)]
-    if not steps and not any(at >= state.given or at in state.fit.noises for at in walks):
+    steps = sum(isinstance(effect, BiasStep) for effect in hypothesis.added)
+    walks = [at for at, effect in enumerate(hypothesis.effects) if isinstance(effect, RateRandomWalk)]
+    if not steps and not any(at >= hypothesis.given_count or at in hypothesis.fit.fitted_noise for at in walks):
         return None
-    effects, held = _with_original_walks(state)
-    without = state.axis.fit(effects, held)
-    known = max((size(effects[at]) for at in walks if at < state.given), default=0.0)
-    walk = state.axis.fit((*effects, RateRandomWalk(K=max(known, 1e-12))), held)
+    effects, fixed_noise = _with_original_walks(hypothesis)
+    without = hypothesis.axis.fit(effects, fixed_noise)
+    known = max((size(effects[at]) for at in walks if at < hypothesis.given_count), default=0.0)
+    walk = hypothesis.axis.fit((*effects, RateRandomWalk(K=max(known, 1e-12))), fixed_noise)
     excess = size(walk.effects[-1])
     rest = background_noise(without.effects)
     if not (excess > 0.0 and rest.white > 0.0):
         return None
-    series, tau0_s = _residual_series(without), 1.0 / state.axis.rate_hz
-    compared = compare_steps_with_random_walk(series, tau0_s, rest, excess)
+    series, tau0_s = _residual_series(without), 1.0 / hypothesis.axis.rate_hz
+    compared = compare_poisson_with_random_walk(series, tau0_s, rest, excess)
     gain, whole = compared.gain, walk.log_likelihood + compared.gain
     if steps:
-        compared = compare_steps_with_single_steps(series, tau0_s, rest, excess, most=max(steps, MIN_FITTED_STEPS))
+        compared = compare_poisson_with_single_steps(series, tau0_s, rest, excess, most=max(steps, MIN_FITTED_STEPS))
         gain = compared.gain + STEP_PENALTY_NATS * max(compared.single_steps - MAX_FREE_STEPS, 0)
     rate, height = (float(compared.parameters[name].value) for name in ("rate", "height"))
-    found = (*effects[state.given :], PoissonSteps(rate=rate, height=height))
-    return NonGaussianAlternative(found, gain - POISSON_PENALTY_NATS, compared.parameters, compared.events, whole=whole)
+    found = (*effects[hypothesis.given_count :], PoissonSteps(rate=rate, height=height))
+    return NonGaussianAlternative(
+        found, gain - POISSON_PENALTY_NATS, compared.parameters, compared.events, poisson_log_likelihood=whole
+    )
 
 
 def _residual_series(fit: AxisFit) -> Floats:
     """Return the series, shape (n,), with all fitted deterministic effects removed."""
-    return inverse_cosine_transform(fit.residual())
+    return inverse_cosine_transform(fit.residual_coefficients())
 
 
 def background_noise(effects: Effects) -> BackgroundNoise:

@@ -18,7 +18,7 @@ from monitor.noise.effect import Effect
 from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.reconcile.diagnostics.diagnostics import periodogram
 from monitor.reconcile.likelihood.axis import Axis, Effects
-from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes, golden_section
+from monitor.reconcile.likelihood.hypothesis import find_maximum_by_golden_section, fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidates import find_spectral_peaks
@@ -70,7 +70,7 @@ class SampleRateErrorEstimate:
     frequency: tuple[float, float]  # frequency of the feature in the model and in the recording, Hz
 
 
-def in_stated_time(effect: Effect, ratio: float) -> Effect:
+def convert_to_stated_time(effect: Effect, ratio: float) -> Effect:
     """Return the effect as it appears in a recording whose stated sample rate is 1/ratio of the true rate.
 
     Parameters
@@ -82,7 +82,7 @@ def in_stated_time(effect: Effect, ratio: float) -> Effect:
 
     Examples
     --------
-    >>> in_stated_time(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
+    >>> convert_to_stated_time(Sinusoidal(amplitude=1.0, frequency=10.1), 1.01).frequency
     10.0
     """
     changed: dict[str, Any] = {
@@ -116,14 +116,14 @@ def detect_sample_rate_error(
     before = {name: _log_likelihood(axes[name], effects[name]) for name in axes}
 
     def gains(x: float) -> dict[str, float]:
-        changed = {name: tuple(in_stated_time(effect, exp(x)) for effect in effects[name]) for name in axes}
+        changed = {name: tuple(convert_to_stated_time(effect, exp(x)) for effect in effects[name]) for name in axes}
         return {name: _log_likelihood(axes[name], changed[name]) - before[name] for name in axes}
 
     def gain(x: float) -> float:
         return sum(gains(x).values())
 
     ratio, width = max(trials, key=lambda one: gain(log(one[0])))
-    x = golden_section(gain, log(ratio) - width, log(ratio) + width, SEARCH_ITERATIONS)
+    x = find_maximum_by_golden_section(gain, log(ratio) - width, log(ratio) + width, SEARCH_ITERATIONS)
     top = gain(x)
     if top < SAMPLE_RATE_PENALTY_NATS:
         return None
@@ -142,7 +142,7 @@ def detect_sample_rate_error(
 
 def _log_likelihood(axis: Axis, effects: Effects) -> float:
     """Return the log-likelihood of effects with the given noise sizes."""
-    return fit_with_given_sizes(axis, effects).fit.log_likelihood
+    return fit_with_fixed_noise(axis, effects).fit.log_likelihood
 
 
 def _features(effects: Effects) -> list[Feature]:
@@ -164,7 +164,7 @@ def _gain_per_feature(
     for group in groups:
         gain = 0.0
         for name, of in effects.items():
-            moved = tuple(in_stated_time(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
+            moved = tuple(convert_to_stated_time(e, ratio) if getattr(e, "frequency", None) in group else e for e in of)
             if moved != of:
                 gain += _log_likelihood(axes[name], moved) - before[name]
         gains.append(gain)
@@ -184,18 +184,18 @@ def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) 
     found: list[tuple[float, float]] = []
     for name, axis in axes.items():
         if features[name]:
-            seen = whiten_axis(fit_with_given_sizes(axis, effects[name]).fit)
-            power += _line_power(seen, features[name], np.exp(-grid))
-            found += _resonance_ratios(seen, features[name])
+            whitened = whiten_axis(fit_with_fixed_noise(axis, effects[name]).fit)
+            power += _line_power(whitened, features[name], np.exp(-grid))
+            found += _resonance_ratios(whitened, features[name])
     strongest = [at for at in np.argsort(power)[-MAX_TRIAL_RATIOS:] if power[at] > 0.0]
     return found + [(exp(float(grid[at])), 8.0 * step) for at in strongest]
 
 
-def _line_power(seen: WhitenedAxis, features: list[Feature], factors: Floats) -> Floats:
+def _line_power(whitened: WhitenedAxis, features: list[Feature], factors: Floats) -> Floats:
     """Return the summed power of all lines if their frequencies are multiplied by each of the given factors."""
     power = np.zeros(factors.size)
-    spectrum = periodogram(seen.white)
-    spacing_hz = seen.axis.rate_hz / (2 * (spectrum.size - 1))
+    spectrum = periodogram(whitened.series)
+    spacing_hz = whitened.axis.rate_hz / (2 * (spectrum.size - 1))
     for line in features:
         if isinstance(line, Sinusoidal):
             at = np.rint(line.frequency * factors / spacing_hz).astype(np.int64)
@@ -203,13 +203,13 @@ def _line_power(seen: WhitenedAxis, features: list[Feature], factors: Floats) ->
     return power
 
 
-def _resonance_ratios(seen: WhitenedAxis, features: list[Feature]) -> list[tuple[float, float]]:
+def _resonance_ratios(whitened: WhitenedAxis, features: list[Feature]) -> list[tuple[float, float]]:
     """Return the ratios that move resonances to observed peaks, each with half the width to search."""
     return [
         (feature.frequency / peak_hz, 2.0 * feature.bandwidth / feature.frequency)
         for feature in features
         if isinstance(feature, Narrowband)
-        for peak_hz, _ in find_spectral_peaks(seen, 4)
+        for peak_hz, _ in find_spectral_peaks(whitened, 4)
         if abs(log(feature.frequency / peak_hz)) < MAX_LOG_RATIO
     ]
 

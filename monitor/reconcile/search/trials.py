@@ -24,10 +24,10 @@ from monitor.noise.effects import (
     ExponentiallyCorrelated,
     NoiseStep,
     Outliers,
+    RandomSampleHold,
     RateRamp,
     RateRandomWalk,
     Resolution,
-    SampleHold,
     Saturation,
     ScaleFactor,
 )
@@ -36,18 +36,18 @@ from monitor.reconcile.likelihood.axis import Axis, Effects
 from monitor.reconcile.likelihood.hypothesis import (
     RESIZE_PENALTY_NATS,
     Hypothesis,
-    golden_section,
+    find_maximum_by_golden_section,
     noise_indices,
 )
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
-from monitor.reconcile.preparation.value_statistics import Interval
+from monitor.reconcile.preparation.value_statistics import ValueWithInterval
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidates import (
     DETERMINISTIC_CANDIDATES,
     NOISE_CANDIDATES,
     PENALTY_NATS,
+    initial_size,
     propose_correlated_noise,
-    start_size,
 )
 
 UNNAMED: Final = "power_law"
@@ -90,28 +90,28 @@ class Trial:
 
     name: str
     effect: Effect | None  # None: no known effect, or no new effect
-    value: float  # gain less penalty, nats; for a deterministic effect, together with the best slow noise
-    alone: float = 0.0  # gain less penalty of a deterministic effect without such noise, nats
-    bounds: Mapping[str, ParameterInterval] = field(default_factory=dict)  # parameters that no spectrum determines
-    events: int = 0  # number of events that were detected
+    score: float  # gain less penalty, nats; for a deterministic effect, together with the best slow noise
+    score_without_slow_noise: float = 0.0  # gain less penalty of a deterministic effect without such noise, nats
+    intervals: Mapping[str, ParameterInterval] = field(default_factory=dict)  # parameters that no spectrum determines
+    event_count: int = 0  # number of events that were detected
 
 
-def trial_groups(state: Hypothesis, seen: WhitenedAxis) -> Iterator[list[Trial]]:
+def trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Iterator[list[Trial]]:
     """Yield the trials of one kind after the other, each kind with the best trial first.
 
     Parameters
     ----------
-    state : Hypothesis
+    hypothesis : Hypothesis
         Fitted effects.
-    seen : WhitenedAxis
-        Axis whitened by ``state``.
+    whitened : WhitenedAxis
+        Axis whitened by ``hypothesis``.
     """
-    yield _value_trials(seen)
-    yield _sample_trials(state, seen)
-    deterministic, noises = _deterministic_trials(state, seen), _noise_trials(state, seen)
+    yield _value_trials(whitened)
+    yield _sample_trials(hypothesis, whitened)
+    deterministic, noises = _deterministic_trials(hypothesis, whitened), _noise_trials(hypothesis, whitened)
     # A noise effect that explains far more comes first, because the residuals of a wrong spectrum look like steps and
     # slopes.
-    if deterministic and deterministic[0].alone > noises[0].value - NOISE_PRIORITY_NATS:
+    if deterministic and deterministic[0].score_without_slow_noise > noises[0].score - NOISE_PRIORITY_NATS:
         yield deterministic
         yield noises
     else:
@@ -119,120 +119,131 @@ def trial_groups(state: Hypothesis, seen: WhitenedAxis) -> Iterator[list[Trial]]
         yield deterministic
 
 
-def replacements_for_resizing(state: Hypothesis, seen: WhitenedAxis) -> list[Trial]:
+def alternatives_to_resizing(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Return effects that explain the data better than changed sizes of known noise effects.
 
     Parameters
     ----------
-    state : Hypothesis
+    hypothesis : Hypothesis
         Fitted effects.
-    seen : WhitenedAxis
-        Axis whitened by ``state``.
+    whitened : WhitenedAxis
+        Axis whitened by ``hypothesis``.
     """
-    found = [one for one in _deterministic_trials(state, seen) if one.alone > 0.0 and one.value > 0.0]
-    noises = [_noise_trial(state, effect) for effect in propose_correlated_noise(seen)]
-    return _best_first(found + [one for one in noises if one.value > 0.0])
+    found = [
+        one
+        for one in _deterministic_trials(hypothesis, whitened)
+        if one.score_without_slow_noise > 0.0 and one.score > 0.0
+    ]
+    noises = [_noise_trial(hypothesis, effect) for effect in propose_correlated_noise(whitened)]
+    return _best_first(found + [one for one in noises if one.score > 0.0])
 
 
 def _best_first(trials: Sequence[Trial]) -> list[Trial]:
     """Return trials in the order of their values."""
-    return sorted(trials, key=lambda one: -one.value)
+    return sorted(trials, key=lambda one: -one.score)
 
 
-def _value_trials(seen: WhitenedAxis) -> list[Trial]:
+def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
     """Return the trials of quantization, clipping and repeats."""
-    shown = seen.axis.shown
+    statistics = whitened.axis.value_statistics
     found: list[Trial] = []
-    if shown.levels and Resolution not in seen.types:
-        grid = shown.levels
+    if statistics.quantization and Resolution not in whitened.types:
+        grid = statistics.quantization
         resolution = Resolution(step=grid.step.value)
         found.append(_penalised_trial(resolution, grid.gain, {"step": _scaled_bounds(grid.step)}, grid.levels))
-    if shown.clipped and shown.clipped.symmetric and Saturation not in seen.types:
-        ends = shown.clipped
+    if statistics.clipping and statistics.clipping.symmetric and Saturation not in whitened.types:
+        ends = statistics.clipping
         saturation = Saturation(limit=ends.limit.value)
         found.append(_penalised_trial(saturation, ends.gain, {"limit": _scaled_bounds(ends.limit)}, ends.count))
-    if shown.repeats and SampleHold not in seen.types:
-        twice = shown.repeats
-        hold = SampleHold(fraction=min(twice.fraction.value, 0.999))
-        bounds = {"fraction": _scaled_bounds(twice.fraction)}
-        found.append(_penalised_trial(hold, twice.gain, bounds, round(twice.count)))
+    if statistics.repeats and RandomSampleHold not in whitened.types:
+        twice = statistics.repeats
+        hold = RandomSampleHold(fraction=min(twice.fraction.value, 0.999))
+        intervals = {"fraction": _scaled_bounds(twice.fraction)}
+        found.append(_penalised_trial(hold, twice.gain, intervals, round(twice.count)))
     return _best_first(found)
 
 
-def _sample_trials(state: Hypothesis, seen: WhitenedAxis) -> list[Trial]:
+def _sample_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Return the trials of outliers and of a step of the noise."""
-    return _best_first(_outlier_trial(state, seen) + _noise_step_trial(seen))
+    return _best_first(_outlier_trial(hypothesis, whitened) + _noise_step_trial(whitened))
 
 
-def _outlier_trial(state: Hypothesis, seen: WhitenedAxis) -> list[Trial]:
+def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Return the trial of outliers, or nothing if another cause of heavy tails is as likely."""
-    far = seen.outliers
-    if far is None or Outliers in seen.types or far.over_student <= MIN_STUDENT_GAIN_NATS:
+    far = whitened.outliers
+    if far is None or Outliers in whitened.types or far.over_student <= MIN_STUDENT_GAIN_NATS:
         return []
     if max(far.clustering_z, far.misfit_z) >= MAX_OUTLIER_Z:
         return []
-    unit = _whitened_unit(state)
+    unit = _whitened_unit(hypothesis)
     effect = Outliers(fraction=min(far.fraction.value, 1.0), scale=unit * far.scale.value)
-    bounds = {"fraction": _scaled_bounds(far.fraction), "scale": _scaled_bounds(far.scale, unit)}
-    return [_penalised_trial(effect, far.gain, bounds, far.count)]
+    intervals = {"fraction": _scaled_bounds(far.fraction), "scale": _scaled_bounds(far.scale, unit)}
+    return [_penalised_trial(effect, far.gain, intervals, far.count)]
 
 
-def _noise_step_trial(seen: WhitenedAxis) -> list[Trial]:
+def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
     """Return the trial of a step of the noise, or nothing if another variation of the variance explains more."""
-    history, length_s = seen.variance_history, seen.axis.length_s
+    history, length_s = whitened.variance_changes, whitened.axis.length_s
     step = history.step
     margin_s = STEP_MARGIN_FRACTION * length_s
-    if AngleRandomWalk not in seen.types or not margin_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s:
+    if (
+        AngleRandomWalk not in whitened.types
+        or not margin_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s
+    ):
         return []
     rivals = (history.trend, history.periodic, history.wander)
-    if step.gain <= max(rivals) - RIVAL_MARGIN_NATS or step.gain <= _band_burst_gain(seen) - RIVAL_MARGIN_NATS:
+    if step.gain <= max(rivals) - RIVAL_MARGIN_NATS or step.gain <= _band_burst_gain(whitened) - RIVAL_MARGIN_NATS:
         return []
-    bounds = {"time": _scaled_bounds(step.time), "ratio": _scaled_bounds(step.ratio)}
-    return [_penalised_trial(NoiseStep(time=step.time.value, ratio=step.ratio.value), step.gain, bounds)]
+    intervals = {"time": _scaled_bounds(step.time), "ratio": _scaled_bounds(step.ratio)}
+    return [_penalised_trial(NoiseStep(time=step.time.value, ratio=step.ratio.value), step.gain, intervals)]
 
 
-def _band_burst_gain(seen: WhitenedAxis) -> float:
+def _band_burst_gain(whitened: WhitenedAxis) -> float:
     """Return the gain in nats of the least constant place of the spectrogram if it is a band, otherwise 0.
 
     A change within a band is no step of the white noise.
     """
-    found = least_constant_tiles(seen)
-    return found.gain if np.ptp(found.frequency) < MAX_BAND_FRACTION * seen.axis.rate_hz else 0.0
+    found = least_constant_tiles(whitened)
+    return found.gain if np.ptp(found.frequency) < MAX_BAND_FRACTION * whitened.axis.rate_hz else 0.0
 
 
-def _whitened_unit(state: Hypothesis) -> float:
+def _whitened_unit(hypothesis: Hypothesis) -> float:
     """Return the standard deviation of the axis per unit of the whitened fast series, from the upper half of the
     bins.
     """
-    half = state.axis.bins.count.size // 2
-    count, variance = state.axis.bins.count[half:], state.fit.fitted.residual[half:]
+    half = hypothesis.axis.bins.count.size // 2
+    count, variance = hypothesis.axis.bins.count[half:], hypothesis.fit.whittle.residual[half:]
     return float(np.sqrt(variance.sum() / count.sum()))
 
 
-def _penalised_trial(effect: Effect, gain: float, bounds: Mapping[str, ParameterInterval], events: int = 0) -> Trial:
+def _penalised_trial(
+    effect: Effect, gain: float, intervals: Mapping[str, ParameterInterval], event_count: int = 0
+) -> Trial:
     """Return a trial whose value is the gain less the penalty of the effect."""
-    return Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], bounds=bounds, events=events)
+    return Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], intervals=intervals, event_count=event_count)
 
 
-def _scaled_bounds(found: Interval, unit: float = 1.0) -> ParameterInterval:
+def _scaled_bounds(found: ValueWithInterval, unit: float = 1.0) -> ParameterInterval:
     """Return an interval in another unit."""
     return ParameterInterval(unit * found.value, unit * found.lo, unit * found.hi)
 
 
-def _noise_trial(state: Hypothesis, effect: Effect) -> Trial:
+def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> Trial:
     """Return the trial of one noise effect."""
-    score = state.refit((*state.found, effect)).score
-    return Trial(effect.name, effect, score - state.score - PENALTY_NATS[effect.name])
+    score = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).score
+    return Trial(effect.name, effect, score - hypothesis.score - PENALTY_NATS[effect.name])
 
 
-def _noise_trials(state: Hypothesis, seen: WhitenedAxis) -> list[Trial]:
+def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Return the trials of noise effects by their score, including an unnamed power law."""
-    resized = state.refit(state.found)
-    found = [Trial(RETUNE, None, resized.score - state.score - MIN_RESIZE_GAIN_NATS)]
-    found += [_noise_trial(state, effect) for propose in NOISE_CANDIDATES for effect in propose(seen)]
-    found = _best_first([*found, _scale_factor_trial(state, resized)])
-    value = max(_power_law_score(state, exponent) for exponent in EXPONENTS) - state.score - PENALTY_NATS[UNNAMED]
-    if value > max(found[0].value, 0.0) + UNNAMED_MARGIN_NATS and found[0].name in POWER_LAW_RIVALS:
+    resized = hypothesis.refit_with_added_effects(hypothesis.added)
+    found = [Trial(RETUNE, None, resized.score - hypothesis.score - MIN_RESIZE_GAIN_NATS)]
+    found += [_noise_trial(hypothesis, effect) for propose in NOISE_CANDIDATES for effect in propose(whitened)]
+    found = _best_first([*found, _scale_factor_trial(hypothesis, resized)])
+    value = (
+        max(_power_law_score(hypothesis, exponent) for exponent in EXPONENTS) - hypothesis.score - PENALTY_NATS[UNNAMED]
+    )
+    if value > max(found[0].score, 0.0) + UNNAMED_MARGIN_NATS and found[0].name in POWER_LAW_RIVALS:
         return [Trial(UNNAMED, None, value), *found]
     return found
 
@@ -250,51 +261,61 @@ POWER_LAW_RIVALS: Final = frozenset(
 """Effects that compete with a power law."""
 
 
-def _deterministic_trials(state: Hypothesis, seen: WhitenedAxis) -> list[Trial]:
+def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Return the trials of effects that follow time, temperature or another axis."""
-    free = state.axis.fit(state.effects).log_likelihood
-    proposed = [effect for propose in DETERMINISTIC_CANDIDATES for effect in propose(seen)]
+    free = hypothesis.axis.fit(hypothesis.effects).log_likelihood
+    proposed = [effect for propose in DETERMINISTIC_CANDIDATES for effect in propose(whitened)]
     kept = [
         effect
         for effect in proposed
-        if state.axis.fit((*state.effects, effect)).log_likelihood - free > 0.3 * PENALTY_NATS[effect.name]
-        and (not isinstance(effect, Leak) or _has_flat_coefficient(seen, effect))
+        if hypothesis.axis.fit((*hypothesis.effects, effect)).log_likelihood - free > 0.3 * PENALTY_NATS[effect.name]
+        and (not isinstance(effect, Leak) or _has_flat_coefficient(whitened, effect))
     ]
     if not kept:
         return []
-    slow_noises = _slow_noise_scores(state)
-    without = max(state.refit(state.found).score, *(score(state.effects) for score in slow_noises))
+    slow_noises = _slow_noise_scores(hypothesis)
+    without = max(
+        hypothesis.refit_with_added_effects(hypothesis.added).score,
+        *(score(hypothesis.effects) for score in slow_noises),
+    )
     trials = []
     for effect in kept:
-        alone = state.refit((*state.found, effect)).score
-        gain = max(alone, *(score((*state.effects, effect)) for score in slow_noises)) - without
+        alone = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).score
+        gain = max(alone, *(score((*hypothesis.effects, effect)) for score in slow_noises)) - without
         penalty = PENALTY_NATS[effect.name] + _quadratic_penalty(effect)
-        trials.append(Trial(effect.name, effect, gain - penalty, alone - state.score - penalty))
+        trials.append(Trial(effect.name, effect, gain - penalty, alone - hypothesis.score - penalty))
     trials = _best_first(trials)
-    curved = _curved_drift_score(state) - without
-    if curved > max(0.0, trials[0].value) + UNNAMED_MARGIN_NATS:
-        return [Trial(UNNAMED, None, curved, curved + without - state.score), *trials]
+    curved = _curved_drift_score(hypothesis) - without
+    if curved > max(0.0, trials[0].score) + UNNAMED_MARGIN_NATS:
+        return [Trial(UNNAMED, None, curved, curved + without - hypothesis.score), *trials]
     return trials
 
 
-def _has_flat_coefficient(seen: WhitenedAxis, leak: Leak) -> bool:
+def _has_flat_coefficient(whitened: WhitenedAxis, leak: Leak) -> bool:
     """Return True if one coefficient describes a leak at all frequencies.
 
     If vibration acts on both axes, the coefficient depends on the frequency. The coefficients in ``FREQUENCY_BANDS``
     bands of equal width have the variance 1/(Σ X²/v). Their scatter about the mean is tested with χ².
     """
-    column = seen.axis.others[leak.source] * seen.weight
+    column = whitened.axis.leak_sources[leak.source] * whitened.weights
     edges = np.linspace(0, column.size, FREQUENCY_BANDS + 1).astype(np.int64)[:-1]
     square = np.maximum(np.add.reduceat(column**2, edges), 1e-300)
-    product = np.add.reduceat(column * seen.whitened, edges)
+    product = np.add.reduceat(column * whitened.coefficients, edges)
     scatter = float((square * (product / square - product.sum() / square.sum()) ** 2).sum())
     return bool(chdtrc(FREQUENCY_BANDS - 1, scatter) > MIN_LEAK_PROBABILITY)
 
 
-def _curved_drift_score(state: Hypothesis) -> float:
+def _curved_drift_score(hypothesis: Hypothesis) -> float:
     """Return the score of a curved drift without a name, less its penalty."""
-    bent = state.axis.fit((*state.effects, RateRamp(R=start_size(state.axis))), state.fit.held, curved=True)
-    return bent.log_likelihood - RESIZE_PENALTY_NATS * state.freed - PENALTY_NATS["rate_ramp"] - QUADRATIC_PENALTY_NATS
+    bent = hypothesis.axis.fit(
+        (*hypothesis.effects, RateRamp(R=initial_size(hypothesis.axis))), hypothesis.fit.fixed_noise, curvature=True
+    )
+    return (
+        bent.log_likelihood
+        - RESIZE_PENALTY_NATS * hypothesis.refitted_size_count
+        - PENALTY_NATS["rate_ramp"]
+        - QUADRATIC_PENALTY_NATS
+    )
 
 
 def _quadratic_penalty(effect: Effect) -> float:
@@ -302,32 +323,32 @@ def _quadratic_penalty(effect: Effect) -> float:
     return QUADRATIC_PENALTY_NATS if getattr(effect, "quadratic", None) is not None else 0.0
 
 
-def _slow_noise_scores(state: Hypothesis) -> list[Callable[[Effects], float]]:
+def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float]]:
     """Return functions that score effects together with each slow noise that could replace a deterministic effect.
 
     The sizes of the model's noise effects are not changed.
     """
-    axis, small = state.axis, start_size(state.axis)
-    held, cost = state.fit.held, RESIZE_PENALTY_NATS * state.freed
+    axis, small = hypothesis.axis, initial_size(hypothesis.axis)
+    fixed_noise, cost = hypothesis.fit.fixed_noise, RESIZE_PENALTY_NATS * hypothesis.refitted_size_count
 
     def with_noise(noise: Effect) -> Callable[[Effects], float]:
-        return lambda effects: axis.fit((*effects, noise), held).log_likelihood - cost - PENALTY_NATS[noise.name]
+        return lambda effects: axis.fit((*effects, noise), fixed_noise).log_likelihood - cost - PENALTY_NATS[noise.name]
 
     def with_power_law(exponent: float) -> Callable[[Effects], float]:
         row = _power_law(axis, exponent)
-        return lambda effects: axis.fit(effects, held, row).log_likelihood - cost - PENALTY_NATS[UNNAMED]
+        return lambda effects: axis.fit(effects, fixed_noise, row).log_likelihood - cost - PENALTY_NATS[UNNAMED]
 
     times_s = np.geomspace(10.0 / axis.rate_hz, 0.1 * axis.length_s, 8)
     noises: list[Effect] = [ExponentiallyCorrelated(sigma=small, correlation_time=float(t)) for t in times_s]
-    if not any(isinstance(effect, RateRandomWalk) for effect in state.effects):
+    if not any(isinstance(effect, RateRandomWalk) for effect in hypothesis.effects):
         noises.append(RateRandomWalk(K=small))
     return [*(with_noise(one) for one in noises), *(with_power_law(exponent) for exponent in EXPONENTS)]
 
 
-def _power_law_score(state: Hypothesis, exponent: float) -> float:
+def _power_law_score(hypothesis: Hypothesis, exponent: float) -> float:
     """Return the score with an additional power law."""
-    fit = state.axis.fit(state.effects, state.fit.held, _power_law(state.axis, exponent))
-    return fit.log_likelihood - RESIZE_PENALTY_NATS * state.freed
+    fit = hypothesis.axis.fit(hypothesis.effects, hypothesis.fit.fixed_noise, _power_law(hypothesis.axis, exponent))
+    return fit.log_likelihood - RESIZE_PENALTY_NATS * hypothesis.refitted_size_count
 
 
 def _power_law(axis: Axis, exponent: float) -> Floats:
@@ -335,20 +356,20 @@ def _power_law(axis: Axis, exponent: float) -> Floats:
     return np.asarray((axis.bins.f_hz / axis.bins.f_hz[0]) ** -exponent)[None, :]
 
 
-def _scale_factor_trial(state: Hypothesis, resized: Hypothesis) -> Trial:
+def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
     """Return the trial of one common factor for all noise effects of the model.
 
     A single wrong size is no evidence for a common factor. In this case, only the wrong size is changed. If two or more
     sizes are wrong and one factor explains them as well, the factor is preferred.
     """
-    effects, held = (*state.model, *state.found), noise_indices(state.model)
+    effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_indices(hypothesis.model)
 
     def value(x: float) -> float:
-        return state.axis.fit((*effects, ScaleFactor(factor=float(np.exp(x)))), held).log_likelihood
+        return hypothesis.axis.fit((*effects, ScaleFactor(factor=float(np.exp(x)))), fixed_noise).log_likelihood
 
     start = float(max(np.linspace(-3.0, 3.0, 13), key=value))
-    x = golden_section(value, start - 0.5, start + 0.5, SCALE_SEARCH_ITERATIONS)
-    gain = value(x) - state.score - PENALTY_NATS["scale_factor"]
-    if resized.freed > 1 and value(x) > resized.fit.log_likelihood - SCALE_FACTOR_MARGIN_NATS:
-        gain = max(gain, resized.score - state.score)
+    x = find_maximum_by_golden_section(value, start - 0.5, start + 0.5, SCALE_SEARCH_ITERATIONS)
+    gain = value(x) - hypothesis.score - PENALTY_NATS["scale_factor"]
+    if resized.refitted_size_count > 1 and value(x) > resized.fit.log_likelihood - SCALE_FACTOR_MARGIN_NATS:
+        gain = max(gain, resized.score - hypothesis.score)
     return Trial("scale_factor", ScaleFactor(factor=float(np.exp(x))), gain)

@@ -55,7 +55,7 @@ FREQUENCY_DIAGNOSTICS: Final = ("psd", "lines", "spectrogram")
 """Diagnostics that locate a departure in frequency."""
 
 
-def supported_effects(
+def keep_supported_effects(
     found: Effects, removed: Mapping[type[Effect], float], findings: Findings, null: AxisNull
 ) -> Effects:
     """Return the effects that were found on an axis and pass all checks.

@@ -13,7 +13,7 @@ from math import hypot, sqrt
 from typing import Final, Literal
 
 from monitor.reconcile.likelihood.effect_terms import ONE_TIME_EFFECTS
-from monitor.reconcile.result import AxisResult, Reconciliation, ReconciliationStep, Score
+from monitor.reconcile.result import AddedOrResizedEffect, AxisResult, DiagnosticGap, Reconciliation
 
 Meaning = Literal["contradiction", "too_faint", "other_name", "unnamed", "may_differ"]
 """Meaning of an absence.
@@ -42,50 +42,53 @@ class Absence:
 
 
 @dataclass(frozen=True, slots=True)
-class StrongestObservation:
+class ClearestOccurrence:
     """Effect in the recording that shows it most clearly."""
 
-    step: ReconciliationStep
-    of: AxisResult  # result of the axis in that recording
+    step: AddedOrResizedEffect
+    axis_result: AxisResult  # result of the axis in that recording
     gap: float  # gap that the effect itself causes, standard deviations
-    seconds: float  # length of that recording, s
+    duration_s: float  # length of that recording, s
 
 
-def explain_absence(shown: StrongestObservation, other: Reconciliation) -> tuple[Meaning, str]:
+def explain_absence(shown: ClearestOccurrence, other: Reconciliation) -> tuple[Meaning, str]:
     """Return why a recording does not show an effect: the meaning, and a sentence that explains it.
 
     Parameters
     ----------
-    shown : StrongestObservation
+    shown : ClearestOccurrence
         Effect in the recording that shows it most clearly.
     other : Reconciliation
         Result of the recording without the effect.
     """
-    step, of = shown.step, shown.of
-    there = other.axes.get(of.axis)
+    step, axis_result = shown.step, shown.axis_result
+    there = other.axes.get(axis_result.axis)
     if there is None:
-        return "may_differ", f"the recording does not contain {of.axis}"
+        return "may_differ", f"the recording does not contain {axis_result.axis}"
     if step.effect in ONE_TIME_EFFECTS:
         return "may_differ", "an effect that happens once need not happen in another recording"
-    if rival := _confused_effect(step, of, there):
+    if rival := _confused_effect(step, axis_result, there):
         return "other_name", f"the difference was named {rival} there, and the two effects are hard to distinguish"
-    seen = next((score for score in there.end.scores if score.lens == step.found.lens), None)
-    if any(score.lens == step.found.lens for score in there.left_over):
-        return "unnamed", f"the same diagnostic ({step.found.lens}) leaves a difference without a name there"
+    seen = next((score for score in there.end.gaps if score.lens == step.before.lens), None)
+    if any(score.lens == step.before.lens for score in there.left_over):
+        return "unnamed", f"the same diagnostic ({step.before.lens}) leaves a difference without a name there"
     if step.effect in LEAK_EFFECTS:
         source = step.parameters["source"].value
         if source not in other.axes:
             return "too_faint", f"the recording does not contain {source}"
         return "may_differ", f"the contribution to the axis depends on the motion of {source}"
     if seen is None or not shown.gap > 0.0:
-        return "may_differ", f"the diagnostic that found the effect ({step.found.lens}) does not determine a size there"
-    growth = _gap_ratio(step, shown.seconds, other.duration_s, seen)
+        return (
+            "may_differ",
+            f"the diagnostic that found the effect ({step.before.lens}) does not determine a size there",
+        )
+    growth = _gap_ratio(step, shown.duration_s, other.duration_s, seen)
     if growth is None:
         return "too_faint", "no changing temperature was recorded"
     return _compare_expected_gap(growth * shown.gap, growth, seen, other.duration_s)
 
 
-def _compare_expected_gap(expected: float, growth: float, seen: Score, seconds: float) -> tuple[Meaning, str]:
+def _compare_expected_gap(expected: float, growth: float, seen: DiagnosticGap, seconds: float) -> tuple[Meaning, str]:
     """Return whether an expected gap should have passed the threshold, with the sentence that explains it."""
     said = (
         f"with the size in the other recording, {seconds:.6g} s of data would show a gap of about {expected:.1f} "
@@ -96,7 +99,7 @@ def _compare_expected_gap(expected: float, growth: float, seen: Score, seconds: 
     return ("contradiction" if expected > enough else "too_faint"), said
 
 
-def _gap_ratio(step: ReconciliationStep, seconds: float, other_s: float, seen: Score) -> float | None:
+def _gap_ratio(step: AddedOrResizedEffect, seconds: float, other_s: float, seen: DiagnosticGap) -> float | None:
     """Return the expected gap of the other recording relative to the first one, for an effect of the same size.
 
     The result is None if the effect cannot be visible there.
@@ -107,14 +110,14 @@ def _gap_ratio(step: ReconciliationStep, seconds: float, other_s: float, seen: S
         return min(sqrt(longer), longer * sqrt(longer))
     if step.effect not in TEMPERATURE_EFFECTS:
         return sqrt(longer)
-    here, there = step.found.where.temperature, seen.where.temperature
+    here, there = step.before.where.temperature, seen.where.temperature
     if there is None or not there[1] > there[0]:
         return None
     swing = 1.0 if here is None or not here[1] > here[0] else (there[1] - there[0]) / (here[1] - here[0])
     return sqrt(longer) * swing
 
 
-def _confused_effect(step: ReconciliationStep, axis_result: AxisResult, other_axis_result: AxisResult) -> str:
+def _confused_effect(step: AddedOrResizedEffect, axis_result: AxisResult, other_axis_result: AxisResult) -> str:
     """Return an effect that only the other recording has if one of the two effects was the runner-up of the other."""
     mine = {one.effect for one in axis_result.steps}
     for one in other_axis_result.steps:
@@ -124,6 +127,6 @@ def _confused_effect(step: ReconciliationStep, axis_result: AxisResult, other_ax
     return ""
 
 
-def _runner_up_names(step: ReconciliationStep) -> set[str]:
+def _runner_up_names(step: AddedOrResizedEffect) -> set[str]:
     """Return the names of the alternatives of a step."""
     return {one.effect for one in step.runners_up}

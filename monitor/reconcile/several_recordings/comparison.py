@@ -20,28 +20,28 @@ from monitor.noise.effect import Effect
 from monitor.noise.effects import Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import (
+    AddedOrResizedEffect,
     AxisResult,
     Decision,
     ParameterInterval,
     Reconciliation,
-    ReconciliationStep,
     StepKind,
     combine_decisions,
 )
-from monitor.reconcile.several_recordings.absence import Absence, StrongestObservation, explain_absence
+from monitor.reconcile.several_recordings.absence import Absence, ClearestOccurrence, explain_absence
 from monitor.reconcile.several_recordings.effect_matching import (
     SAMPLE_RATE_EFFECT,
-    closest_effect,
-    distance,
-    effect_of,
-    fields_of,
+    find_closest_effect,
+    find_effect_of_step,
     identifying_parameter,
+    identifying_parameter_distance,
     identifying_parameter_name,
+    parameters_of,
 )
 from monitor.reconcile.several_recordings.pooled_parameters import (
     MIN_AGREEMENT_PROBABILITY,
     PooledParameter,
-    agreement,
+    agreement_probability,
     distance_in_sigma,
     pool_parameter,
 )
@@ -64,7 +64,7 @@ class MatchedEffect:
 
     effect: str
     kind: StepKind
-    steps: Mapping[str, ReconciliationStep]  # recording -> its step
+    steps: Mapping[str, AddedOrResizedEffect]  # recording -> its step
     parameters: Mapping[str, PooledParameter]
     p: float | None  # probability that sizes as different as these come from one size; None: nothing to compare
     absent: tuple[Absence, ...] = ()
@@ -74,14 +74,14 @@ class MatchedEffect:
         """True if the sizes in all recordings agree, or None if there is nothing to compare."""
         return None if self.p is None else self.p >= MIN_AGREEMENT_PROBABILITY
 
-    def step(self) -> ReconciliationStep:
+    def pooled_step(self) -> AddedOrResizedEffect:
         """Return the step of the first recording with the pooled parameters."""
         first = next(iter(self.steps.values()))
         return replace(first, parameters={name: one.bounds for name, one in self.parameters.items()})
 
 
 @dataclass(frozen=True, slots=True)
-class AxisRuns:
+class AxisComparison:
     """One axis in all recordings that contain it."""
 
     axis: str
@@ -97,15 +97,15 @@ class Comparison:
     verdict: Decision
     runs: tuple[NamedResult, ...]
     without_result: Mapping[str, str]  # recording without a result -> reason
-    axes: Mapping[str, AxisRuns]  # in AXES order
+    axes: Mapping[str, AxisComparison]  # in AXES order
     baseline: NoiseModel  # the model under test
     model: NoiseModel  # with the common effects
     fitted_to: str | None  # the recording that the five terms were fitted to; None: the model was given
     seed: int
 
 
-def compare(
-    runs: Sequence[NamedResult], fitted_to: str | None = None, silent: Mapping[str, str] | None = None
+def compare_results(
+    runs: Sequence[NamedResult], fitted_to: str | None = None, without_result: Mapping[str, str] | None = None
 ) -> Comparison:
     """Compare the results of several recordings that were reconciled with one model.
 
@@ -115,7 +115,7 @@ def compare(
         Two or more recordings with different names.
     fitted_to : str, optional
         Recording to which the five terms of the model were fitted.
-    silent : mapping of str to str, optional
+    without_result : mapping of str to str, optional
         Recordings without a result, with the reason.
     """
     baseline = runs[0].result.baseline
@@ -123,7 +123,7 @@ def compare(
     return Comparison(
         combine_decisions([run.result.verdict for run in runs]),
         tuple(runs),
-        dict(silent or {}),
+        dict(without_result or {}),
         axes,
         baseline,
         _add_common_effects(baseline, axes, {run.name: run.result.model for run in runs}),
@@ -133,7 +133,7 @@ def compare(
 
 
 def _add_common_effects(
-    baseline: NoiseModel, axes: Mapping[str, AxisRuns], models: Mapping[str, NoiseModel]
+    baseline: NoiseModel, axes: Mapping[str, AxisComparison], models: Mapping[str, NoiseModel]
 ) -> NoiseModel:
     """Return the model under test with the common effects and their pooled parameters.
 
@@ -143,12 +143,12 @@ def _add_common_effects(
     for axis, one in axes.items():
         for seen in one.common:
             run, step = next(iter(seen.steps.items()))
-            made = _with_pooled_parameters(effect_of(models[run], axis, step), seen)
+            made = _with_pooled_parameters(find_effect_of_step(models[run], axis, step), seen)
             known = effects.get(axis, ())
             if seen.kind == "added":
                 effects[axis] = (*known, made)
             else:
-                old = closest_effect(known, seen.effect, fields_of(made))
+                old = find_closest_effect(known, seen.effect, parameters_of(made))
                 effects[axis] = tuple(made if effect is old else effect for effect in known)
     return NoiseModel(effects, baseline.sample_rate_hz, baseline.temperature)
 
@@ -160,19 +160,19 @@ def _with_pooled_parameters(effect: Effect, seen: MatchedEffect) -> Effect:
     return replace(made, phase=None) if isinstance(made, Sinusoidal) else made
 
 
-def _compare_axis(axis: str, runs: Sequence[NamedResult]) -> AxisRuns:
+def _compare_axis(axis: str, runs: Sequence[NamedResult]) -> AxisComparison:
     """Return the common and the single effects of one axis."""
     results = {run.name: run.result.axes[axis] for run in runs if axis in run.result.axes}
-    groups: list[dict[str, ReconciliationStep]] = []
+    groups: list[dict[str, AddedOrResizedEffect]] = []
     for run in runs:
         for step in _steps_of_axis(run, axis, runs):
             _add_to_group(groups, run.name, step, axis, runs)
     every = [_summarise_group(group, axis, runs) for group in groups]
     common = tuple(one for one in every if not one.absent and len(one.steps) > 1)
-    return AxisRuns(axis, results, common, tuple(one for one in every if one not in common))
+    return AxisComparison(axis, results, common, tuple(one for one in every if one not in common))
 
 
-def _steps_of_axis(run: NamedResult, axis: str, runs: Sequence[NamedResult]) -> list[ReconciliationStep]:
+def _steps_of_axis(run: NamedResult, axis: str, runs: Sequence[NamedResult]) -> list[AddedOrResizedEffect]:
     """Return the steps of one axis.
 
     A sample rate error belongs to the first axis on which any recording shows it.
@@ -182,7 +182,7 @@ def _steps_of_axis(run: NamedResult, axis: str, runs: Sequence[NamedResult]) -> 
     return _sample_rate_steps(run) + steps if axis == _sample_rate_axis(runs) else steps
 
 
-def _sample_rate_steps(run: NamedResult) -> list[ReconciliationStep]:
+def _sample_rate_steps(run: NamedResult) -> list[AddedOrResizedEffect]:
     """Return the steps that correct the sample rate."""
     return [step for one in run.result.axes.values() for step in one.steps if step.effect == SAMPLE_RATE_EFFECT]
 
@@ -199,21 +199,21 @@ def _sample_rate_axis(runs: Sequence[NamedResult]) -> str:
 
 
 def _add_to_group(
-    groups: list[dict[str, ReconciliationStep]],
+    groups: list[dict[str, AddedOrResizedEffect]],
     run: str,
-    step: ReconciliationStep,
+    step: AddedOrResizedEffect,
     axis: str,
     runs: Sequence[NamedResult],
 ) -> None:
     """Add a step to the closest group of the same effect in other recordings, or start a new group."""
     models = {one.name: one.result.model for one in runs}
     here = identifying_parameter(step, axis, models[run])
-    best: tuple[float, dict[str, ReconciliationStep]] | None = None
+    best: tuple[float, dict[str, AddedOrResizedEffect]] | None = None
     for group in groups:
         other, first = next(iter(group.items()))
         if run in group or (first.effect, first.kind) != (step.effect, step.kind):
             continue
-        apart = distance(step.effect, here, identifying_parameter(first, axis, models[other]))
+        apart = identifying_parameter_distance(step.effect, here, identifying_parameter(first, axis, models[other]))
         if apart is not None and (best is None or apart < best[0]):
             best = apart, group
     if best is None:
@@ -222,7 +222,9 @@ def _add_to_group(
         best[1][run] = step
 
 
-def _summarise_group(group: Mapping[str, ReconciliationStep], axis: str, runs: Sequence[NamedResult]) -> MatchedEffect:
+def _summarise_group(
+    group: Mapping[str, AddedOrResizedEffect], axis: str, runs: Sequence[NamedResult]
+) -> MatchedEffect:
     """Return the effect that a group of steps describes."""
     first = next(iter(group.values()))
     parameters = _pool_parameters(group)
@@ -236,19 +238,21 @@ def _summarise_group(group: Mapping[str, ReconciliationStep], axis: str, runs: S
     step = group[strongest.name]
     # the sample rate error may be on another axis in that recording
     of = next(one for one in strongest.result.axes.values() if any(own is step for own in one.steps))
-    shown = StrongestObservation(step, of, _gap_of_effect(step, axis, strongest.result), strongest.result.duration_s)
+    shown = ClearestOccurrence(step, of, _gap_of_effect(step, axis, strongest.result), strongest.result.duration_s)
     absent = tuple(Absence(run.name, *explain_absence(shown, run.result)) for run in having if run.name not in group)
     return MatchedEffect(first.effect, first.kind, dict(group), parameters, _size_agreement(sizes, parameters), absent)
 
 
-def _gap_of_effect(step: ReconciliationStep, axis: str, result: Reconciliation) -> float:
+def _gap_of_effect(step: AddedOrResizedEffect, axis: str, result: Reconciliation) -> float:
     """Return the gap that an effect itself causes.
 
     For a changed size, return the distance of the size in the model from its interval, in standard deviations.
     """
     if step.kind == "added":
         return sqrt(max(step.before.gap**2 - step.after.gap**2, 0.0))
-    given = closest_effect(result.baseline.effects[axis], step.effect, fields_of(effect_of(result.model, axis, step)))
+    given = find_closest_effect(
+        result.baseline.effects[axis], step.effect, parameters_of(find_effect_of_step(result.model, axis, step))
+    )
     return max(distance_in_sigma(one, getattr(given, name)) for name, one in step.parameters.items())
 
 
@@ -257,10 +261,10 @@ def _size_agreement(sizes: Sequence[PooledParameter], parameters: Mapping[str, P
 
     For an effect without a size, such as a bandwidth limit, all parameters are compared.
     """
-    return agreement(sizes or parameters.values())
+    return agreement_probability(sizes or parameters.values())
 
 
-def _pool_parameters(group: Mapping[str, ReconciliationStep]) -> dict[str, PooledParameter]:
+def _pool_parameters(group: Mapping[str, AddedOrResizedEffect]) -> dict[str, PooledParameter]:
     """Return the pooled parameters of a group of steps."""
     steps = [_at_common_reference(step, next(iter(group.values()))) for step in group.values()]
     names = dict.fromkeys(name for step in steps for name in step.parameters if name != "phase")
@@ -269,7 +273,7 @@ def _pool_parameters(group: Mapping[str, ReconciliationStep]) -> dict[str, Poole
     }
 
 
-def _at_common_reference(step: ReconciliationStep, first: ReconciliationStep) -> ReconciliationStep:
+def _at_common_reference(step: AddedOrResizedEffect, first: AddedOrResizedEffect) -> AddedOrResizedEffect:
     """Return a step whose quadratic temperature dependence refers to the temperature of the first recording.
 
     The coefficient becomes c + 2 q (T₁ − T₀).

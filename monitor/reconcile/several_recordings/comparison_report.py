@@ -12,8 +12,8 @@ from typing import Any, Final
 import msgspec
 
 from monitor.reconcile.report import finite_or_none, parameter_entry
-from monitor.reconcile.result import ReconciliationStep
-from monitor.reconcile.several_recordings.comparison import AxisRuns, Comparison, MatchedEffect, NamedResult
+from monitor.reconcile.result import AddedOrResizedEffect
+from monitor.reconcile.several_recordings.comparison import AxisComparison, Comparison, MatchedEffect, NamedResult
 
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
 """Name and version of the JSON schema."""
@@ -46,7 +46,7 @@ def _run_entry(run: NamedResult) -> dict[str, Any]:
     }
 
 
-def _axis_entry(one: AxisRuns) -> dict[str, Any]:
+def _axis_entry(one: AxisComparison) -> dict[str, Any]:
     """Return the report entry of one axis."""
     return {
         "verdicts": {run: result.verdict for run, result in one.results.items()},
@@ -77,7 +77,7 @@ def _effect_entry(seen: MatchedEffect) -> dict[str, Any]:
     }
 
 
-def _step_entry(step: ReconciliationStep) -> dict[str, Any]:
+def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
     """Return the report entry of one effect in one recording."""
     return {
         "parameters": {name: parameter_entry(one) for name, one in step.parameters.items()},

@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from monitor.noise.effect import Effect
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.result import ParameterInterval, ReconciliationStep
+from monitor.reconcile.result import AddedOrResizedEffect, ParameterInterval
 
 IDENTIFYING_PARAMETERS: Final[Mapping[str, tuple[str, float]]] = {
     "sinusoidal": ("frequency", 0.005),
@@ -42,14 +42,14 @@ def identifying_parameter_name(effect: str) -> str:
     return IDENTIFYING_PARAMETERS.get(effect, ("", 0.0))[0]
 
 
-def identifying_parameter(step: ReconciliationStep, axis: str, model: NoiseModel) -> ParameterInterval | None:
+def identifying_parameter(step: AddedOrResizedEffect, axis: str, model: NoiseModel) -> ParameterInterval | None:
     """Return the parameter that identifies an effect among effects of the same name.
 
     A step that changes a known effect contains only the size. The model of the recording then provides the parameter.
 
     Parameters
     ----------
-    step : ReconciliationStep
+    step : AddedOrResizedEffect
         Step of the reconciliation.
     axis : str
         Name of the axis.
@@ -58,11 +58,15 @@ def identifying_parameter(step: ReconciliationStep, axis: str, model: NoiseModel
     """
     name = identifying_parameter_name(step.effect)
     return (
-        (step.parameters.get(name) or ParameterInterval(getattr(effect_of(model, axis, step), name))) if name else None
+        (step.parameters.get(name) or ParameterInterval(getattr(find_effect_of_step(model, axis, step), name)))
+        if name
+        else None
     )
 
 
-def distance(effect: str, a: ParameterInterval | None, b: ParameterInterval | None) -> float | None:
+def identifying_parameter_distance(
+    effect: str, a: ParameterInterval | None, b: ParameterInterval | None
+) -> float | None:
     """Return the relative distance of two identifying parameters, or None if they do not match.
 
     The distance is 0 if one of the parameters is None.
@@ -76,9 +80,9 @@ def distance(effect: str, a: ParameterInterval | None, b: ParameterInterval | No
 
     Examples
     --------
-    >>> distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(17.30))
+    >>> identifying_parameter_distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(17.30))
     0.0
-    >>> distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(19.00))
+    >>> identifying_parameter_distance("sinusoidal", ParameterInterval(17.30), ParameterInterval(19.00))
     """
     if a is None or b is None:
         return 0.0
@@ -89,7 +93,7 @@ def distance(effect: str, a: ParameterInterval | None, b: ParameterInterval | No
     return _relative_difference(a.value, b.value) if lo <= other_hi and other_lo <= hi else None
 
 
-def effect_of(model: NoiseModel, axis: str, step: ReconciliationStep) -> Effect:
+def find_effect_of_step(model: NoiseModel, axis: str, step: AddedOrResizedEffect) -> Effect:
     """Return the effect that a step added or changed, from the model of its recording.
 
     Parameters
@@ -98,7 +102,7 @@ def effect_of(model: NoiseModel, axis: str, step: ReconciliationStep) -> Effect:
         Model of the recording, with all effects that were found.
     axis : str
         Name of the axis.
-    step : ReconciliationStep
+    step : AddedOrResizedEffect
         Step of the reconciliation.
     """
     clock = (
@@ -107,10 +111,10 @@ def effect_of(model: NoiseModel, axis: str, step: ReconciliationStep) -> Effect:
         else []
     )
     parameters = {name: one.value for name, one in step.parameters.items()}
-    return closest_effect(clock or model.effects[axis], step.effect, parameters)
+    return find_closest_effect(clock or model.effects[axis], step.effect, parameters)
 
 
-def closest_effect(effects: Sequence[Effect], name: str, parameters: Mapping[str, Any]) -> Effect:
+def find_closest_effect(effects: Sequence[Effect], name: str, parameters: Mapping[str, Any]) -> Effect:
     """Return the effect of a given name whose parameters are closest to the given ones.
 
     Parameters
@@ -123,13 +127,13 @@ def closest_effect(effects: Sequence[Effect], name: str, parameters: Mapping[str
         Parameters to compare, in SI units.
     """
 
-    def apart(effect: Effect) -> float:
+    def parameter_distance(effect: Effect) -> float:
         return sum(_relative_difference(getattr(effect, key, None), value) for key, value in parameters.items())
 
-    return min((effect for effect in effects if effect.name == name), key=apart)
+    return min((effect for effect in effects if effect.name == name), key=parameter_distance)
 
 
-def fields_of(effect: Effect) -> dict[str, Any]:
+def parameters_of(effect: Effect) -> dict[str, Any]:
     """Return all parameters of an effect by name."""
     return {f.name: getattr(effect, f.name) for f in fields(effect)}  # type: ignore[arg-type]
 

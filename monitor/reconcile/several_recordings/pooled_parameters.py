@@ -38,10 +38,10 @@ class PooledParameter:
         """Probability of a larger χ² if all recordings measure the same value, or None if fewer than two have an
         interval.
         """
-        return agreement([self])
+        return agreement_probability([self])
 
 
-def agreement(parameters: Iterable[PooledParameter]) -> float | None:
+def agreement_probability(parameters: Iterable[PooledParameter]) -> float | None:
     """Return the probability of a larger total χ² of all parameters, treated as independent, or None without degrees of
     freedom.
     """

@@ -109,28 +109,28 @@ def test_memory_stays_bounded_on_garbage() -> None:
 
 def test_hints() -> None:
     buffer = FrameBuffer(b"\xaa", match, 5)
-    assert buffer.hint == ""
+    assert buffer.recent_problem == ""
     buffer.feed([Chunk(b"\x11" * base.MAX_BYTES_WITHOUT_FRAME, 0)])
-    assert "baud rate" in buffer.hint
+    assert "baud rate" in buffer.recent_problem
     buffer.feed([Chunk(FRAMES[0], 0)])
-    assert buffer.hint == ""
+    assert buffer.recent_problem == ""
     buffer.feed([Chunk(FRAMES[0][:-1] + b"\x99" + FRAMES[1], 0)])
-    assert "fail their check" in buffer.hint
+    assert "fail their check" in buffer.recent_problem
     buffer.feed([Chunk(FRAMES[0] * HINT_FRAMES, 0)])
-    assert buffer.hint == ""
+    assert buffer.recent_problem == ""
 
 
 def test_keep_carries_rejected_frames_to_the_next_kept_one() -> None:
     frames = Frames([b"0", b"1", b"2", b"3"], np.arange(4), np.array([1, 2, 4, 8]), np.zeros(4, np.bool_))
-    kept, after = frames.select_frames([1, 2])
-    assert (kept.data, kept.t_ns.tolist(), kept.bad_before.tolist(), after) == (
+    kept = frames.select_frames([1, 2])
+    assert (kept.data, kept.t_ns.tolist(), kept.bad_before.tolist(), kept.bad_after) == (
         [b"1", b"2"],
         [1, 2],
         [3, 4],
         8,
     )
-    none, after = frames.select_frames([])
-    assert (none.data, none.t_ns.size, none.bad_before.size, after) == ([], 0, 0, 15)
+    none = frames.select_frames([])
+    assert (none.data, none.t_ns.size, none.bad_before.size, none.bad_after) == ([], 0, 0, 15)
 
 
 def rows(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -138,17 +138,17 @@ def rows(n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def test_rows_without_loss_make_one_block() -> None:
-    out = BlockBuilder().build_blocks(*rows(5), np.zeros(5, np.int64))
+    out = BlockBuilder().build_plausible_blocks(*rows(5), np.zeros(5, np.int64))
     assert [len(b) for b in out] == [5]
     assert out[0].lost == 0
 
 
 def test_rows_are_cut_where_frames_were_bad() -> None:
     collected = BlockBuilder()
-    out = collected.build_blocks(*rows(5), np.array([1, 0, 2, 0, 0]), bad_after=4)
+    out = collected.build_plausible_blocks(*rows(5), np.array([1, 0, 2, 0, 0]), bad_after=4)
     assert [(len(b), b.lost) for b in out] == [(2, 1), (3, 2)]
     assert collected.bad == 7
-    following = collected.build_blocks(*rows(1), np.array([1]))
+    following = collected.build_plausible_blocks(*rows(1), np.array([1]))
     assert [(len(b), b.lost) for b in following] == [(1, 5)]
     assert collected.bad == 8
 
@@ -157,30 +157,30 @@ def test_implausible_rows_leave_an_empty_place() -> None:
     t_ns, values, temperature, ticks = rows(6)
     values[0, 0], values[2, 4], values[3], values[5, 5] = 1001.0, -np.inf, np.nan, 10_001.0
     collected = BlockBuilder()
-    out = collected.build_blocks(t_ns, values, temperature, ticks, np.array([0, 0, 0, 0, 3, 0]))
+    out = collected.build_plausible_blocks(t_ns, values, temperature, ticks, np.array([0, 0, 0, 0, 3, 0]))
     assert [(b.ticks.tolist(), b.lost) for b in out] == [([1], 1), ([4], 5)]
     assert collected.bad == 7
-    assert [b.lost for b in collected.build_blocks(*rows(1), np.array([0]))] == [1]
+    assert [b.lost for b in collected.build_plausible_blocks(*rows(1), np.array([0]))] == [1]
 
 
 def test_rows_all_bad_and_rows_none_carry_over() -> None:
     t_ns, _, temperature, ticks = rows(2)
     collected = BlockBuilder()
-    assert collected.build_blocks(t_ns, np.full((2, 6), np.inf), temperature, ticks, np.array([1, 0])) == []
+    assert collected.build_plausible_blocks(t_ns, np.full((2, 6), np.inf), temperature, ticks, np.array([1, 0])) == []
     empty = np.empty(0, np.int64)
-    assert collected.build_blocks(empty, np.empty((0, 6)), np.empty(0), empty, empty, 2) == []
-    assert [b.lost for b in collected.build_blocks(*rows(2), np.array([0, 0]))] == [5]
+    assert collected.build_plausible_blocks(empty, np.empty((0, 6)), np.empty(0), empty, empty, 2) == []
+    assert [b.lost for b in collected.build_plausible_blocks(*rows(2), np.array([0, 0]))] == [5]
     assert collected.bad == 5
-    collected.build_blocks(empty, np.empty((0, 6)), np.empty(0), empty, empty, 2)
-    collected.reset()
-    assert [b.lost for b in collected.build_blocks(*rows(2), np.array([0, 0]))] == [0]
+    collected.build_plausible_blocks(empty, np.empty((0, 6)), np.empty(0), empty, empty, 2)
+    collected.forget_rejected_frames()
+    assert [b.lost for b in collected.build_plausible_blocks(*rows(2), np.array([0, 0]))] == [0]
 
 
 def test_some_axes_not_measured_pass_and_an_impossible_temperature_does_not() -> None:
     t_ns, values, temperature, ticks = rows(3)
     values[:, :3] = np.nan
     temperature[1] = 4000.0
-    out = BlockBuilder().build_blocks(t_ns, values, temperature, ticks, np.zeros(3, np.int64))
+    out = BlockBuilder().build_plausible_blocks(t_ns, values, temperature, ticks, np.zeros(3, np.int64))
     assert [len(b) for b in out] == [3]
     assert np.isnan(out[0].temperature_c).tolist() == [False, True, False]
 

@@ -20,9 +20,9 @@ from drivers.sample import (
     AXES,
     EXTENDED_ID,
     NO_TICK,
-    ArrivalTiming,
+    ArrivalTimedFormat,
     Chunk,
-    CounterTiming,
+    CounterTimedFormat,
     SampleBlock,
     concatenate_blocks,
     make_block,
@@ -106,7 +106,7 @@ def test_slope_of_the_shipped_database() -> None:
 def test_xsens_frames() -> None:
     signals = {**XSENS, "temperature": "Temperature.SensorTemperature"}
     decoder = build("xsens_mti", signals, counter="SampleTime.SampleTimeFine", tick=1e-4)
-    assert decoder.timing == CounterTiming(1 << 32, 1e-4)
+    assert decoder.timing == CounterTimedFormat(1 << 32, 1e-4)
     got = decoder.feed(
         [
             chunk(0x51, "1980"),
@@ -233,7 +233,7 @@ def test_encoded_samples_come_back_to_half_a_bit(
     assert (np.abs(got.values - sent.values) <= 0.5001 * np.array(lsb)).all()
     np.testing.assert_array_equal(got.t_ns, sent.t_ns)
     np.testing.assert_array_equal(got.ticks, sent.ticks if "counter" in keys else np.full(300, NO_TICK))
-    assert (decoder.bad, got.lost, decoder.hint) == (0, 0, "")
+    assert (decoder.bad, got.lost, decoder.recent_problem) == (0, 0, "")
     # frame by frame is the same
     single = build(file, signals, **keys)
     one_by_one = concatenate_blocks([b for c in chunks for b in single.feed([c])])
@@ -335,22 +335,22 @@ def test_a_late_frame_makes_its_sample_late_and_not_bad(period_ms: int, late: li
     frames = delayed(10, late, period_ms)
     blocks = decoder.feed(frames)
     assert counts(blocks) == whole(10, late)
-    assert (decoder.late, decoder.bad) == (len(late), 0)
+    assert (decoder.dropped_late_samples, decoder.bad) == (len(late), 0)
     assert sum(b.lost for b in blocks) == len([i for i in late if i < counts(blocks)[-1][0]])  # then a good one follows
-    assert decoder.hint == HINT
+    assert decoder.recent_problem == HINT
     single = build("j1939_imu", SAE, window=0.005)
     assert counts([b for frame in frames for b in single.feed([frame])]) == whole(10, late)
-    assert (single.late, single.bad, single.hint) == (len(late), 0, HINT)
+    assert (single.dropped_late_samples, single.bad, single.recent_problem) == (len(late), 0, HINT)
 
 
 def test_samples_that_are_all_late_are_told_though_none_is_whole() -> None:
     decoder = build("j1939_imu", SAE, window=0.005)
     assert decoder.feed(delayed(10, list(range(10)), 20)) == []
-    assert (decoder.late, decoder.bad, decoder.hint) == (10, 0, HINT)
+    assert (decoder.dropped_late_samples, decoder.bad, decoder.recent_problem) == (10, 0, HINT)
     # joined in the middle of a sample, which is not counted
     decoder = build("j1939_imu", SAE, window=0.005)
     assert decoder.feed(delayed(10, list(range(10)), 20)[1:]) == []
-    assert (decoder.late, decoder.bad, decoder.hint) == (9, 0, HINT)
+    assert (decoder.dropped_late_samples, decoder.bad, decoder.recent_problem) == (9, 0, HINT)
 
 
 def test_late_and_missing_frames_are_told_apart() -> None:
@@ -361,7 +361,7 @@ def test_late_and_missing_frames_are_told_apart() -> None:
     decoder = build("j1939_imu", SAE, window=0.005)
     blocks = decoder.feed(frames)
     assert counts(blocks) == whole(12, [3, 4, 5, 6, 10])
-    assert (decoder.late, decoder.bad) == (2, 3)
+    assert (decoder.dropped_late_samples, decoder.bad) == (2, 3)
     assert [(len(b), b.lost) for b in blocks] == [(3, 0), (3, 4), (1, 1)]
 
 
@@ -370,7 +370,7 @@ def test_a_late_frame_that_is_too_short_makes_its_sample_bad() -> None:
     frames[7] = Chunk(b"", frames[7].t_ns, ACCS)
     decoder = build("j1939_imu", SAE, window=0.005)
     assert counts(decoder.feed(frames)) == whole(6, [3])
-    assert (decoder.late, decoder.bad) == (0, 1)
+    assert (decoder.dropped_late_samples, decoder.bad) == (0, 1)
 
 
 def test_a_partial_sample_is_kept_without_its_late_frame() -> None:
@@ -378,15 +378,15 @@ def test_a_partial_sample_is_kept_without_its_late_frame() -> None:
     got = concatenate_blocks(decoder.feed(delayed(6, [3], 10)))
     assert np.isnan(got.values).all(axis=1).tolist() == [False] * 6
     assert np.isnan(got.values[:, 3:]).all(axis=1).tolist() == [i == 3 for i in range(6)]
-    assert (decoder.late, decoder.bad, decoder.hint) == (0, 0, HINT)
+    assert (decoder.dropped_late_samples, decoder.bad, decoder.recent_problem) == (0, 0, HINT)
 
 
 def test_the_hint_goes_when_no_frame_has_been_late_for_a_while() -> None:
     decoder = build("j1939_imu", SAE, window=0.005)
     decoder.feed(delayed(10, [3], 10))
-    assert decoder.hint == HINT
+    assert decoder.recent_problem == HINT
     decoder.feed([Chunk(c.data, c.t_ns + 1_000_000_000, c.address) for c in delayed(1100, [], 10)])
-    assert decoder.hint == ""
+    assert decoder.recent_problem == ""
 
 
 def test_joining_mid_stream_is_no_loss() -> None:
@@ -412,7 +412,7 @@ def test_a_short_frame_is_bad() -> None:
     blocks = decoder.feed([good, chunk(9, "f9fb8f"), chunk(9, ""), good])
     assert [(len(b), b.lost) for b in blocks] == [(1, 0), (1, 2)]
     assert decoder.bad == 2
-    assert "ImuData" in decoder.hint
+    assert "ImuData" in decoder.recent_problem
 
 
 def test_not_valid_is_bad() -> None:
@@ -420,7 +420,7 @@ def test_not_valid_is_bad() -> None:
     blocks = decoder.feed([chunk(9, "f9fb8f4aff093080"), chunk(9, "f8fb8f4aff093080")] * 2)
     assert [(len(b), b.lost) for b in blocks] == [(1, 0), (1, 1)]
     assert decoder.bad == 2
-    assert "ImuValid" in decoder.hint
+    assert "ImuValid" in decoder.recent_problem
 
 
 COUNTED = """VERSION ""
@@ -442,7 +442,7 @@ def test_frames_with_equal_counts_belong_together(tmp_path: Path) -> None:
     path.write_text(COUNTED)
     signals = {"gz": "Gyro.Z", "az": "Accel.Z"}
     decoder = build(path, signals, counter="Count", join="counter")
-    assert decoder.timing == CounterTiming(16, None)
+    assert decoder.timing == CounterTimedFormat(16, None)
     frames = [chunk(1 + which, struct.pack("<h5xB", i, i % 16), i) for i in range(40) for which in (0, 1)]
     del frames[21]  # Accel 10
     del frames[9]  # Accel 4 … and the order of the two does not matter
@@ -478,7 +478,7 @@ def test_a_frame_with_the_count_of_its_sample_is_late_after_the_window(tmp_path:
     ]
     got = concatenate_blocks(decoder.feed(frames))
     assert got.ticks.tolist() == [0, 1, 2, 3, 5, 6, 7, 8, 9]
-    assert (decoder.late, decoder.bad, got.lost, decoder.hint) == (1, 0, 1, HINT)
+    assert (decoder.dropped_late_samples, decoder.bad, got.lost, decoder.recent_problem) == (1, 0, 1, HINT)
 
 
 def test_a_counter_message_starts_the_sample() -> None:
@@ -499,10 +499,10 @@ def test_one_sender_at_a_time() -> None:
     frame = "007D007D00820005"
     other = 0x0CF02A81 | EXTENDED_ID
     assert len(concatenate_blocks(decoder.feed([chunk(ARI, frame), chunk(other, frame), chunk(ARI, frame)]))) == 2
-    assert "0x81" in decoder.hint
+    assert "0x81" in decoder.recent_problem
     chosen = build("j1939_imu", {"gz": SAE["gz"]}, source=0x81)
     assert len(chosen.feed([chunk(ARI, frame), chunk(other, frame)])) == 1
-    assert chosen.hint == ""
+    assert chosen.recent_problem == ""
 
 
 def test_addresses() -> None:
@@ -512,7 +512,7 @@ def test_addresses() -> None:
     exact = build("j1939_imu", SAE, j1939=False)
     assert exact.addresses == (0x0CF02AFE | EXTENDED_ID, 0x0CF02DFE | EXTENDED_ID)
     assert exact.feed([chunk(ARI, "007D007D007D0005")]) == []
-    assert isinstance(exact.timing, ArrivalTiming)
+    assert isinstance(exact.timing, ArrivalTimedFormat)
 
 
 def test_reset_forgets_a_half_sample() -> None:
@@ -615,7 +615,7 @@ def test_recorded_frames_give_the_recorded_samples(name: str) -> None:
     ended = False
     while not ended:
         try:
-            chunks = link.read(1.0) or []
+            chunks = link.poll_chunks(1.0) or []
         except LinkEnded:
             ended = True
         else:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from drivers.decoders import ros2_imu
 from drivers.decoders.base import HINT_FRAMES, Decoder
-from drivers.sample import NO_TICK, Chunk, SenderTiming, concatenate_blocks, make_block
+from drivers.sample import NO_TICK, Chunk, SenderTimedFormat, concatenate_blocks, make_block
 
 GOLDEN_HEAD = bytes.fromhex("0001000000F1536515CD5B0709000000696D755F6C696E6B00000000")
 GYRO, ACCEL = (0.01, -0.02, 0.03), (0.1, 0.2, 9.81)
@@ -58,7 +58,7 @@ def test_golden_message(decoder: Decoder) -> None:
     assert got.values[0].tolist() == [*GYRO, *ACCEL]
     assert got.ticks.tolist() == [9]
     assert np.isnan(got.temperature_c).all()
-    assert decoder.timing == SenderTiming()
+    assert decoder.timing == SenderTimedFormat()
     assert payload().replace(b"\xcc", b"\0") == GOLDEN
 
 
@@ -97,9 +97,9 @@ def test_a_rejected_message_is_missing_once(decoder: Decoder) -> None:
     blocks = decoder.feed(chunks)
     assert [(len(b), b.lost) for b in blocks] == [(2, 0), (2, 1)]
     assert decoder.bad == 1
-    assert "XCDR1" in decoder.hint
+    assert "XCDR1" in decoder.recent_problem
     decoder.feed([Chunk(GOLDEN, 0)] * HINT_FRAMES)
-    assert decoder.hint == ""
+    assert decoder.recent_problem == ""
 
 
 def test_another_publisher_or_another_count_is_no_loss(decoder: Decoder) -> None:
@@ -127,7 +127,7 @@ def test_without_attachment_there_are_no_ticks(decoder: Decoder) -> None:
 def test_what_is_no_imu_message_is_bad(decoder: Decoder, data: bytes) -> None:
     assert decoder.feed([Chunk(data, 0)]) == []
     assert decoder.bad == 1
-    assert decoder.hint
+    assert decoder.recent_problem
 
 
 def test_encode_feeds_back(decoder: Decoder) -> None:

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from drivers.decoders import samples
 from drivers.decoders.base import HINT_FRAMES
-from drivers.sample import Chunk, SenderTiming, concatenate_blocks, make_block
+from drivers.sample import Chunk, SenderTimedFormat, concatenate_blocks, make_block
 from drivers.zenoh.sample_message import encode_samples
 
 
@@ -18,7 +18,7 @@ def message(count: int, n: int = 10, lost: int = 0, bad_rows: tuple[int, ...] = 
 
 def test_times_are_given() -> None:
     decoder = samples.build(samples.Settings())
-    assert decoder.timing == SenderTiming()
+    assert decoder.timing == SenderTimedFormat()
     assert decoder.carrier == "messages"
 
 
@@ -54,10 +54,10 @@ def test_a_rejected_message_is_counted_and_explained() -> None:
     blocks = decoder.feed([message(10), Chunk(b"no message", 0), message(30)])
     assert [b.lost for b in blocks] == [0, 10]
     assert decoder.bad == 1
-    assert "samples message" in decoder.hint
+    assert "samples message" in decoder.recent_problem
     for i in range(HINT_FRAMES):
         decoder.feed([message(40 + 10 * i)])
-    assert decoder.hint == ""
+    assert decoder.recent_problem == ""
 
 
 def test_encode_feeds_back() -> None:

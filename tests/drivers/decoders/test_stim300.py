@@ -8,7 +8,7 @@ import pytest
 from drivers.decoders.base import MAX_BYTES_WITHOUT_FRAME
 from drivers.decoders.stim300 import IDENTIFIERS, SIZES, Settings, build, datagram_crc, has_valid_crc
 from drivers.errors import ConfigError
-from drivers.sample import Chunk, CounterTiming, SampleBlock, concatenate_blocks, make_block
+from drivers.sample import Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks, make_block
 from drivers.settings_model import read_settings
 
 PUBLISHED = bytes.fromhex(
@@ -38,7 +38,7 @@ def test_the_published_frame() -> None:
     np.testing.assert_allclose(got.values[0], [*gyro, *accel], rtol=1e-14)
     assert got.temperature_c[0] == pytest.approx((35.625 + 35.75 + 35.625) / 3, abs=1e-12)
     assert got.ticks.tolist() == [225]
-    assert build(Settings()).timing == CounterTiming(256, 1 / 2000)
+    assert build(Settings()).timing == CounterTimedFormat(256, 1 / 2000)
 
 
 def test_the_crc_against_one_bit_after_the_other() -> None:
@@ -109,10 +109,10 @@ def test_an_error_in_the_status_is_bad(at: int, bit: int) -> None:
     blocks = decoder.feed([Chunk(PUBLISHED + changed(at, bit | 1), 0)])
     assert [(len(b), b.lost) for b in blocks] == [(1, 0)]
     assert decoder.bad == 1
-    assert ("starting" if bit == 0x40 else "status 0x") in decoder.hint
+    assert ("starting" if bit == 0x40 else "status 0x") in decoder.recent_problem
     blocks = decoder.feed([Chunk(PUBLISHED, 0)])
     assert blocks[0].lost == 1
-    assert decoder.hint == ""
+    assert decoder.recent_problem == ""
 
 
 @pytest.mark.parametrize(("at", "byte"), [(GYRO_STATUS, 0x20), (ACCEL_STATUS, 0x20), (INCL_STATUS, 0x88)])
@@ -139,7 +139,7 @@ def test_auto_follows_a_device_that_is_set_anew() -> None:
     assert len(decoder.feed([Chunk(PUBLISHED * 3, 0)])) == 1
     size = len(short[0])
     assert decoder.feed([Chunk(b"".join(short)[:MAX_BYTES_WITHOUT_FRAME], 0)]) == []
-    assert "baud rate" in decoder.hint
+    assert "baud rate" in decoder.recent_problem
     got = sum(len(b) for b in decoder.feed([Chunk(b"".join(short)[MAX_BYTES_WITHOUT_FRAME:], 0)]))
     assert got == 200 - MAX_BYTES_WITHOUT_FRAME // size - 1
     once = build(Settings())

@@ -8,7 +8,7 @@ import pytest
 from drivers.decoders.base import xor_checksum
 from drivers.decoders.text import MAX_LINE_BYTES, Settings, build
 from drivers.errors import ConfigError
-from drivers.sample import ArrivalTiming, Chunk, CounterTiming, SampleBlock, concatenate_blocks
+from drivers.sample import ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
 from drivers.settings_model import read_settings
 
 SIX = ("gx", "gy", "gz", "ax", "ay", "az")
@@ -96,11 +96,11 @@ def test_a_line_that_cannot_be_read_is_bad_and_leaves_a_place(line: bytes) -> No
 def test_the_hint_says_what_is_wrong_and_goes_away() -> None:
     decoder = build(Settings(columns=SIX))
     decoder.feed([Chunk(b"\n1,2,3\n", 0)])
-    assert "3 columns, expected 6" in decoder.hint
+    assert "3 columns, expected 6" in decoder.recent_problem
     decoder.feed([Chunk(b"1,2,3,4,5,gyro\n", 0)])
-    assert "not a number" in decoder.hint
+    assert "not a number" in decoder.recent_problem
     decoder.feed([Chunk(LINE * 1000, 0)])
-    assert decoder.hint == ""
+    assert decoder.recent_problem == ""
 
 
 def test_the_first_line_is_left_out_unless_it_is_known_to_be_whole() -> None:
@@ -128,7 +128,7 @@ def test_an_overlong_line_is_one_bad_line() -> None:
     feeds = [LINE, *[b"7" * 1000] * (3 * MAX_LINE_BYTES // 1000), b"\n", LINE]
     blocks = [b for data in feeds for b in decoder.feed([Chunk(data, 0)])]
     assert [(len(b), b.lost) for b in blocks] == [(1, 0), (1, 1)]
-    assert "line end" in decoder.hint
+    assert "line end" in decoder.recent_problem
     assert blocks_of(LINE + b"7" * (MAX_LINE_BYTES + 1) + b"\n" + LINE) == [(1, 0), (1, 1)]
 
 
@@ -157,15 +157,15 @@ def test_nmea_checksum() -> None:
 def test_the_devices_own_time(unit: str, text: bytes, ticks: int, modulus: int) -> None:
     settings = {"columns": ("t", *SIX), "time_unit": unit}
     assert decoded(text + b"," + LINE, **settings).ticks.tolist() == [ticks]
-    assert build(Settings(**settings)).timing == CounterTiming(modulus, 1e-9)
+    assert build(Settings(**settings)).timing == CounterTimedFormat(modulus, 1e-9)
 
 
 def test_a_counter() -> None:
     settings = {"columns": (*SIX, "counter"), "counter_modulus": 100}
     got = decoded(b"1,2,3,4,5,6,99\n1,2,3,4,5,6,0\n", **settings)
     assert got.ticks.tolist() == [99, 0]
-    assert build(Settings(**settings)).timing == CounterTiming(100)
-    assert build(Settings(columns=SIX)).timing == ArrivalTiming()
+    assert build(Settings(**settings)).timing == CounterTimedFormat(100)
+    assert build(Settings(columns=SIX)).timing == ArrivalTimedFormat()
     assert blocks_of(b"1,2,3,4,5,6,1\n1,2,3,4,5,6,nan\n1,2,3,4,5,6,3\n", **settings) == [(1, 0), (1, 1)]
 
 

@@ -78,7 +78,7 @@ def test_other_sentences_are_passed_over() -> None:
     assert [(len(b), b.lost) for b in blocks] == [(2, 0)]
     assert decoder.bad == 0
     decoder.feed([Chunk(REGISTER * 150, 0)])
-    assert "async output" in decoder.hint
+    assert "async output" in decoder.recent_problem
 
 
 def test_the_crc_of_four_digits() -> None:

@@ -7,7 +7,15 @@ import numpy as np
 import pytest
 
 from drivers.decoders.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, find_layout
-from drivers.sample import NO_TICK, ArrivalTiming, Chunk, CounterTiming, SampleBlock, concatenate_blocks, make_block
+from drivers.sample import (
+    NO_TICK,
+    ArrivalTimedFormat,
+    Chunk,
+    CounterTimedFormat,
+    SampleBlock,
+    concatenate_blocks,
+    make_block,
+)
 
 EXAMPLE_1 = bytes.fromhex("FA 01 08 00 93 50 2E 42 83 3E F1 3F 48 B5 04 BB 92 88")
 EXAMPLE_2_WRONG = bytes.fromhex("FA 05 08 00 01 00" + "00" * 20 + "A8 3A")
@@ -58,7 +66,7 @@ def test_the_recommended_message() -> None:
     assert got.values.tolist() == [[0.125, -0.5, 1.0, 0.5, -0.25, -9.75]]
     assert got.ticks.tolist() == [123_456_789]
     assert np.isnan(got.temperature_c).all()
-    assert build(Settings()).timing == CounterTiming(TICKS, 1e-9)
+    assert build(Settings()).timing == CounterTimedFormat(TICKS, 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -127,11 +135,11 @@ def test_without_a_time_the_hint_says_what_to_do() -> None:
     data = message({1: 1 << 9}, vector(0, 0, -9.8, 0, 0, 0))
     decoder = build(Settings())
     decoder.feed([Chunk(data, 0)])
-    assert "TimeStartup" in decoder.hint
+    assert "TimeStartup" in decoder.recent_problem
     decoder = build(Settings(clock="arrival"))
     decoder.feed([Chunk(data, 0)])
-    assert decoder.hint == ""
-    assert decoder.timing == ArrivalTiming()
+    assert decoder.recent_problem == ""
+    assert decoder.timing == ArrivalTimedFormat()
 
 
 def test_time_beyond_62_bits_wraps() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.decoders.witmotion import Settings, build, encode_packet
 from drivers.errors import ConfigError
-from drivers.sample import ArrivalTiming, Chunk, SampleBlock, concatenate_blocks, make_block
+from drivers.sample import ArrivalTimedFormat, Chunk, SampleBlock, concatenate_blocks, make_block
 from drivers.settings_model import read_settings
 
 DEGREE, G = math.pi / 180.0, 9.80665
@@ -31,7 +31,7 @@ def test_a_sample_is_both_packets() -> None:
     accel = np.array([0.0048828125, -0.009765625, 1.0]) * G
     np.testing.assert_allclose(got.values[0], [*gyro, *accel], rtol=1e-14)
     assert got.temperature_c[0] == pytest.approx(25.12)
-    assert build(Settings()).timing == ArrivalTiming()
+    assert build(Settings()).timing == ArrivalTimedFormat()
 
 
 def test_the_other_familys_temperature() -> None:
@@ -94,7 +94,7 @@ def test_halves_of_two_samples_are_not_married() -> None:
 def test_packets_without_pairs_are_told() -> None:
     decoder = build(Settings())
     decoder.feed([Chunk(ANGLES * 150, 0)])
-    assert "0x51" in decoder.hint
+    assert "0x51" in decoder.recent_problem
 
 
 def test_a_type_out_of_the_range_is_no_packet() -> None:

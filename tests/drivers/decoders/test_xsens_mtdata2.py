@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.decoders.xsens_mtdata2 import MAX_PAYLOAD, Settings, build, encode_message, match_message
-from drivers.sample import NO_TICK, Chunk, CounterTiming, SampleBlock, concatenate_blocks
+from drivers.sample import NO_TICK, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
 
 DOCUMENTED = bytes.fromhex(
     "FA FF 36 31 10 20 02 DF C5 10 60 04 00 45 9D A0 40 20 0C BE DC 9A FA 3F 54 9F 37 41 1C BB 70"
@@ -47,8 +47,8 @@ def test_the_other_clock() -> None:
     got = decoded(DOCUMENTED, clock="packet_counter")
     assert got is not None
     assert got.ticks.tolist() == [57285]
-    assert build(Settings()).timing == CounterTiming(2**32, 1e-4)
-    assert build(Settings(clock="packet_counter")).timing == CounterTiming(65536)
+    assert build(Settings()).timing == CounterTimedFormat(2**32, 1e-4)
+    assert build(Settings(clock="packet_counter")).timing == CounterTimedFormat(65536)
     free = decoded(DOCUMENTED, clock="arrival")
     assert free is not None
     assert free.ticks.tolist() == [NO_TICK]
@@ -154,7 +154,7 @@ def test_what_is_no_number_is_bad(wrong: float) -> None:
 def test_a_missing_clock_is_told() -> None:
     decoder = build(Settings())
     decoder.feed([Chunk(encode_message(floats(0x4020, 1, 2, 3)), 0)])
-    assert "sample_time_fine" in decoder.hint
+    assert "sample_time_fine" in decoder.recent_problem
 
 
 def test_extended_length() -> None:

@@ -53,7 +53,7 @@ def message(identifier: int, extended: bool = False, **keys: Any) -> can.Message
 def collect(link: CanLink) -> list[Chunk]:
     """All that is there: a read on a busy computer may give it in parts."""
     chunks: list[Chunk] = []
-    while more := link.read(0.2):
+    while more := link.poll_chunks(0.2):
         chunks += more
     return chunks
 
@@ -76,7 +76,7 @@ def test_a_read_is_never_without_end(peer: can.BusABC, channel: str) -> None:
         peer.send(message(1))
     sizes = []
     while sum(sizes) < can_link.MAX_FRAMES + 5:
-        sizes.append(len(link.read(0.1) or ()))
+        sizes.append(len(link.poll_chunks(0.1) or ()))
     link.close()
     assert max(sizes) <= can_link.MAX_FRAMES
     assert sum(sizes) == can_link.MAX_FRAMES + 5
@@ -132,7 +132,7 @@ def test_stamps_that_cannot_be_believed_are_left_aside(channel: str) -> None:
 
 def test_only_what_the_decoder_asks_for(peer: can.BusABC, channel: str) -> None:
     link = build(interface="virtual", channel=channel)
-    link.accept([0x09, 0x0CF02AFE | EXTENDED_ID | ANY_SOURCE, 0x18EF00FE | EXTENDED_ID | ANY_SOURCE])
+    link.set_address_filter([0x09, 0x0CF02AFE | EXTENDED_ID | ANY_SOURCE, 0x18EF00FE | EXTENDED_ID | ANY_SOURCE])
     link.open()
     kept = [(0x09, False), (0x0CF02A80, True), (0x18F02AE2, True), (0x18EF55AA, True)]
     others = [(0x0A, False), (0x09, True), (0x0CF02BFE, True), (0x0DF02AFE, True), (0x02A, False)]
@@ -145,10 +145,10 @@ def test_only_what_the_decoder_asks_for(peer: can.BusABC, channel: str) -> None:
 
 def test_accepting_nothing_in_particular_is_accepting_all(peer: can.BusABC, channel: str) -> None:
     link = build(interface="virtual", channel=channel)
-    link.accept([])
+    link.set_address_filter([])
     link.open()
     peer.send(message(0x55))
-    assert link.read(1.0)
+    assert link.poll_chunks(1.0)
     link.close()
 
 
@@ -160,7 +160,7 @@ def test_error_and_remote_frames_are_left_aside(peer: can.BusABC, channel: str) 
     peer.send(message(7))
     got: list[Chunk] = []
     for _ in range(10):
-        got += link.read(0.05) or []
+        got += link.poll_chunks(0.05) or []
     link.close()
     assert [c.address for c in got] == [7]
     assert link.error_frames == 1
@@ -198,10 +198,10 @@ def test_losing_the_bus(monkeypatch: pytest.MonkeyPatch, answer: Any, says: str)
     link = build(channel="can0")
     link.open()
     with pytest.raises(LinkLost, match=says):
-        link.read(1.0)
+        link.poll_chunks(1.0)
     assert bus.closed
     with pytest.raises(LinkLost, match="closed"):
-        link.read(0.0)
+        link.poll_chunks(0.0)
 
 
 @pytest.mark.parametrize(
@@ -289,14 +289,14 @@ def test_an_adapter_that_garbles_a_line_goes_on() -> None:
     link.open()
     os.write(master, b"\xff\xfe\r")
     for _ in range(5):
-        link.read(0.05)
+        link.poll_chunks(0.05)
     os.write(master, b"t00z2aabb\r")
     for _ in range(5):
-        link.read(0.05)
+        link.poll_chunks(0.05)
     os.write(master, b"t0092aabb\r")
     chunks: list[Chunk] = []
     for _ in range(20):
-        chunks += link.read(0.05) or []
+        chunks += link.poll_chunks(0.05) or []
     link.close()
     os.close(master)
     os.close(slave)
@@ -310,7 +310,7 @@ def test_from_the_bus_to_samples(peer: can.BusABC, channel: str) -> None:
     decoder = dbc.build(read_settings(dbc.Settings, {"file": "j1939_imu", "signals": signals}))
     assert isinstance(decoder, dbc.DbcDecoder)
     link = build(interface="virtual", channel=channel)
-    link.accept(decoder.addresses)
+    link.set_address_filter(decoder.addresses)
     link.open()
     for i in range(20):
         peer.send(message(0x18FEF100, True))  # other traffic of a truck

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.sample import NO_TICK, ArrivalTiming, CounterTiming, SenderTiming, make_block
+from drivers.sample import NO_TICK, ArrivalTimedFormat, CounterTimedFormat, SenderTimedFormat, make_block
 from drivers.timing.arrival_regression import FORGET_S, ArrivalRegression, snap_to_standard_rate
 from drivers.timing.sample_clock import LastSample, SampleClock
 from tests.support.recordings import recordings
@@ -39,7 +39,7 @@ def feed(clock, arrived_s, ticks=None, lost=None, values=None):
         out += clock.assign_times(
             make_block(t_ns, values[a:b].copy(), None, counted, 0 if lost is None else int(lost[a]))
         )
-    assert sum(len(one) for one in out) + clock.repeated_rows == len(arrived_s)
+    assert sum(len(one) for one in out) + clock.dropped_repeated_rows == len(arrived_s)
     assert (np.diff(times(out)) > 0).all()
     return out
 
@@ -91,7 +91,7 @@ class TestCounter:
             # a short counter needs the settled line to see a whole turn
             first = at if n < 256 else int(12 * rate)
             kept[first : first + n] = False
-        clock = SampleClock(CounterTiming(*kind), rate if nominal else None)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         out = feed(clock, arrive(T0 + index / rate)[kept], ticks_of(index, kind, rate)[kept])
         assert lost(out) == (~kept).sum()
         assert clock.rate_hz == pytest.approx(rate, rel=1e-3)
@@ -100,27 +100,27 @@ class TestCounter:
     def test_duplicates_lose_nothing_and_are_kept_out(self, kind, rate, nominal):
         index = np.arange(int(10 * rate))
         twice = np.sort(np.concatenate([index, index[200:203]]))
-        clock = SampleClock(CounterTiming(*kind), rate if nominal else None)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         values = varied(index.size)[twice]
         out = feed(clock, burst(T0 + index / rate)[twice], ticks_of(index, kind, rate)[twice], values=values)
         assert lost(out) == 0
-        assert clock.repeated_rows == 3
+        assert clock.dropped_repeated_rows == 3
         assert np.array_equal(np.concatenate([one.values for one in out]), varied(index.size))
         assert set(kinds(clock)) == {"samples_repeated"}
 
     def test_the_same_count_with_other_values_is_kept(self, kind, rate, nominal):
         index = np.arange(int(10 * rate))
         twice = np.sort(np.concatenate([index, index[200:203]]))
-        clock = SampleClock(CounterTiming(*kind), rate if nominal else None)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         assert lost(feed(clock, burst(T0 + index / rate)[twice], ticks_of(index, kind, rate)[twice])) == 0
-        assert clock.repeated_rows == 0
+        assert clock.dropped_repeated_rows == 0
         assert "other values" in clock.take_events()[0].text
 
     def test_a_counter_that_sticks_is_told_once(self, kind, rate, nominal):
         index = np.arange(int(12 * rate))
         ticks = ticks_of(index, kind, rate)
         ticks[300:] = ticks[300]
-        clock = SampleClock(CounterTiming(*kind), rate if nominal else None)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         assert lost(feed(clock, burst(T0 + index / rate), ticks)) == 0
         assert [kind for kind in kinds(clock) if kind != "samples_repeated"] == ["clock_jumped"]
 
@@ -128,16 +128,16 @@ class TestCounter:
         index = np.arange(int(12 * rate))
         ticks = ticks_of(index, kind, rate)
         ticks[300:350] = ticks[300]
-        clock = SampleClock(CounterTiming(*kind), rate if nominal else None)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         assert lost(feed(clock, burst(T0 + index / rate), ticks)) <= 1
         assert [kind for kind in kinds(clock) if kind != "samples_repeated"] == ["clock_jumped"]
 
     def test_a_cable_out_for_five_seconds(self, kind, rate, nominal):
         index, at, n = np.arange(int(28 * rate)), int(12 * rate), int(5 * rate)
         ticks, arrived = ticks_of(index, kind, rate), jitter(T0 + index / rate)
-        clock = SampleClock(CounterTiming(*kind), rate if nominal else None)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         out = feed(clock, arrived[:at], ticks[:at])
-        clock.pause()
+        clock.note_link_closed()
         later = feed(clock, arrived[at + n :], ticks[at + n :])
         assert lost(out + later) == n
         assert times(out)[-1] < times(later)[0]
@@ -148,9 +148,9 @@ class TestCounter:
         index, at, n = np.arange(int(28 * rate)), int(at_s * rate), int(5 * rate)
         ticks, arrived = ticks_of(index + 7000, kind, rate), jitter(T0 + index / rate)
         fresh = ticks_of(index, kind, rate) if kind[0] == 256 else np.rint(index / rate / kind[1] if kind[1] else index)
-        clock = SampleClock(CounterTiming(*kind), rate if nominal else None)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         out = feed(clock, arrived[:at], ticks[:at])
-        clock.pause()
+        clock.note_link_closed()
         out += feed(clock, arrived[at + n :], fresh[: index.size - at - n])
         turn = kind[0] / (rate and 1) * (kind[1] or 1 / rate) * rate  # samples
         if nominal or at_s > 5.0:
@@ -165,7 +165,7 @@ class TestCounter:
         arrived = burst(T0 + index / rate)
         asleep = np.flatnonzero((arrived > T0 + 12) & (arrived < T0 + 13))
         arrived[asleep] = T0 + 13 + np.arange(asleep.size) // 60 * 3e-4
-        clock = SampleClock(CounterTiming(*kind), rate if nominal else None)
+        clock = SampleClock(CounterTimedFormat(*kind), rate if nominal else None)
         out = feed(clock, np.maximum.accumulate(arrived), ticks_of(index, kind, rate))
         assert lost(out) == 0
         assert kinds(clock) == []
@@ -174,7 +174,7 @@ class TestCounter:
 @pytest.mark.parametrize(("kind", "rate"), COUNTERS)
 def test_a_replay_fifty_times_as_fast_as_configured(kind, rate):
     index = np.arange(int(200 * rate))
-    clock = SampleClock(CounterTiming(*kind), rate)
+    clock = SampleClock(CounterTimedFormat(*kind), rate)
     out = feed(clock, burst(T0 + index / rate / 50, 0.01), ticks_of(index, kind, rate))
     assert lost(out) == 0
     assert kinds(clock) == []
@@ -187,7 +187,7 @@ def test_a_device_that_starts_anew_unseen(kind, rate):
     ticks = ticks_of(index + 7000, kind, rate)
     ticks[at:] = np.rint(np.arange(index.size - at) / rate / kind[1] if kind[1] else np.arange(index.size - at))
     arrived = jitter(T0 + index / rate + 0.7 * (index >= at))
-    clock = SampleClock(CounterTiming(*kind), rate)
+    clock = SampleClock(CounterTimedFormat(*kind), rate)
     assert lost(feed(clock, arrived, ticks)) == pytest.approx(0.7 * rate, abs=0.011 * rate + 1)
     assert kinds(clock) == ["clock_jumped"]
 
@@ -196,7 +196,7 @@ def test_samples_without_their_counter_go_by_arrival_and_leave_no_false_gap():
     index = np.arange(4000)
     ticks = index.copy()
     ticks[1000:1200] = -1
-    clock = SampleClock(CounterTiming(65536), 100.0)
+    clock = SampleClock(CounterTimedFormat(65536), 100.0)
     assert lost(feed(clock, burst(T0 + index / 100), ticks)) == 0
     assert kinds(clock) == []
 
@@ -208,7 +208,7 @@ def test_time_stamps_of_the_device_may_jitter():
     ticks = np.rint((index / 400 + rng.uniform(-2e-4, 2e-4, index.size)) * 1e9).astype(np.int64) + 10**9
     kept = np.ones(index.size, bool)
     kept[[1, 2, 700, 2000, 2001]] = False
-    clock = SampleClock(CounterTiming(*VECTORNAV), None)
+    clock = SampleClock(CounterTimedFormat(*VECTORNAV), None)
     assert lost(feed(clock, burst(T0 + index / 400)[kept], ticks[kept])) == 5
 
 
@@ -216,7 +216,7 @@ def test_a_device_set_to_another_rate_is_believed():
     index = np.arange(8000)
     ticks = np.where(index < 4000, 4 * index, 16000 + 8 * (index - 4000)) % 256
     taken = np.where(index < 4000, index / 500, 8 + (index - 4000) / 250)
-    clock = SampleClock(CounterTiming(*STIM300), None)
+    clock = SampleClock(CounterTimedFormat(*STIM300), None)
     # until half of the last steps are the new ones, each counts as one missing
     assert lost(feed(clock, burst(T0 + taken), ticks)) < 200
 
@@ -229,7 +229,7 @@ def test_a_device_set_to_another_rate_is_believed():
 @pytest.mark.parametrize("nominal", [True, False])
 def test_arrival_jitter_does_not_become_jitter_of_the_samples(rate, arrive, nominal):
     taken = T0 + np.arange(int(45 * rate)) / rate
-    clock = SampleClock(ArrivalTiming(), rate if nominal else None)
+    clock = SampleClock(ArrivalTimedFormat(), rate if nominal else None)
     out = feed(clock, arrive(taken))
     assert lost(out) == 0
     assert kinds(clock) == []
@@ -250,7 +250,7 @@ def test_arrival_jitter_does_not_become_jitter_of_the_samples(rate, arrive, nomi
 @pytest.mark.parametrize("nominal", [True, False])
 class TestArrival:
     def clock(self, rate, nominal):
-        return SampleClock(ArrivalTiming(), rate if nominal else None)
+        return SampleClock(ArrivalTimedFormat(), rate if nominal else None)
 
     @pytest.mark.parametrize("asleep_s", [0.2, 1.0, 2.5])
     def test_a_late_scheduler_loses_nothing(self, rate, arrive, nominal, asleep_s):
@@ -293,7 +293,7 @@ class TestArrival:
         at, n = int(at_s * rate), int(5 * rate)
         clock = self.clock(rate, nominal)
         out = feed(clock, arrived[:at])
-        clock.pause()
+        clock.note_link_closed()
         out += feed(clock, arrived[at + n :])
         if nominal or at_s > 5.0:
             assert lost(out) == pytest.approx(n, abs=2)
@@ -302,7 +302,7 @@ class TestArrival:
 
 @pytest.mark.parametrize("rate", [20.0, 100.0, 400.0])
 def test_a_fast_replay_by_arrival(rate):
-    clock = SampleClock(ArrivalTiming(), rate)
+    clock = SampleClock(ArrivalTimedFormat(), rate)
     out = feed(clock, burst(T0 + np.arange(int(200 * rate)) / rate / 50, 0.01))
     assert lost(out) == 0
     assert times(out)[-1] / NS == pytest.approx(T0 + 4.0, abs=0.1)
@@ -312,7 +312,7 @@ def test_a_fast_replay_by_arrival(rate):
 def test_a_crystal_that_drifts_is_followed_as_it_warms_up():
     index = np.arange(900 * 100)
     taken = T0 + np.cumsum((1.0 + 50e-6 * np.sin(2 * np.pi * index / index.size)) / 100.0)
-    clock = SampleClock(ArrivalTiming(), 100.0)
+    clock = SampleClock(ArrivalTimedFormat(), 100.0)
     out = feed(clock, burst(taken))
     assert lost(out) == 0
     off = times(out)[6000:] / NS - taken[6000:]
@@ -322,13 +322,13 @@ def test_a_crystal_that_drifts_is_followed_as_it_warms_up():
 def test_unix_time_keeps_its_nanoseconds():
     """Frames of a log: a double of Unix time holds no more than 240 ns."""
     t_ns = 1_700_000_000_123_456_789 + np.arange(2000) * 1_000_000
-    clock = SampleClock(ArrivalTiming(), 1000.0)
+    clock = SampleClock(ArrivalTimedFormat(), 1000.0)
     out = [one for t in t_ns for one in clock.assign_times(make_block(np.array([t]), np.zeros((1, 6))))]
     assert np.abs(times(out) - t_ns).max() <= 5
 
 
 def test_the_first_samples_of_an_unknown_rate_are_in_order():
-    clock = SampleClock(ArrivalTiming(), None)
+    clock = SampleClock(ArrivalTimedFormat(), None)
     out = clock.assign_times(make_block(np.full(50, 10**9), np.zeros((50, 6))))
     assert clock.rate_hz is None
     assert (np.diff(times(out)) > 0).all()
@@ -353,7 +353,7 @@ def test_given_times_are_kept_and_holes_told_where_they_can_be(rows, nominal, sc
         "bursts": np.sort(burst(exact, 0.043) + rng.uniform(0.0, 0.002, index.size)),
     }[scatter][kept]
     t_ns = np.rint(t * NS).astype(np.int64)
-    clock = SampleClock(SenderTiming(), 100.0 if nominal else None)
+    clock = SampleClock(SenderTimedFormat(), 100.0 if nominal else None)
     out = []
     for at in range(0, len(t_ns), rows):
         out += clock.assign_times(make_block(t_ns[at : at + rows].copy(), varied(len(t_ns))[at : at + rows].copy()))
@@ -369,7 +369,7 @@ def test_given_times_are_kept_and_holes_told_where_they_can_be(rows, nominal, sc
 
 def test_given_times_that_jump_are_told_and_the_rate_survives():
     t = np.concatenate([np.arange(1000) / 100, 5.0 + np.arange(1000) / 100, 9000.0 + np.arange(1000) / 100])
-    clock = SampleClock(SenderTiming(), None)
+    clock = SampleClock(SenderTimedFormat(), None)
     out = []
     for at in range(0, 3000, 100):
         out += clock.assign_times(make_block(np.rint(t[at : at + 100] * NS).astype(np.int64), np.zeros((100, 6))))
@@ -383,7 +383,7 @@ def test_times_that_stand_still_or_jitter_back_lose_nothing():
     t = np.arange(2000) / 100
     t[500:503] = t[500]
     t[700:1500:2] -= 0.012
-    clock = SampleClock(SenderTiming(), 100.0)
+    clock = SampleClock(SenderTimedFormat(), 100.0)
     out = clock.assign_times(make_block(np.rint(t * NS).astype(np.int64), varied(2000)))
     assert lost(out) <= 2
     assert sum(len(one) for one in out) == 2000
@@ -391,7 +391,7 @@ def test_times_that_stand_still_or_jitter_back_lose_nothing():
 
 
 def test_loss_told_by_the_sender_is_kept():
-    clock = SampleClock(SenderTiming(), 100.0)
+    clock = SampleClock(SenderTimedFormat(), 100.0)
     first = make_block(np.arange(100) * 10**7, np.zeros((100, 6)))
     second = make_block(np.arange(107, 207) * 10**7, np.zeros((100, 6)), lost=7)
     assert lost(clock.assign_times(first) + clock.assign_times(second)) == 7
@@ -411,10 +411,10 @@ def stamp_given(clock, t_s, values, rows):
 def test_rows_that_are_sent_twice_are_kept_out_once(rows, again):
     """One by one, or a whole batch again."""
     sent = np.insert(np.arange(1000), max(again) + 1, again)
-    clock = SampleClock(SenderTiming(), 100.0)
+    clock = SampleClock(SenderTimedFormat(), 100.0)
     out = stamp_given(clock, 50.0 + sent / 100, varied(1000)[sent], rows)
     assert np.array_equal(np.concatenate([one.values for one in out])[:, 0], np.arange(1000))
-    assert clock.repeated_rows == len(again)
+    assert clock.dropped_repeated_rows == len(again)
     assert lost(out) == 0
     texts = [event.text for event in clock.take_events(ended=True)]
     assert sum(int(text.split()[0]) for text in texts) == len(again)
@@ -423,7 +423,7 @@ def test_rows_that_are_sent_twice_are_kept_out_once(rows, again):
 
 def test_a_recording_in_which_every_row_stands_twice():
     sent = np.repeat(np.arange(3000), 2)
-    clock = SampleClock(SenderTiming(), None)
+    clock = SampleClock(SenderTimedFormat(), None)
     out = stamp_given(clock, sent / 100, varied(3000)[sent], 1000)
     assert np.array_equal(np.concatenate([one.values for one in out])[:, 0], np.arange(3000))
     assert clock.rate_hz == 100.0
@@ -434,10 +434,10 @@ def test_times_too_coarse_to_tell_rows_apart_make_no_repeats(rows):
     """Five rows in each second, of few levels: equal rows at one time are no repeats."""
     values = np.repeat(np.random.default_rng(0).integers(0, 2, (3000, 1)).astype(float), 6, axis=1)
     values[:6, 0] = np.arange(6)
-    clock = SampleClock(SenderTiming(), 5.0)
+    clock = SampleClock(SenderTimedFormat(), 5.0)
     out = stamp_given(clock, np.arange(3000) // 5, values, rows)
     assert sum(len(one) for one in out) == 3000
-    assert (clock.repeated_rows, lost(out), kinds(clock)) == (0, 0, [])
+    assert (clock.dropped_repeated_rows, lost(out), kinds(clock)) == (0, 0, [])
 
 
 @pytest.mark.parametrize("late_by", [1, 3])
@@ -445,7 +445,7 @@ def test_rows_out_of_order_are_put_in_order_where_they_came_together(late_by):
     sent = np.arange(2000)
     for at in (300, 1000, 1500):
         sent = np.insert(np.delete(sent, at), at + late_by, at)
-    clock = SampleClock(SenderTiming(), 100.0)
+    clock = SampleClock(SenderTimedFormat(), 100.0)
     out = stamp_given(clock, 7.0 + sent[:200] / 100, varied(2000)[sent[:200]], 200)
     out += stamp_given(clock, 7.0 + sent[200:] / 100, varied(2000)[sent[200:]], 4096)
     assert np.array_equal(np.concatenate([one.values for one in out])[:, 0], np.arange(2000))
@@ -458,11 +458,11 @@ def test_rows_that_come_after_their_place_has_passed_are_left_out(late_by):
     sent = np.arange(2000)
     for at in (300, 1000, 1500):
         sent = np.insert(np.delete(sent, at), at + late_by, at)
-    clock = SampleClock(SenderTiming(), 100.0)
+    clock = SampleClock(SenderTimedFormat(), 100.0)
     out = stamp_given(clock, 7.0 + sent / 100, varied(2000)[sent], 1)
     kept = np.concatenate([one.values for one in out])[:, 0]
     assert np.array_equal(kept, np.delete(np.arange(2000), [300, 1000, 1500]))
-    assert (clock.late_rows, lost(out)) == (3, 3)
+    assert (clock.dropped_late_rows, lost(out)) == (3, 3)
     assert {event.kind for event in clock.take_events()} == {"clock_jumped"}
 
 
@@ -470,18 +470,18 @@ def test_rows_that_come_after_their_place_has_passed_are_left_out(late_by):
 def test_a_clock_that_is_set_back_a_little_leaves_no_sample_out(rows):
     t = np.arange(3000) / 100 + 20.0
     t[1500:] -= 0.503
-    clock = SampleClock(SenderTiming(), 100.0)
+    clock = SampleClock(SenderTimedFormat(), 100.0)
     assert sum(len(one) for one in stamp_given(clock, t, varied(3000), rows)) == 3000
     assert any(event.text == "time went back by 0.493 s" for event in clock.take_events())
 
 
 def test_events_of_a_kind_are_at_most_one_a_second():
     sent = np.sort(np.concatenate([np.arange(6000), np.arange(100, 6000, 10)]))
-    clock = SampleClock(SenderTiming(), 100.0)
+    clock = SampleClock(SenderTimedFormat(), 100.0)
     stamp_given(clock, sent / 100, varied(6000)[sent], 1)
     told = clock.take_events(ended=True)
     assert 50 <= len(told) <= 61
-    assert sum(int(event.text.split()[0]) for event in told) == clock.repeated_rows == 590
+    assert sum(int(event.text.split()[0]) for event in told) == clock.dropped_repeated_rows == 590
 
 
 @pytest.mark.data
@@ -491,10 +491,10 @@ def test_events_of_a_kind_are_at_most_one_a_second():
 def test_recordings_of_real_sensors_hold_no_repeats(name):
     data = np.load(recordings() / f"{name}.npz")
     values = np.stack([data[axis] for axis in ("gx", "gy", "gz") * 2], axis=1).astype(np.float64)
-    clock = SampleClock(SenderTiming(), None)
+    clock = SampleClock(SenderTimedFormat(), None)
     out = stamp_given(clock, data["t"], values, 500)
     assert sum(len(one) for one in out) == len(values)
-    assert (clock.repeated_rows, clock.late_rows) == (0, 0)
+    assert (clock.dropped_repeated_rows, clock.dropped_late_rows) == (0, 0)
 
 
 @pytest.mark.data
@@ -506,7 +506,7 @@ def test_recordings_with_host_times_have_no_invented_holes(name, most):
     t = np.load(recordings() / f"{name}.npz")["t"]
     t_ns = np.rint(t * NS).astype(np.int64)
     for nominal in (None, (len(t) - 1) / (t[-1] - t[0])):
-        clock = SampleClock(SenderTiming(), nominal)
+        clock = SampleClock(SenderTimedFormat(), nominal)
         out = []
         for at in range(0, len(t), 500):
             out += clock.assign_times(make_block(t_ns[at : at + 500].copy(), np.zeros((len(t_ns[at : at + 500]), 6))))
@@ -519,9 +519,9 @@ def test_recordings_with_host_times_have_no_invented_holes(name, most):
 def test_the_line_of_exact_points_is_exact():
     line = ArrivalRegression()
     for i in range(100):
-        line.add(7.0 * i, 3.0 + 0.07 * i)
+        line.add_point(7.0 * i, 3.0 + 0.07 * i)
     assert line.rate_hz() == pytest.approx(100.0, rel=1e-12)
-    assert line.at(7000.0) == pytest.approx(73.0, rel=1e-12)
+    assert line.time_at_index_s(7000.0) == pytest.approx(73.0, rel=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -550,7 +550,7 @@ def stall(t, seed=0):
 def test_a_device_clock_contradicts_the_rate_however_its_samples_arrive(tick_s):
     ticks = np.rint(np.arange(600) / 100.0 / tick_s).astype(np.int64)
     for arrived in (T0 + np.arange(600) / 5000.0, jitter(T0 + np.arange(600) / 100.0)):
-        wrong, right = (SampleClock(CounterTiming(1 << 32, tick_s), rate) for rate in (200.0, 100.0))
+        wrong, right = (SampleClock(CounterTimedFormat(1 << 32, tick_s), rate) for rate in (200.0, 100.0))
         seen = []
         for i in range(0, 600, 5):
             for clock in (wrong, right):
@@ -566,7 +566,7 @@ def test_a_device_clock_contradicts_the_rate_however_its_samples_arrive(tick_s):
 
 def test_a_tick_too_coarse_for_single_steps_contradicts_nothing():
     ticks = np.floor(np.arange(4160) / 416.0 / 1e-3).astype(np.int64)  # steps of 2 and 3
-    clock = SampleClock(CounterTiming(1 << 16, 1e-3), 416.0)
+    clock = SampleClock(CounterTimedFormat(1 << 16, 1e-3), 416.0)
     feed(clock, jitter(T0 + np.arange(4160) / 416.0), ticks)
     assert not clock.rate_check_pending
     assert (clock.rate_hz, clock.contradicted_hz) == (416.0, None)
@@ -576,7 +576,7 @@ def test_a_tick_too_coarse_for_single_steps_contradicts_nothing():
 @pytest.mark.parametrize("seed", range(5))
 def test_jitter_of_arrivals_contradicts_no_rate_that_is_nearly_right(arrive, seed):
     taken = T0 + np.arange(3000) / 100.0
-    clock = SampleClock(ArrivalTiming(), 100.2)
+    clock = SampleClock(ArrivalTimedFormat(), 100.2)
     arrived = arrive(taken) if arrive is burst else arrive(taken, seed=seed)
     for a in range(0, 3000, 10):
         feed(clock, arrived[a : a + 10])
@@ -587,13 +587,13 @@ def test_jitter_of_arrivals_contradicts_no_rate_that_is_nearly_right(arrive, see
 
 @pytest.mark.parametrize("arrive", [jitter, burst, stall])
 def test_arrivals_contradict_a_rate_that_is_far_off(arrive):
-    clock = SampleClock(ArrivalTiming(), 200.0)
+    clock = SampleClock(ArrivalTimedFormat(), 200.0)
     feed(clock, arrive(T0 + np.arange(3000) / 100.0))
     assert clock.contradicted_hz == pytest.approx(100.0, rel=0.02)
 
 
 def test_how_fast_a_file_is_read_contradicts_nothing():
-    clock = SampleClock(ArrivalTiming(), 100.0, arrivals_are_timed=False)
+    clock = SampleClock(ArrivalTimedFormat(), 100.0, arrivals_are_timed=False)
     feed(clock, T0 + np.arange(6000) / 2000.0)
     assert not clock.rate_check_pending
     assert (clock.rate_hz, clock.contradicted_hz) == (100.0, None)
@@ -601,17 +601,17 @@ def test_how_fast_a_file_is_read_contradicts_nothing():
 
 def test_given_times_contradict_a_rate_also_where_there_are_few():
     times_ns = np.arange(150) * 10_000_000
-    clock = SampleClock(SenderTiming(), 200.0)
+    clock = SampleClock(SenderTimedFormat(), 200.0)
     clock.assign_times(make_block(times_ns, varied(150)))
     assert clock.rate_check_pending
     assert clock.contradicted_hz is None
-    clock.end()
+    clock.compare_rates_at_end()
     assert not clock.rate_check_pending
     assert clock.contradicted_hz == pytest.approx(100.0)
 
 
 def test_times_that_never_show_a_rate_leave_the_configured_one():
-    clock = SampleClock(SenderTiming(), 100.0)
+    clock = SampleClock(SenderTimedFormat(), 100.0)
     for i in range(17):
         assert clock.rate_check_pending == (i > 0)
         clock.assign_times(make_block(np.zeros(4000, np.int64), varied(4000) + i))
@@ -620,7 +620,7 @@ def test_times_that_never_show_a_rate_leave_the_configured_one():
 
 
 def test_a_jump_of_given_times_does_not_begin_the_check_anew():
-    clock = SampleClock(SenderTiming(), 200.0)
+    clock = SampleClock(SenderTimedFormat(), 200.0)
     times_ns = np.arange(600) * 10_000_000
     for a in range(0, 600, 20):
         clock.assign_times(make_block(times_ns[a : a + 20].copy(), varied(20) + a))
@@ -631,7 +631,7 @@ def test_a_jump_of_given_times_does_not_begin_the_check_anew():
 
 
 def test_after_a_restart_the_rate_is_checked_before_it_is_believed():
-    clock = SampleClock(ArrivalTiming(), 200.0)
+    clock = SampleClock(ArrivalTimedFormat(), 200.0)
     assert not clock.rate_check_pending
     clock.resume(LastSample(round(T0 * NS), NO_TICK, 200.0, None))
     assert clock.rate_check_pending
@@ -642,7 +642,7 @@ def test_after_a_restart_the_rate_is_checked_before_it_is_believed():
 def test_a_wrong_period_after_garbage_makes_no_losses_without_end(seed, longest_stall_s):
     """Rejected lines count as samples, more than the device can have sent; then good ones come in fits and starts."""
     rng = np.random.default_rng(seed)
-    clock = SampleClock(ArrivalTiming(), 100.0)
+    clock = SampleClock(ArrivalTimedFormat(), 100.0)
     told = 0
 
     def feed_at(arrived_s, n, rejected=0):

@@ -73,26 +73,26 @@ def deadline(seconds: float) -> Iterator[None]:
 
 def replace_endless_commands() -> None:
     """Let services, ``reconcile`` and long simulations end where their arguments have been accepted."""
-    from monitor.cli.shared import terminal_session
-    from monitor.commands import reconcile, simulate
+    from monitor.cli.shared import service_in_terminal
+    from monitor.commands import reconcile, simulate_recording
     from monitor.publishing.terminal import watch
 
     places: list[tuple[Any, str]] = [
-        (terminal_session, "serve"),
-        (terminal_session, "view"),
+        (service_in_terminal, "run_service"),
+        (service_in_terminal, "run_fleet_viewer"),
         (watch, "watch"),
-        (reconcile, "make"),
+        (reconcile, "run_reconciliation"),
     ]
     for place, name in places:
         setattr(place, name, _accepted(name))
-    write: Callable[..., None] = simulate._write
+    write: Callable[..., None] = simulate_recording._write
 
-    def write_short(result: simulate.Result, *rest: Any) -> None:
+    def write_short(result: simulate_recording.Result, *rest: Any) -> None:
         if result.samples > LONGEST_SIMULATION:
             raise SystemExit(0)
         write(result, *rest)
 
-    simulate._write = write_short
+    simulate_recording._write = write_short
 
 
 def _accepted(name: str) -> Callable[..., None]:

@@ -19,8 +19,8 @@ import pytest
 
 import imu_monitor
 from drivers.sample import AXES
-from monitor.common.config_files import CONFIG_FOLDER
-from monitor.daemon.operations import live_reconcile
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.daemon.operations import reconcile_on_request
 
 ROOT: Final = Path(imu_monitor.__file__).resolve().parent
 SCRIPT: Final = "import sys\nfrom imu_monitor import main\nsys.exit(main())\n"
@@ -109,7 +109,7 @@ def test_foreign_packages_come_first_on_the_module_path(form: str, run: Run, tmp
     path = foreign(tmp_path / "ros", form)
     done = run("check", DEMO, environment={"PYTHONPATH": f"{path}{os.pathsep}{ROOT}"})
     well(done)
-    assert "1 device, nothing wrong" in done.stdout
+    assert "1 device, no mistakes" in done.stdout
 
 
 @pytest.mark.parametrize(
@@ -129,7 +129,7 @@ def test_foreign_packages_in_the_current_folder(form: str, tmp_path: Path) -> No
 def test_a_child_of_the_daemon_runs_the_same_program(tmp_path: Path) -> None:
     path = foreign(tmp_path / "ros", "packages")
     environment = os.environ | {"PYTHONPATH": str(path)}
-    command = [*live_reconcile.COMMAND, "--help"]
+    command = [*reconcile_on_request.COMMAND, "--help"]
     done = subprocess.run(
         command, cwd=path, env=environment, capture_output=True, text=True, timeout=TIMEOUT_S, check=False
     )

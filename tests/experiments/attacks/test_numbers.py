@@ -20,15 +20,15 @@ import pytest
 
 import drivers.decoders
 import drivers.links
-from drivers import discovery, quantities
+from drivers import discovery, number_ranges
 from drivers.errors import ConfigError, ImuError
-from drivers.quantities import Quantity
+from drivers.number_ranges import NumberRange
 from drivers.recordings import load_samples
 from drivers.sample import AXES
-from drivers.settings_model import SettingsModel, WordOr, describe_keys
+from drivers.settings_model import SettingsModel, WordOr, fields_by_key
 from monitor import cli
 from monitor.commands.analyze import Request, run_analysis
-from monitor.common import config_files
+from monitor.common import shipped_file_paths
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature
@@ -88,7 +88,7 @@ def leaves(kind: Any) -> Iterator[Any]:
 def arguments(tmp_path: Path) -> dict[tuple[str, ...], list[str]]:
     """Valid arguments of each command, without the options."""
     rng = np.random.default_rng(1)
-    recording, model = tmp_path / "r.npz", str(config_files.CONFIG_FOLDER / "models" / "consumer-mems.toml")
+    recording, model = tmp_path / "r.npz", str(shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml")
     warm = 25.0 + 5.0 * np.sin(np.arange(2000) / 200.0)
     np.savez(recording, t=np.arange(2000) / 100.0, temperature=warm, **{a: rng.normal(size=2000) for a in AXES})  # type: ignore[arg-type]
     config = tmp_path / "c.toml"
@@ -234,7 +234,7 @@ def key_cases() -> Iterator[tuple[str, type[SettingsModel], str]]:
 def numeric_keys(kind: type[SettingsModel]) -> list[str]:
     """Keys that take a number, and keys whose text stands for one."""
     found = []
-    for key, field in describe_keys(kind).items():
+    for key, field in fields_by_key(kind).items():
         worded = isinstance(field.default, str) and any(c.isdigit() for c in field.default)
         if worded or key == "listen" or {int, float} & set(leaves(field.annotation)):
             found.append(key)
@@ -292,7 +292,7 @@ def test_every_number_of_the_settings_names_its_quantity() -> None:
     """A new key cannot be forgotten: its type names the range that is supported."""
     lacking = []
     for _, kind, name in key_cases():
-        for key, field in describe_keys(kind).items():
+        for key, field in fields_by_key(kind).items():
             if {int, float} & set(leaves(field.annotation)) and not names_quantity((field.annotation, field.metadata)):
                 lacking.append(f"{name}: {key}")
     # checked against a list of what exists, converted from a rate with its own check, or passed on to a library
@@ -304,7 +304,7 @@ def test_every_number_of_the_settings_names_its_quantity() -> None:
 
 def names_quantity(parts: Any) -> bool:
     """Whether a quantity is among annotations, or in a type that a word may replace."""
-    if isinstance(parts, Quantity):
+    if isinstance(parts, NumberRange):
         return True
     if isinstance(parts, WordOr):
         return names_quantity(parts._kind)
@@ -455,7 +455,7 @@ def test_a_short_or_endless_end_of_a_recording(last_s: float, tmp_path: Path) ->
     assert len(load_samples(path, last_s=last_s)) == (400 if last_s > 1.0 else 1)
 
 
-@pytest.mark.parametrize("rate_hz", [quantities.RATE_HZ.low, 20e3, quantities.RATE_HZ.high])
+@pytest.mark.parametrize("rate_hz", [number_ranges.RATE_HZ.low, 20e3, number_ranges.RATE_HZ.high])
 def test_every_supported_rate_is_answered(rate_hz: float, tmp_path: Path) -> None:
     """Both ends of the range, and a sensor of vibration; slow sensors are above, by their time stamps."""
     path = tmp_path / "r.npz"

@@ -22,7 +22,7 @@ from drivers.links import serial_link
 from drivers.recordings import load_samples, segment
 from drivers.sample import make_block
 from drivers.zenoh.sample_message import encode_samples
-from drivers.zenoh.session import build_session_config
+from drivers.zenoh.session_config import build_session_config
 from monitor.common import topics
 from monitor.daemon.operations.metrics import MetricsOutput
 from monitor.publishing.zenoh.publisher import ZenohPublisher
@@ -234,7 +234,7 @@ def test_two_daemons_with_one_prefix_and_the_same_device_name(tmp_path: Path) ->
                 first.put(topics.STATUS, "bench", b"{}")
                 other.put(topics.STATUS, "bench", b"{}")
                 assert other.state == "ok"
-        second.remove("bench")
+        second.remove_device("bench")
         assert "another program" not in second.state
 
 

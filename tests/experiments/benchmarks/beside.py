@@ -19,7 +19,7 @@ import numpy as np
 from scipy.signal import welch
 
 from drivers.sample import AXES, Floats
-from monitor.commands import analyze, simulate
+from monitor.commands import analyze, simulate_recording
 from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEGREE,
@@ -32,7 +32,7 @@ from monitor.common.units import (
 )
 from monitor.estimation.analysis import Analysis
 from monitor.estimation.detection.line_detection import detect_lines
-from monitor.noise.catalogue import load_model
+from monitor.noise.model_catalogue import load_model
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.plots.allan_figure import FIT_DASHES, MARKER_SIZES, MARKERS
 from monitor.publishing.plots.style import (
@@ -86,8 +86,8 @@ def sides(recording: Path, model: str, seed: int) -> tuple[Side, Side]:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder) / "simulated.npz"
         seconds = estimate.curve.n / estimate.rate_hz
-        simulate.run_simulation(
-            simulate.Request(load_model(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model)
+        simulate_recording.run_simulation(
+            simulate_recording.Request(load_model(model, Path.cwd()), out, seconds, seed, estimate.rate_hz, name=model)
         )
         simulated = analyze.run_analysis(analyze.Request(out)).analysis
     return Side("recorded", recorded), Side("simulated", simulated)
@@ -112,7 +112,7 @@ def panel(axes: "Axes", recorded: Side, simulated: Side, kind: Kind) -> None:
     shown = []
     for number, (axis, colour) in enumerate(zip(axes_of(kind), COLOURS, strict=True)):
         for side, style in (
-            (recorded, {"linestyle": "", "marker": MARKERS[number], "mec": "white", "mew": 0.4, "label": axis}),
+            (recorded, {"linestyle": "", "marker": MARKERS[number], "mfc": "none", "mew": 1.1, "label": axis}),
             (simulated, {"linestyle": FIT_DASHES[number], "linewidth": 1.8}),
         ):
             tau_s, deviation, lo, hi = curve(side, axis)

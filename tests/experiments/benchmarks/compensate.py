@@ -29,7 +29,7 @@ from monitor.drift.compensation.compensator import Compensator
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
 from monitor.drift.thermal.interval_means import compute_interval_means
-from monitor.noise.catalogue import load_model
+from monitor.noise.model_catalogue import load_model
 from tests.experiments.benchmarks.joint import compiled_joint, joint
 from tests.experiments.benchmarks.machine import console, table
 from tests.experiments.benchmarks.motion_score import MotionScore, score_in_motion
@@ -69,7 +69,7 @@ def live(values: Floats, rate_hz: float, adapts: bool = True) -> tuple[Floats, C
     size = one.interval_samples
     for start in range(0, len(values), size):
         out[start : start + size] = one.compensate(values[start : start + size])
-        one.identify()
+        one.identify_due_models()
     return out, one
 
 
@@ -297,7 +297,7 @@ def _followed(model, z: Floats, scatter: Floats, drift: Floats, adapts: bool) ->
         off[k] = expected - drift[k]
         total, _ = sage_husa.update_with_interval(row, z[k], scatter[k], 1e-12)
         new[k] = (z[k] - expected) / total**0.5
-        sage_husa.predict(row)
+        sage_husa.predict_next_interval(row)
     half = z.size // 2
     return [float(np.sqrt(np.mean(part**2))) for part in (off[2048:half], off[half + 200 :], new[half + 200 :])]
 
@@ -334,7 +334,7 @@ def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats
     taught: list[Floats] = []
     for start in range(0, len(values) - size, size):
         one.compensate(values[start : start + size])
-        one.identify()
+        one.identify_due_models()
         kept.append((one._state.drift.copy(), len(taught)))
         taught += [interval.mean for interval in one.take_intervals()]
     means, per_min = np.array(taught), round(60.0 / one.interval_s)
@@ -349,7 +349,7 @@ def _coasted(values: Floats, rate_hz: float, spans: tuple[float, ...]) -> Floats
             rows = rows.copy()
             for row in rows:
                 for _ in range(ahead + per_min // 2):
-                    sage_husa.predict(row)
+                    sage_husa.predict_next_interval(row)
             now = np.array([sage_husa.expected_bias(row) for row in rows])
             spread = now[:, 1] + np.array([row["white_variance"] for row in rows]) / per_min
             squares[:, at] += np.mean([(truth - minute) ** 2, (truth - now[:, 0]) ** 2, spread], axis=1)
@@ -371,11 +371,11 @@ def alarms(seeds: int) -> None:
     for name, records, rate_hz in sources:
         told: list[str] = []
         for values in records:
-            one, by_hand = LiveCompensation(rate_hz), ArmaWorker("", at_once=True)
+            one, by_hand = LiveCompensation(rate_hz), ArmaWorker("", synchronous=True)
             t_ns = np.round(np.arange(len(values)) / rate_hz * 1e9).astype(np.int64)
             for start in range(0, len(values), 100):
                 one.update(make_block(t_ns[start : start + 100].copy(), values[start : start + 100].copy()))
-                by_hand.update(one)
+                by_hand.adopt_and_start_models(one)
             told += [event.text for event in one.take_events()]
         hours = sum(len(values) for values in records) / rate_hz / 3600.0
         made.add_row(name, f"{hours:.1f}", str(len(told)), str(sum("stepped" in text for text in told)))
@@ -496,7 +496,7 @@ def robust(_seeds: int) -> None:
         elif kind == 5:
             values[size // 2 :] += 0.05
         out = one.compensate(values, lost=int(rng.integers(2)) * int(rng.integers(10**6)))
-        one.identify()
+        one.identify_due_models()
         one.take_intervals()
         assert np.array_equal(np.isfinite(out), np.isfinite(values))
         for row in one._state.drift:

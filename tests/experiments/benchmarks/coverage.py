@@ -2,7 +2,8 @@
 
     python -m tests.experiments.benchmarks.coverage --json coverage.jsonl                # all cells, 20 minutes
     python -m tests.experiments.benchmarks.coverage --json coverage.jsonl --records 120  # fewer
-    python -m tests.experiments.benchmarks.coverage --json coverage.jsonl --records 0 --page docs/statistics.md
+
+With ``--records 0 --page docs/statistics-measurements.md``, the program only writes the tables into the page.
 
 Counted for each cell (a noise and a length of record at 100 Hz), in percent with the 95 % interval of Wilson:
 
@@ -101,7 +102,7 @@ def tables(chunks: list[Chunk]) -> str:
     """Markdown of all that was counted."""
     groups = merged(chunks)
     parts = [
-        "Deviations, two-sided 95 % intervals, τ up to an eighth of the record:",
+        "Two-sided 95 % intervals of deviations, for τ up to an eighth of the record:",
         markdown(
             ("record", "noise", "records", "holds, %", "worst and best τ, %"), [_deviations(*g) for g in groups.items()]
         ),
@@ -112,8 +113,9 @@ def tables(chunks: list[Chunk]) -> str:
         ),
         "Absent terms that are estimated, %:",
         markdown(("record", "noise", *SYMBOLS), [_absent(*group) for group in groups.items()]),
-        f"Bold: the interval of the figure lies entirely outside {_percent(*TWO_SIDED)} % (intervals), "
-        f"{_percent(*ONE_SIDED)} % (bounds), {_percent(*SAID)} % (all results), {_percent(*FALSE)} % (absent terms).",
+        "A figure is bold if its interval lies entirely outside the expected range. The expected range is "
+        f"{_percent(*TWO_SIDED)} % for intervals, {_percent(*ONE_SIDED)} % for bounds, {_percent(*SAID)} % for all "
+        f"results of a term together, and {_percent(*FALSE)} % for absent terms.",
     ]
     return "\n\n".join(parts)
 

@@ -23,8 +23,8 @@ import psutil
 
 from drivers.decoders import vectornav_binary
 from drivers.sample import make_block
-from monitor.common import config_files
-from monitor.noise.catalogue import read_model
+from monitor.common import shipped_file_paths
+from monitor.noise.model_catalogue import read_model
 
 WARM_S = 25.0
 DEVICE = """
@@ -55,7 +55,7 @@ class Sensors:
         self.ports = [folder / f"tty{i}" for i in range(count)]
         self._masters = [self._plug(port) for port in self.ports]
         n = round(rate_hz * seconds)
-        model = read_model(config_files.CONFIG_FOLDER / "models" / "consumer-mems.toml")
+        model = read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml")
         values = model.stream(float(rate_hz), 1).draw_with_temperature(n).values
         ticks = np.arange(n, dtype=np.int64) * (1_000_000_000 // rate_hz)
         encoder = vectornav_binary.build(vectornav_binary.Settings())

@@ -2,7 +2,8 @@
 
     python -m tests.experiments.benchmarks.efficiency --json efficiency.jsonl  # all cells, 300 records each
     python -m tests.experiments.benchmarks.efficiency --json efficiency.jsonl --records 1200    # add more
-    python -m tests.experiments.benchmarks.efficiency --json efficiency.jsonl --records 0 --page docs/statistics.md
+
+With ``--records 0 --page docs/statistics-measurements.md``, the program only writes the tables into the page.
 
 For each cell (a noise and a length of record at 100 Hz), each estimator and each term: the root mean square of the
 relative error of the coefficient over its Cramér–Rao limit, with the 95 % interval of that ratio from the scatter

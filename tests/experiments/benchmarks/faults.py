@@ -107,10 +107,10 @@ class Said(Output):
     healths: list[Health] = field(default_factory=list)
     events: list[str] = field(default_factory=list)  # their sentences
 
-    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         self.healths.append(health)
 
-    def event(self, device: str, unix_s: float, received: int, event: Any) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Any) -> None:
         self.events.append(event.text)
 
     def texts(self) -> set[str]:
@@ -239,7 +239,7 @@ def running(folder: Path, more: str = NO_ZENOH + NO_VIEWER) -> Iterator[Rig]:
         wait_for(lambda: said.healths and "compiling" not in said.healths[-1].text, "the kernels")
         yield rig
     finally:
-        service.stop()
+        service.request_stop()
         thread.join(PATIENCE_S)
         board.close()
 
@@ -312,7 +312,7 @@ def two_daemons(folder: Path, times: int) -> Outcome:
     """A second daemon on the same serial port and zenoh endpoint."""
     both = f'[zenoh]\nlisten = ["{free_endpoint()}"]\n' + NO_VIEWER
     with running(folder, both) as rig:
-        wait_for(lambda: rig.service.states()["zenoh"] == "ok", "the session")
+        wait_for(lambda: rig.service.output_states()["zenoh"] == "ok", "the session")
         said = Said()
         second = Service(loading.load(folder / "faults.toml"), [said])
         thread = threading.Thread(target=second.run)
@@ -322,7 +322,7 @@ def two_daemons(folder: Path, times: int) -> Outcome:
             busy = said.wait("is busy")
             rig.flows()
         finally:
-            second.stop()
+            second.request_stop()
             thread.join(PATIENCE_S)
         assert second.workers[0].driver.counts.received == 0
         return rig.outcome("two daemons on one port", f"the second: {held}; {busy}")
@@ -359,7 +359,7 @@ def can_bus(folder: Path, times: int) -> Outcome:
     service = Service(loading.load(path), [said])
     station = service.workers[0]
     # python-can would sort a peer's error frames out by their identifier, as the kernel does not
-    station.driver.link.accept([])  # type: ignore[attr-defined]
+    station.driver.link.set_address_filter([])  # type: ignore[attr-defined]
     thread = threading.Thread(target=service.run)
     thread.start()
     sent = 0
@@ -393,7 +393,7 @@ def can_bus(folder: Path, times: int) -> Outcome:
                 injected, sent - 1, counts.received, counts.lost, counts.bad, text, "the last sample stays open"
             )
     finally:
-        service.stop()
+        service.request_stop()
         thread.join(PATIENCE_S)
 
 
@@ -414,7 +414,7 @@ def full_disk(folder: Path, times: int) -> Outcome:
             said = rig.said.wait("No space left")
             rig.flows()
             ballast.unlink()
-            wait_for(lambda: rig.service.states()["recording"] == "ok", "the recording")
+            wait_for(lambda: rig.service.output_states()["recording"] == "ok", "the recording")
             outcome = rig.outcome("disk full, then free again", said)
         _check_recording(small / "store", outcome)
         return outcome
@@ -424,14 +424,14 @@ def full_disk(folder: Path, times: int) -> Outcome:
 
 def slow_disk(folder: Path, times: int) -> Outcome:
     """Every batch takes two seconds to write."""
-    write = segment.SegmentWriter.write_samples
+    write = segment.SingleSegmentWriter.write_samples
 
-    def slowly(writer: segment.SegmentWriter, *arguments: Any) -> None:
+    def slowly(writer: segment.SingleSegmentWriter, *arguments: Any) -> None:
         time.sleep(2.0)
         write(writer, *arguments)
 
     with (
-        mock.patch("drivers.recordings.segment.SegmentWriter.write_samples", slowly),
+        mock.patch("drivers.recordings.segment.SingleSegmentWriter.write_samples", slowly),
         running(folder, _storage(folder / "store")) as rig,
     ):
         for _ in range(4):
@@ -528,14 +528,14 @@ def viewer(folder: Path, times: int) -> Outcome:
     more = NO_ZENOH + f'[viewer]\nmode = "web"\nport = {free_port()}\nweb_port = {free_port()}\n'
     with running(folder, more) as rig:
         assert rig.service.viewer is not None
-        wait_for(lambda: rig.service.states()["viewer"] == "ok", "the viewer")
+        wait_for(lambda: rig.service.output_states()["viewer"] == "ok", "the viewer")
         child = rig.service.viewer._child
         assert child is not None
         os.kill(child.pid, signal.SIGSTOP)
         said = rig.said.wait("stalled")
         rig.flows(2 * RATE)
         os.kill(child.pid, signal.SIGCONT)
-        wait_for(lambda: rig.service.states()["viewer"] == "ok", "the viewer again")
+        wait_for(lambda: rig.service.output_states()["viewer"] == "ok", "the viewer again")
         return rig.outcome("viewer frozen", f"viewer: {said}")
 
 

@@ -26,7 +26,7 @@ from typing import Any, Final
 import psutil
 import zenoh
 
-from drivers.zenoh.session import build_session_config
+from drivers.zenoh.session_config import build_session_config
 from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from tests.support.ports import free_port

@@ -19,7 +19,7 @@ import numpy as np
 
 from monitor.estimation.estimate import Estimate
 from monitor.history import reading as past
-from monitor.history.bucket import HistoryRow, pack_statistics
+from monitor.history.bucket import HistoryRow, pack_count_min_max_last
 from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
 from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.query import PARTS, HistoryQuery
@@ -75,8 +75,9 @@ def cost() -> None:
     each = (time.perf_counter() - begun) / 20_000
     full = [row for row in rows if row is not None]
     print(f"an estimate: {each * 1e6:.1f} µs in the loop; {len(full[0].names)} numbers")
-    packed = _timed(lambda: [pack_statistics(row) for row in full]) / len(full)
-    print(f"a row: {packed * 1e6:.0f} µs to pack, {np.mean([len(pack_statistics(row)) for row in full]):.0f} bytes")
+    packed = _timed(lambda: [pack_count_min_max_last(row) for row in full]) / len(full)
+    size = np.mean([len(pack_count_min_max_last(row)) for row in full])
+    print(f"a row: {packed * 1e6:.0f} µs to pack, {size:.0f} bytes")
 
 
 def years(path: Path, count: float) -> None:

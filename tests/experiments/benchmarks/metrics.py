@@ -19,8 +19,8 @@ def main() -> None:
     for devices in (1, 16, 100):
         output = MetricsOutput(Metrics("127.0.0.1", 0))
         for i in range(devices):
-            output.health(f"device-{i}", 0.0, made.health())
-            output.result(f"device-{i}", 0.0, 0, made.estimate())
+            output.publish_health(f"device-{i}", 0.0, made.health())
+            output.publish_result(f"device-{i}", 0.0, 0, made.estimate())
         output.start()
         while not output.port:
             time.sleep(0.01)

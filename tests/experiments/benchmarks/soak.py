@@ -26,11 +26,11 @@ from drivers.errors import LinkEnded, LinkLost
 from drivers.links.base import Carrier
 from drivers.recordings import segment
 from drivers.sample import Chunk, make_block
-from monitor.common import config_files
+from monitor.common import shipped_file_paths
 from monitor.daemon.service import Service
 from monitor.history.sqlite_store import open_history
 from monitor.history.time_ranges import TimeRange
-from monitor.noise.catalogue import read_model
+from monitor.noise.model_catalogue import read_model
 from monitor.settings import loading
 
 ROWS: Final = 8192
@@ -77,7 +77,7 @@ class Wire:
         self._rate_hz = rate_hz
         self._samples = samples
         self._encoder = vectornav_binary.build(vectornav_binary.Settings())
-        self._stream = read_model(config_files.CONFIG_FOLDER / "models" / "consumer-mems.toml").stream(rate_hz, 1)
+        self._stream = read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml").stream(rate_hz, 1)
         self._rng = np.random.default_rng(1)
         self._closed = threading.Event()
 
@@ -87,7 +87,7 @@ class Wire:
     def close(self) -> None:
         self._closed.set()
 
-    def read(self, timeout_s: float) -> list[Chunk] | None:
+    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
         if self._closed.is_set():
             raise LinkLost("closed")
         truth = self.truth

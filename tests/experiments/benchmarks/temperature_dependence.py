@@ -26,7 +26,11 @@ def false_statements(noise: str, shape: str, seeds: int) -> tuple[int, int, int]
     for seed in range(seeds):
         means = chamber_means(shape, drift(noise, COUNT, np.random.default_rng(seed)))
         one, loop = find_dependence(means), find_hysteresis(means)
-        found += (one is not None, one is not None and one.explains_most, loop is not None and loop.significant)
+        found += (
+            one is not None,
+            one is not None and one.explains_most,
+            loop is not None and loop.hysteresis_is_significant,
+        )
     return int(found[0]), int(found[1]), int(found[2])
 
 
@@ -48,7 +52,7 @@ def loops(law: str, shape: str, size: float, seeds: int) -> tuple[int, float]:
         noise = drift("white", COUNT, np.random.default_rng(seed))
         curve = chamber_means(shape, noise, "cubic", 100.0).bias
         loop = find_hysteresis(chamber_means(shape, curve, law, size))
-        if loop is not None and loop.significant:
+        if loop is not None and loop.hysteresis_is_significant:
             ratios.append(loop.size / size)
     return len(ratios), float(np.median(ratios)) if ratios else float("nan")
 

@@ -27,14 +27,14 @@ def cell(lag_h: float, noise: float, seeds: int) -> tuple[str, ...]:
     ratios, inside, names = [], [], Counter[str]()
     for seed in range(seeds):
         means = hourly(seed, lag_h, noise)
-        model = fit_thermal_model(means.first(DAY)).model
+        model = fit_thermal_model(means.first_intervals(DAY)).model
         multi = predict(model, means.temperature_c, began=True)
         one = predict(model, means.temperature_c, means.bias, began=True)
         cubic = np.polynomial.Polynomial.fit(means.temperature_c[:DAY], means.bias[:DAY], 3)(means.temperature_c)
         of_cubic = np.sqrt(np.mean((means.bias - cubic)[DAY:] ** 2))
         ratios.append([np.sqrt(np.mean((means.bias - each.bias)[DAY:] ** 2)) / of_cubic for each in (multi, one)])
         inside.append(np.mean(((multi.lo < means.bias) & (means.bias < multi.hi))[DAY:]))
-        names["difference" if model.shape.memory else "polynomial"] += 1
+        names["difference" if model.shape.difference_equation_order else "polynomial"] += 1
     multi_step, one_step = np.array(ratios).T
     return (
         f"{lag_h:g} h",

@@ -13,7 +13,7 @@ from itertools import islice
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate, OnlineThermalModel
+from monitor.drift.thermal.online_thermal_model import OnlineThermalModel, PredictedAxisInterval
 from monitor.drift.thermal.residual_alarm import UnexplainedChange
 from tests.experiments.benchmarks.machine import console, table
 from tests.monitor.drift.made import COEFFICIENT, late, weather
@@ -55,7 +55,7 @@ def wandering(draws: Floats) -> Floats:
 
 def followed(
     kind: str, seed: int, step: float = 0.0
-) -> tuple[list[AxisThermalUpdate], list[tuple[int, UnexplainedChange]], float]:
+) -> tuple[list[PredictedAxisInterval], list[tuple[int, UnexplainedChange]], float]:
     """The intervals, what was told when, and the deviation of a mean."""
     biases, warmth, size = record(kind, seed, step)
     axis, looks, told = OnlineThermalModel(60.0 * MINUTES), [], []
@@ -63,7 +63,7 @@ def followed(
         looks.append(axis.update(bias, size, temperature_c))
         while axis.step():
             pass
-        told += [(k, found) for found in axis.take()]
+        told += [(k, found) for found in axis.take_unexplained_changes()]
     return looks, told, size
 
 
@@ -76,7 +76,7 @@ def held(kind: str, seeds: int) -> tuple[str, ...]:
         told, records = told + len(found), records + bool(found)
         for k, one in enumerate(looks):
             if one.one_step is not None:
-                inside[k < FIRST].append(one.one_step.side(one.bias) == 0)
+                inside[k < FIRST].append(one.one_step.side_of(one.bias) == 0)
     count = sum(map(len, inside.values()))
     shares = [f"{100 * np.mean(inside[early]):.1f} %" for early in (True, False)]
     return kind, f"{count}", *shares, f"{told}", f"{records} of {seeds}"

@@ -38,10 +38,10 @@ def without_null() -> Iterator[None]:
     from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
     from monitor.reconcile.diagnostics.null_distribution import AxisNull, NullDistribution
 
-    def table(simulated: Mapping[str, Sequence[Any]], _axes: int) -> dict[str, AxisNull]:
+    def table(simulated: Mapping[str, Sequence[Any]]) -> dict[str, AxisNull]:
         return {axis: dict.fromkeys(DIAGNOSTICS, NullDistribution(1.92, 3.32)) for axis in simulated}
 
-    with patch.object(reconcile, "null_distributions", table):
+    with patch.object(reconcile, "estimate_null_distributions", table):
         yield
 
 
@@ -73,7 +73,7 @@ def without_withdrawal() -> Iterator[None]:
     """Names stay, whatever is left at their place."""
     from monitor.reconcile.search import search
 
-    with patch.object(search, "supported_effects", lambda found, *_others: found):
+    with patch.object(search, "keep_supported_effects", lambda found, *_others: found):
         yield
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 
 from drivers.decoders.base import MAX_ACCEL_M_S2, MAX_GYRO_RAD_S, TEMPERATURE_LIMITS_C, Decoder
-from drivers.sample import NO_TICK, Chunk, CounterTiming, SampleBlock, SenderTiming
+from drivers.sample import NO_TICK, Chunk, CounterTimedFormat, SampleBlock, SenderTimedFormat
 
 LIMITS = (MAX_GYRO_RAD_S,) * 3 + (MAX_ACCEL_M_S2,) * 3
 LARGEST_LOSS = 10**10
@@ -38,15 +38,15 @@ def fed(decoder: Decoder, calls: list[list[Chunk]]) -> list[SampleBlock]:
         bad = decoder.bad
         for block in decoder.feed(chunks):
             sound(block)
-            if isinstance(decoder.timing, CounterTiming):
+            if isinstance(decoder.timing, CounterTimedFormat):
                 known = block.ticks[block.ticks != NO_TICK]
                 assert ((known >= 0) & (known < decoder.timing.modulus)).all(), "a count outside its turn"
-            if not isinstance(decoder.timing, SenderTiming):
+            if not isinstance(decoder.timing, SenderTimedFormat):
                 assert set(block.t_ns.tolist()) <= arrivals, "a time at which nothing arrived"
             out.append(block)
         assert decoder.bad >= bad
-        assert isinstance(decoder.hint, str)
-        assert len(decoder.hint) < 1000
+        assert isinstance(decoder.recent_problem, str)
+        assert len(decoder.recent_problem) < 1000
     return out
 
 

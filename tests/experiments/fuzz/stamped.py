@@ -1,6 +1,6 @@
 """A ``SampleClock`` under watch: what must hold of the times it gives and of what it calls missing."""
 
-from drivers.sample import SampleBlock, SenderTiming, Timing
+from drivers.sample import SampleBlock, SenderTimedFormat, Timing
 from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
 from tests.experiments.fuzz.checks import LARGEST_LOSS
@@ -14,7 +14,7 @@ class Stamped:
 
     def __init__(self, timing: Timing, rate_hz: float | None) -> None:
         self.clock = SampleClock(timing, rate_hz)
-        self._given = isinstance(timing, SenderTiming)
+        self._given = isinstance(timing, SenderTimedFormat)
         self._rows = self._passed = 0
         self._told = self._missing = 0  # by the decoder; by the clock
         self._first_ns: int | None = None
@@ -34,7 +34,7 @@ class Stamped:
             self._passed += len(one)
             self._missing += one.lost
             self._times(block, one)
-        kept_out = self.clock.repeated_rows + self.clock.late_rows
+        kept_out = self.clock.dropped_repeated_rows + self.clock.dropped_late_rows
         assert self._passed + kept_out == self._rows, "a row is gone, or came twice"
         self._missing_is_possible()
         rate = self.clock.rate_hz

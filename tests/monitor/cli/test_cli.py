@@ -25,8 +25,8 @@ import pytest
 from drivers.recordings import save_samples
 from drivers.sample import AXES
 from monitor.cli import main, report_failed_thread
-from monitor.common.config_files import CONFIG_FOLDER
-from monitor.noise.catalogue import read_model
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.noise.model_catalogue import read_model
 from monitor.settings.loading import load
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
@@ -285,7 +285,7 @@ def test_check_accepts_every_shipped_file(call: Call, recording: Path, name: str
     shutil.copy(recording, "recording.csv")  # the one that replay.toml names
     said = call("check", name)
     assert (said.status, said.err) == (0, "")
-    assert "nothing wrong" in said.out
+    assert "no mistakes" in said.out
 
 
 def test_check_accepts_the_defaults_that_it_prints(call: Call) -> None:
@@ -293,7 +293,7 @@ def test_check_accepts_the_defaults_that_it_prints(call: Call) -> None:
     assert (printed.status, printed.err) == (0, "")
     Path("defaults.toml").write_text(printed.out)
     said = call("check", "defaults.toml")
-    assert (said.status, said.out, said.err) == (0, "defaults.toml: 1 device, nothing wrong\n", "")
+    assert (said.status, said.out, said.err) == (0, "defaults.toml: 1 device, no mistakes\n", "")
 
 
 def test_check_prints_the_keys_of_one_link_and_one_decoder(call: Call) -> None:
@@ -339,7 +339,10 @@ WRONG_ARGUMENTS = {
     "bad viewer": (("demo", "--viewer", "nativ"), '--viewer: "nativ"; possible are native, auto, '),
     "bad seconds": (("demo", "--seconds", "soon"), "Invalid value for '--seconds'"),
     "no seconds": (("demo", "--seconds", "0"), "--seconds: 0 s is outside the supported range"),
-    "bad endpoint": (("watch", "--connect", "7450"), 'connect "7450": no endpoint; write e.g. tcp/127.0.0.1:7450'),
+    "bad endpoint": (
+        ("watch", "--connect", "7450"),
+        'connect "7450": not a valid endpoint; an example is tcp/127.0.0.1:7450',
+    ),
     "bad key": (("watch", "##", "--connect", "tcp/127.0.0.1:9"), 'key expression "##"'),
     "bad rate": (("analyze", "x.csv", "--rate", "-1"), "--rate: -1 Hz is outside the supported range"),
     "no rate": (("analyze", "x.csv", "--rate", "nan"), "--rate"),
@@ -470,7 +473,7 @@ WRONG_MODELS = {
     ),
     "unknown key": ("sample_rat = 100.0\n", 'unknown key "sample_rat"; did you mean "sample_rate"?'),
     "unknown table": ("[temprature]\nmean = 25.0\n", 'unknown axis "temprature"; did you mean "temperature"?'),
-    "no axis": ("", "names no axis"),
+    "no axis": ("", "the model has no axis"),
     "no TOML": ("[gz", "not TOML"),
 }
 
@@ -507,7 +510,7 @@ def test_a_model_without_a_rate_asks_for_one(call: Call) -> None:
     Path("m.toml").write_text("[gz.angle_random_walk]\nN = 1e-3\n")
     said = call("simulate", "m.toml", "--seconds", "1min", "--out", "x.csv")
     assert said.status == 2
-    assert "m.toml: has no sample_rate; give one with --rate HZ" in said.only_line()
+    assert "m.toml: the model has no sample_rate; set the rate with --rate HZ" in said.only_line()
     said = call(
         "simulate", "m.toml", "--seconds", "1min", "--out", "x.csv", "--rate", "20", "--seed", "5", "--json", "-"
     )
@@ -1114,10 +1117,10 @@ def counted(self, *arguments):
     caught = Caught()
     self.outputs.append(caught)
     run(self, *arguments)
-    truth = self.virtual["demo"].truth
+    truth = self.workers[0].simulated.fault_counts
     if "demo" in caught.blocks:
         numbers = (concatenate_blocks(caught.blocks["demo"]).ticks // 10_000_000).tolist()
-        print(json.dumps([numbers, truth.made, truth.dropped]), file=sys.stderr)
+        print(json.dumps([numbers, truth.sample_count, truth.dropped]), file=sys.stderr)
 monitor.daemon.service.Service.run = counted
 sys.argv[0] = "imu-monitor"
 sys.exit(main())
@@ -1285,8 +1288,8 @@ def test_history_of_a_span_and_a_step_by_its_configuration(call: Call, histories
 @pytest.mark.parametrize(
     ("arguments", "status", "line"),
     [
-        ((), 2, "CONFIG.toml or a folder is missing"),
-        (("{kept}",), 2, "choose with --device: bench-1, bench-2"),
+        ((), 2, "CONFIG.toml or a folder is needed"),
+        (("{kept}",), 2, "choose one with --device: bench-1, bench-2"),
         (("{kept}", "--device", "bench-3"), 2, 'did you mean "bench-'),
         (("{kept}", "--device", "bench-1", "--from", "-1h"), 3, "nothing in that time; kept are 2025-11-21 00:00:00"),
         (("{kept}", "--from", "soon"), 2, '--from: "soon" is no time'),
@@ -1312,7 +1315,7 @@ def test_a_view_of_what_is_not_kept_is_refused(call: Call, tmp_path: Path) -> No
     (tmp_path / "c.toml").write_text(VIRTUAL + QUIET)
     said = call("run", "c.toml", "--history", "1d")
     assert said.status == 2
-    assert said.only_line() == "imu-monitor: --history: there is no history to show; add folder to [storage]\n"
+    assert said.only_line() == "imu-monitor: --history: there is no history to show; set folder in [storage]\n"
     assert "no duration" in call("run", "c.toml", "--history", "long").only_line()
 
 
@@ -1320,7 +1323,7 @@ def test_history_without_storage_is_said(call: Call, tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text(VIRTUAL)
     said = call("history", "c.toml")
     assert said.status == 2
-    assert "[storage] folder is missing" in said.only_line()
+    assert "[storage] has no folder" in said.only_line()
 
 
 def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path) -> None:
@@ -1341,7 +1344,7 @@ def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path
         there = call("history", str(histories), "--device", "bench-1", "--json", "-", *span)
         nothing = call("history", "--connect", endpoint, "--from", "2000-01-01", "--to", "2000-01-02")
     finally:
-        service.stop()
+        service.request_stop()
         thread.join(PATIENCE_S)
     assert not thread.is_alive()
     told, kept = json.loads(said.out), json.loads(there.out)
@@ -1365,7 +1368,7 @@ def test_history_of_a_running_daemon(call: Call, histories: Path, tmp_path: Path
         (ValueError("x" * 9000), 1, " …; please report it"),
         (RecursionError("too deep"), 1, "internal error: RecursionError: too deep"),
         (MemoryError("Unable to allocate 233. GiB"), 1, "not enough memory (Unable to allocate 233. GiB); read less"),
-        (MemoryError(), 1, "not enough memory; read less at once"),
+        (MemoryError(), 1, "not enough memory; read less data"),
         (PermissionError(13, "Permission denied", "a.csv"), 1, "Permission denied: 'a.csv'"),
     ],
     ids=lambda value: type(value).__name__,

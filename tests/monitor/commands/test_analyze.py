@@ -129,7 +129,7 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
         page = (tmp_path / "x.html").read_text("utf-8")
         assert "gy †" in page
         assert "gx †" not in page
-        assert "† its slow part is temperature" in page
+        assert "† slow variance due to temperature" in page
 
 
 @pytest.mark.long
@@ -184,5 +184,5 @@ def test_an_analysis_beyond_the_memory_is_one_line(recording: Path, monkeypatch:
         raise MemoryError
 
     monkeypatch.setattr(analyze, "analyze", fail)
-    with pytest.raises(ConfigError, match=r"x\.npz: the analysis needs more memory than is free; take the end alone"):
+    with pytest.raises(ConfigError, match=r"x\.npz: the analysis needs more memory than is free; use only the end"):
         run_analysis(Request(recording))

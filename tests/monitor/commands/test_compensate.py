@@ -31,7 +31,7 @@ def test_the_recording_comes_out_without_its_drift(tmp_path, capsys):
     plot, told = tmp_path / "a.png", tmp_path / "a.json"
     assert exit_status("compensate", recording, "--out", out, "--json", told, "--plot", plot) == 0
     text = capsys.readouterr().out
-    assert "adaptive; judged on" in text
+    assert "adaptive; evaluated on" in text
     assert "→" in text
     before, after = load_samples(recording), load_samples(out)
     assert after.axes == ("gx", "gz", "az")
@@ -93,11 +93,11 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, capsys):
         ([recording, "--method", "adaptve"], 2, 'did you mean "adaptive"?'),
         ([recording, "--order", "3,1"], 2, "possible are 0,0 1,0 1,1 2,0 2,1"),
         ([tmp_path / "none.npz"], 2, "none.npz"),
-        ([tmp_path / "b.npz"], 2, "no gyro axis in it"),
+        ([tmp_path / "b.npz"], 2, "there is no gyro axis"),
         ([tmp_path / "c.npz"], 3, "never at rest"),
         ([recording, "--rate", "-1"], 2, "is outside the supported range"),
         ([recording, "--plot", tmp_path / "a.pdf"], 2, "ending in .png"),
-        ([recording, "--json", out], 2, "is what --out writes"),
+        ([recording, "--json", out], 2, "is also the output file of --out"),
     ):
         assert exit_status("compensate", *arguments, "--out", out) == status
         err = capsys.readouterr().err
@@ -105,4 +105,4 @@ def test_what_is_wrong_is_one_line_and_nothing_is_written(tmp_path, capsys):
         assert err.count("\n") == 1
         assert not out.exists()
     assert exit_status("compensate", recording, "--out", recording) == 2
-    assert "is what --out writes" in capsys.readouterr().err
+    assert "is also the output file of --out" in capsys.readouterr().err

@@ -16,15 +16,23 @@ import pytest
 
 from drivers.driver import AxisMap
 from drivers.recordings import segment
-from drivers.recordings.segment import DaemonState, SegmentWriter
+from drivers.recordings.segment import DaemonState, SingleSegmentWriter
 from drivers.sample import make_block
 from monitor.commands import doctor
-from monitor.commands.doctor import SAMPLE_BYTES, Finding, bytes_a_day, disk_space, examine, satisfies, worst_mark
+from monitor.commands.doctor import (
+    SAMPLE_BYTES,
+    Finding,
+    check_disk_space,
+    examine,
+    recorded_bytes_per_day,
+    version_satisfies,
+    worst_mark,
+)
 from monitor.common.compiled import cache_folder
-from monitor.common.config_files import CONFIG_FOLDER
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, FolderLock
-from monitor.daemon.storage.recorder import origin
-from monitor.noise.catalogue import read_model
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.daemon.storage.recorder import segment_metadata
+from monitor.noise.model_catalogue import read_model
 from monitor.settings import loading
 from monitor.settings.loading import Storage
 from tests.support.waiting import PATIENCE_S
@@ -209,7 +217,7 @@ def test_ports_that_are_taken_and_routers_that_do_not_answer_are_told(tmp_path: 
 
 @pytest.mark.parametrize("endpoint", ["tcp/127.0.0.1:99999", f"tcp/{'a' * 70}.example:1", "tcp/192.0.2.1:7447"])
 def test_an_address_that_cannot_be_listened_on_is_wrong(endpoint: str) -> None:
-    (found,) = doctor.port_is_free("zenoh", endpoint)
+    (found,) = doctor.check_port_free("zenoh", endpoint)
     assert found.mark == "wrong"
     assert found.text.startswith(f"{endpoint}: cannot listen: ")
 
@@ -239,13 +247,14 @@ def test_a_rate_that_is_not_configured_leaves_the_disk_unjudged(tmp_path: Path) 
     found = examined(tmp_path, text)
     assert "disk use per day unknown" in str(of(found, "storage"))
     config = loading.load(tmp_path / "c.toml")
-    assert bytes_a_day(config) is None
+    assert recorded_bytes_per_day(config) is None
 
 
 def test_room_is_judged_by_days(tmp_path: Path) -> None:
     own = Storage(folder=tmp_path, keep_s=30 * 86400.0, disk_share=0.9)
     marks = [
-        disk_space(own, 1e9, 100_000_000_000, free)[0] for free in (90_000_000_000, 25_000_000_000, 10_500_000_000)
+        check_disk_space(own, 1e9, 100_000_000_000, free)[0]
+        for free in (90_000_000_000, 25_000_000_000, 10_500_000_000)
     ]
     assert [one.mark for one in marks] == ["well", "doubt", "wrong"]
     assert "the oldest data will be deleted after about 15 days" in marks[1].text
@@ -259,7 +268,7 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
     rng = np.random.default_rng(1)
     t_ns = 1_760_000_000_000_000_000 + np.arange(60_000) * 10_000_000 + rng.integers(-1000, 1000, 60_000)
     temperature = np.round(25.0 + 0.01 * rng.standard_normal(60_000), 2)
-    writer = SegmentWriter(tmp_path / segment.segment_name(1, 1.76e9), origin("a", AxisMap()))
+    writer = SingleSegmentWriter(tmp_path / segment.format_segment_name(1, 1.76e9), segment_metadata("a", AxisMap()))
     for at in range(0, 60_000, 50):
         rows = slice(at, at + 50)
         ticks = np.arange(at, at + 50) * 10
@@ -276,9 +285,9 @@ def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
 
 
 def test_the_libraries_here_are_those_that_are_required() -> None:
-    found = doctor.check_libraries()
+    found = doctor.check_library_versions()
     assert [one.mark for one in found] == ["well"], found
-    required = {name: optional for name, _, optional in doctor.requirements()}
+    required = {name: optional for name, _, optional in doctor.required_libraries()}
     assert required["numpy"] is False
     assert required["rerun-sdk"] is True
     assert "pytest" not in required
@@ -295,7 +304,7 @@ def test_the_libraries_here_are_those_that_are_required() -> None:
     ],
 )
 def test_versions_are_compared_by_their_numbers(version: str, wanted: str, fits: bool) -> None:
-    assert satisfies(version, wanted) is fits
+    assert version_satisfies(version, wanted) is fits
 
 
 @pytest.mark.long
@@ -338,7 +347,7 @@ def test_the_clock_is_asked_and_an_answer_given() -> None:
     ],
 )
 def test_the_unit_is_judged_by_what_systemd_says(seen: dict[str, str], mark: str) -> None:
-    assert [one.mark for one in doctor.unit_state({"LoadState": "loaded", **seen})] == [mark]
+    assert [one.mark for one in doctor.check_unit_state({"LoadState": "loaded", **seen})] == [mark]
 
 
 # --- the command

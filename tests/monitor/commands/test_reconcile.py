@@ -12,8 +12,9 @@ import pytest
 
 from drivers.errors import ConfigError, NotReady, RecordingError
 from monitor.cli import main
-from monitor.commands import reconcile, simulate
-from monitor.commands.reconcile import ComparisonRequest, compare_recordings, unique_names
+from monitor.commands import reconcile
+from monitor.commands import simulate_recording as simulate
+from monitor.commands.reconcile import ComparisonRequest, compare_recordings, unique_recording_names
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, BiasStep, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import Reconciliation
@@ -116,7 +117,7 @@ def test_without_a_model_that_of_the_first_is_for_all(tmp_path: Path) -> None:
     assert first.fitted_first
     assert not second.fitted_first
     assert second.baseline == first.baseline == found.baseline
-    assert second.notes[0] == "The model under test are the five terms of a."
+    assert second.notes[0] == "The model under test consists of the five noise terms of a."
     assert "five classic terms, fitted to a" in (tmp_path / "out" / "report.html").read_text()
     assert report(tmp_path / "out")["fitted_to"] == "a"
     assert [what for what in told if "reading" in what] == ["a, 1 of 2: reading", "b, 2 of 2: reading"]
@@ -144,7 +145,7 @@ def test_two_answers_at_least_are_needed(tmp_path: Path) -> None:
     status, said, complaint = command("reconcile", *paths, "--out", tmp_path / "out", "--json", answer_file)
     assert (status, said) == (3, "")
     assert complaint.startswith(
-        "imu-monitor: two recordings at least are compared with each other, and 0 can be: short: "
+        "imu-monitor: at least two recordings are needed for a comparison, but only 0 can be evaluated: short: "
     )
     answer = json.loads(answer_file.read_bytes())
     assert answer == report(tmp_path / "out")
@@ -154,8 +155,8 @@ def test_two_answers_at_least_are_needed(tmp_path: Path) -> None:
 
 def test_names_are_those_of_the_files_and_differ(tmp_path: Path) -> None:
     paths = [Path("a/run.csv"), Path("b/run.csv.gz"), Path("c/RUN.NPZ"), Path("d/run-2.csv"), tmp_path / "segments"]
-    assert list(unique_names(paths)) == ["run", "run-2", "RUN", "run-2-2", "segments"]
-    assert list(unique_names([Path(".csv"), Path("x.parquet")])) == [".csv", "x"]
+    assert list(unique_recording_names(paths)) == ["run", "run-2", "RUN", "run-2-2", "segments"]
+    assert list(unique_recording_names([Path(".csv"), Path("x.parquet")])) == [".csv", "x"]
 
 
 def test_what_cannot_be_compared_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,9 +188,9 @@ def test_one_recording_is_reported_as_before(tmp_path: Path) -> None:
 
 def test_the_first_without_an_answer_ends_it_where_the_model_was_to_be_its(tmp_path: Path) -> None:
     paths = (recorded(tmp_path / "s.csv", KNOWN, 1, 2.0), recorded(tmp_path / "t.csv", KNOWN, 1, 2.0))
-    with pytest.raises(NotReady, match=r"0 can be: s: the recording has 200 samples"):
+    with pytest.raises(NotReady, match=r"0 can be evaluated: s: the recording has 200 samples"):
         compare_recordings(ComparisonRequest(paths, None, tmp_path / "out"))
     with pytest.raises(
-        NotReady, match=r"0 can be: s: the recording has 200 samples.*; t: the recording has 200 samples"
+        NotReady, match=r"0 can be evaluated: s: the recording has 200 samples.*; t: the recording has 200 samples"
     ):
         compare_recordings(ComparisonRequest(paths, KNOWN, tmp_path / "out"))

@@ -47,7 +47,7 @@ def test_fit_then_predict_another_start(tmp_path, capsys):
 def test_the_model_file_comes_back_as_it_went(tmp_path):
     study = thermal.fit_recording(write(tmp_path / "a.npz", 3), 3600.0)
     path = tmp_path / "m.json"
-    path.write_bytes(thermal.write_model_file(study))
+    path.write_bytes(thermal.encode_model_file(study))
     one, other = study.fits["gz"].model, thermal.read_model_file(path)["gz"]
     written = json.loads(path.read_bytes())
     assert written["schema"] == "imu-monitor/thermal-model/1"
@@ -65,19 +65,19 @@ def test_hardly_moved_is_no_answer_and_says_so(tmp_path, capsys):
     np.savez(path, fs=1.0, gz=1e-5 * rng.standard_normal(n), temp=25.0 + 0.01 * rng.standard_normal(n))
     out = tmp_path / "out.json"
     assert exit_status("thermal", "fit", path, "--json", out) == 3
-    assert "temperature hardly moved" in capsys.readouterr().err
-    assert "temperature hardly moved" in json.loads(out.read_bytes())["refused"]["gz"]
+    assert "temperature hardly changed" in capsys.readouterr().err
+    assert "temperature hardly changed" in json.loads(out.read_bytes())["refused"]["gz"]
 
 
 def test_no_temperature_is_said(tmp_path, capsys):
     path = tmp_path / "none.npz"
     np.savez(path, fs=1.0, gz=np.arange(100.0))
     assert exit_status("thermal", "fit", path) == 2
-    assert "no temperature in it" in capsys.readouterr().err
+    assert "there is no temperature" in capsys.readouterr().err
 
 
 def good(tmp_path):
-    return json.loads(thermal.write_model_file(thermal.fit_recording(write(tmp_path / "a.npz", 3), 3600.0)))
+    return json.loads(thermal.encode_model_file(thermal.fit_recording(write(tmp_path / "a.npz", 3), 3600.0)))
 
 
 @pytest.mark.parametrize(
@@ -85,9 +85,9 @@ def good(tmp_path):
     [
         (lambda m: m.update(schema="imu-monitor/thermal-model/9"), 'schema "imu-monitor/thermal-model/9"'),
         (lambda m: m.update(interval=0.0), "interval: 0 s"),
-        (lambda m: m["axes"].clear(), "no axis in it"),
+        (lambda m: m["axes"].clear(), "there is no axis in the file"),
         (lambda m: m["axes"].update(gq=m["axes"].pop("gz")), "axes.gq: no such axis"),
-        (lambda m: m["axes"]["gz"].update(sizes=[1.0]), "axes.gz: sizes: 1 of them"),
+        (lambda m: m["axes"]["gz"].update(sizes=[1.0]), "axes.gz: sizes: 1 values"),
         (lambda m: m["axes"]["gz"].update(time_constants=[-1.0]), "axes.gz: time_constants"),
         (lambda m: m["axes"]["gz"].update(temperature=[25.0, 25.0]), "axes.gz: temperature"),
         (lambda m: m["axes"]["gz"].update(phi=1.0), "axes.gz: phi: 1"),

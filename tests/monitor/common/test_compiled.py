@@ -2,6 +2,7 @@
 
 import gc
 import inspect
+import os
 import subprocess
 import sys
 import textwrap
@@ -60,7 +61,38 @@ def test_cached_code_is_stale_when_what_it_calls_has_changed(tmp_path):
 def test_the_stamp_of_a_kernel_covers_the_files_it_calls():
     imported = [package for package, *_ in IMPORT_STATEMENT.findall(Path(inspect.getfile(fit_kernel)).read_text())]
     assert imported.count("monitor.estimation.fit.term_selection") == 1
-    assert fit_kernel.fit_axes._cache._cache_file._source_stamp[1] == source_hash(Path(inspect.getfile(fit_kernel)))
+    assert fit_kernel.fit_axes._cache._cache_file._version.endswith(source_hash(Path(inspect.getfile(fit_kernel))))
+
+
+def test_a_cache_that_names_a_type_of_an_earlier_revision_is_replaced(tmp_path):
+    root = Path(monitor.common.compiled.__file__).parents[2]
+    revision = """
+        from typing import NamedTuple
+        from monitor.common.compiled import compiled
+
+        class {0}(NamedTuple):
+            left: float
+
+        @compiled
+        def double(pair):
+            return pair.left + pair.left
+
+        assert double({0}(21.0)) == 42.0
+        print(len(double._cache_hits))
+    """
+
+    def run_revision(name: str) -> str:
+        (tmp_path / "kernels.py").write_text(textwrap.dedent(revision.format(name)))
+        command = [sys.executable, "-c", "import kernels"]
+        paths = os.pathsep.join((str(tmp_path), str(root)))
+        environment = os.environ | {"PYTHONPATH": paths}
+        done = subprocess.run(
+            command, env=environment, cwd=tmp_path, timeout=PATIENCE_S, check=False, capture_output=True, text=True
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
+
+    assert [run_revision(name) for name in ("Pair", "Pair", "Couple", "Couple")] == ["0", "1", "0", "1"]
 
 
 def test_machine_code_is_generated_only_for_the_kernel_that_python_calls():

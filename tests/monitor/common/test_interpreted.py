@@ -87,7 +87,7 @@ def results(seed: int) -> list[Any]:
             estimator.update(part)
         for restart in watch.take_restarts():
             estimator.restart(restart.axis, restart.samples)
-        found += [compensation.update(samples).values, compensation.take()]
+        found += [compensation.update(samples).values, compensation.take_updates()]
         if rng.random() < 0.2 and estimator.samples_in_window >= MIN_SAMPLES:
             found.append(estimator.get())
     found += [estimator.step_slow_statistics() for _ in range(3)]

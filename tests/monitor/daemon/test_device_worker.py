@@ -16,7 +16,7 @@ from monitor.daemon.device import device_worker
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import DriftUpdate
-from monitor.drift.thermal.live_thermal import ThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficients import Status
@@ -38,25 +38,30 @@ class Caught:
         self.rates, self.drifts = [], []
         self.total_times, self.health_times = [], []
 
-    def samples(self, device, received, samples, offset_ns):
+    def publish_samples(self, device, received, samples, offset_ns):
         self.blocks.append(samples)
         self.counts.append(received)
 
-    def result(self, device, unix_s, received, result):
-        kept = {Estimate: self.estimates, ModelGap: self.gaps, ThermalUpdate: self.thermals, DriftUpdate: self.drifts}
+    def publish_result(self, device, unix_s, received, result):
+        kept = {
+            Estimate: self.estimates,
+            ModelGap: self.gaps,
+            ThermalIntervalResult: self.thermals,
+            DriftUpdate: self.drifts,
+        }
         if isinstance(result, SlowStatistics):
             self.totals.append((received, *result))
             self.total_times.append(unix_s)
         else:
             kept[type(result)].append((unix_s, result))
 
-    def compensated(self, device, received, samples, offset_ns):
+    def publish_compensated_samples(self, device, received, samples, offset_ns):
         self.rates.append(samples)
 
-    def event(self, device, unix_s, received, event):
+    def publish_event(self, device, unix_s, received, event):
         self.events.append((unix_s, event))
 
-    def health(self, device, unix_s, health):
+    def publish_health(self, device, unix_s, health):
         self.healths.append(health)
         self.health_times.append(unix_s)
 
@@ -112,7 +117,7 @@ class Rig:
         self.station._push(samples)
 
     def work(self, now_s, drain=False):
-        self.station.work(now_s, drain)
+        self.station.process_new_samples(now_s, drain)
 
     def finish_models(self):
         """Wait for the thread that finds a model of drift: samples come far faster here than those of a sensor."""
@@ -145,7 +150,7 @@ def test_a_running_device_whose_can_frames_are_late_says_so():
         delay_ns = i % 2 * (8_000_000 if i // 2 == 30 else 1_000_000)
         rig.link.write(replace(chunk, t_ns=chunk.t_ns + delay_ns))
     rig.station.driver.step()
-    health = rig.station.status.health({}, 0)
+    health = rig.station.status.build_health({}, 0)
     assert health.state == "running"
     assert (health.received, health.bad, health.lost, health.late) == (49, 0, 1, 1)
     assert health.text == (
@@ -251,7 +256,7 @@ def test_a_rate_known_better_is_the_new_label():
     for _ in range(60_000):
         t_ns += 10_000_000
         rig.station.clock.assign_times(make_block(np.array([t_ns]), np.zeros((1, 6))))
-    rig.station.publish_status({}, 0)
+    rig.station.slew_and_publish_status({}, 0)
     rig.bring(1)
     rig.work(1001.0, drain=True)
     after = rig.caught.estimates[-1][1]
@@ -263,10 +268,10 @@ def test_a_rate_known_better_is_the_new_label():
 
 def test_reset_empties_the_window():
     rig = Rig()
-    rig.station.reset()
+    rig.station.empty_window()
     rig.bring(500)
     rig.work(1000.0, drain=True)
-    rig.station.reset()
+    rig.station.empty_window()
     rig.bring(30)
     rig.work(1001.0, drain=True)
     assert rig.caught.estimates[-1][1].curve.n == 30
@@ -291,22 +296,22 @@ def test_a_tau_that_does_not_fit_the_rate_found_is_said_and_samples_go_on():
     assert sum(map(len, rig.caught.blocks)) == 300
     assert rig.caught.estimates == []
     rig.station.driver.state, rig.station.driver.text = "running", ""
-    assert "tau: none of [5.0] s" in rig.station.status.health({}, 0).text
+    assert "tau: none of [5.0] s" in rig.station.status.build_health({}, 0).text
 
 
 def test_latency_counts_from_the_oldest_unpublished_sample():
     rig = Rig(refit_s=10.0, publish_s=10.0)
     rig.bring(10)
     rig.work(1000.0)  # goes out at once
-    rig.station.status.health({}, 0)
+    rig.station.status.build_health({}, 0)
     rig.bring(1)
     rig.work(1000.01)  # taken, but its batch waits
     time.sleep(0.05)
     rig.bring(1)
     rig.work(1000.2)
-    health = rig.station.status.health({}, 0)
+    health = rig.station.status.build_health({}, 0)
     assert health.latency_p50_s >= 0.05
-    assert rig.station.status.health({}, 0).latency_p50_s is None
+    assert rig.station.status.build_health({}, 0).latency_p50_s is None
 
 
 def test_overflow_is_counted_and_travels_as_loss():
@@ -315,7 +320,7 @@ def test_overflow_is_counted_and_travels_as_loss():
     rig.bring(capacity)
     rig.bring(100)
     rig.work(1000.0, drain=True)
-    assert rig.station.status.health({}, 0).overflowed == 100
+    assert rig.station.status.build_health({}, 0).overflowed == 100
     assert rig.caught.blocks[0].lost == 100
     assert sum(map(len, rig.caught.blocks)) == capacity
 
@@ -329,13 +334,13 @@ def test_through_the_reader_s_thread_to_the_end_of_a_replay():
         rig.link.write(chunk.data)
     rig.link.end()
     rig.station.start()
-    wait_for(lambda: rig.work(time.monotonic()) or rig.station.ended, "the end of the replay")
+    wait_for(lambda: rig.work(time.monotonic()) or rig.station.replay_finished, "the end of the replay")
     rig.station.stop()
     assert rig.station.join(PATIENCE_S)
     rig.work(time.monotonic(), drain=True)
     assert sum(map(len, rig.caught.blocks)) == 400
     assert rig.caught.estimates[-1][1].samples == 400
-    assert rig.station.publish_status({"zenoh": "ok"}, 7).received == 400
+    assert rig.station.slew_and_publish_status({"zenoh": "ok"}, 7).received == 400
     assert (rig.caught.healths[-1].state, rig.caught.healths[-1].memory_bytes) == ("ended", 7)
     assert rig.wake.is_set()
     # Unix time of samples stamped by the monotonic clock
@@ -350,9 +355,9 @@ def test_a_rate_off_the_configured_one_is_said():
     said = (
         "measured rate 50 Hz differs from the configured 100 Hz; coefficients are withheld: correct `rate` or remove it"
     )
-    assert rig.station.status.health({}, 0).text == said
+    assert rig.station.status.build_health({}, 0).text == said
     rig.station.driver.state, rig.station.driver.text = "ended", "x.csv: the end of the file."
-    assert rig.station.status.health({}, 0).text == f"x.csv: the end of the file; {said}"
+    assert rig.station.status.build_health({}, 0).text == f"x.csv: the end of the file; {said}"
 
 
 def stamp(rig, n, rate_hz, rng):
@@ -374,7 +379,7 @@ def test_nothing_is_estimated_by_a_rate_that_the_device_contradicts(tmp_path):
         stamp(rig, 50, 100.0, rng)
         rig.bring(50)
         rig.work(1000.0 + i)
-    rig.station.publish_status({}, 0)
+    rig.station.slew_and_publish_status({}, 0)
     rig.work(1100.0, drain=True)
     estimates = [estimate for _, estimate in rig.caught.estimates]
     assert len(estimates) > 10
@@ -401,7 +406,7 @@ def test_a_rate_that_is_nearly_right_is_estimated_by():
     assert Status.ESTIMATED in statuses(last)
     assert last.rate_hz == 100.2
     rig.station.driver.state, rig.station.driver.text = "running", ""
-    assert rig.station.status.health({}, 0).text == ""
+    assert rig.station.status.build_health({}, 0).text == ""
 
 
 def test_a_rate_within_an_oscillator_s_tolerance_gives_way_to_the_measured_one():
@@ -411,7 +416,7 @@ def test_a_rate_within_an_oscillator_s_tolerance_gives_way_to_the_measured_one()
         stamp(rig, 50, 98.8, rng)
         rig.bring(50)
         rig.work(1000.0 + i)
-        rig.station.publish_status({}, 0)
+        rig.station.slew_and_publish_status({}, 0)
     _, last = rig.caught.estimates[-1]
     assert Status.ESTIMATED in statuses(last)
     assert last.rate_hz == pytest.approx(98.8, rel=2e-3)
@@ -457,17 +462,17 @@ def test_a_replay_has_ended_when_its_samples_are_fitted():
     rig.bring(300)
     rig.work(1000.0)
     rig.station.driver.state = "ended"
-    assert not rig.station.ended
+    assert not rig.station.replay_finished
     rig.ready.window.set()
     rig.work(1001.0)
     assert rig.caught.estimates[-1][1].coefficients.status.max() == 0  # the curve alone
-    assert not rig.station.ended
+    assert not rig.station.replay_finished
     rig.ready.fit.set()
     rig.work(1002.0)
     assert rig.caught.estimates[-1][1].coefficients.status.max() > 0
     assert rig.station.pipeline.signal_monitor is None
     rig.ready.all.set()
-    assert rig.station.ended
+    assert rig.station.replay_finished
     rig.bring(10)
     rig.work(1003.0)
     assert rig.station.pipeline.signal_monitor is not None
@@ -481,7 +486,7 @@ def test_at_a_low_rate_everything_is_there_before_the_kernels_are_compiled():
     assert rig.station.pipeline.signal_monitor is not None
     rig.station.driver.state = "running"
     rig.ready.progress = "compiling 2 of 8: fit"
-    assert rig.station.status.health({}, 0).text == "compiling 2 of 8: fit; no sample is lost"
+    assert rig.station.status.build_health({}, 0).text == "compiling 2 of 8: fit; no sample is lost"
 
 
 def test_interpreted_fits_come_once_a_second_and_compiled_ones_as_configured():
@@ -525,7 +530,8 @@ def test_samples_whose_rate_cannot_be_told_go_on():
     assert rig.caught.estimates == []
     rig.station.driver.state, rig.station.driver.text = "running", ""
     assert (
-        rig.station.status.health({}, 0).text == "no estimate: the times of the samples do not show a rate; set `rate`"
+        rig.station.status.build_health({}, 0).text
+        == "no estimate: the times of the samples do not show a rate; set `rate`"
     )
 
 
@@ -657,11 +663,11 @@ def test_a_model_that_is_none_is_said_at_once(tmp_path):
 
 def test_the_samples_of_the_window_and_their_temperature():
     rig = Rig(window_s=5.0)
-    assert rig.station.window_snapshot() is None
+    assert rig.station.copy_window_and_temperature() is None
     for i in range(14):
         rig.bring(50, lost=3 if i == 12 else 0)
         rig.work(1000.0 + 0.1 * i)
-    held, temperature_c = rig.station.window_snapshot()
+    held, temperature_c = rig.station.copy_window_and_temperature()
     values = held.values()
     sent = np.concatenate([samples.values for samples in rig.caught.blocks] + [np.empty((0, 6))])
     assert (len(held), temperature_c.shape) == (500, (500,))
@@ -743,15 +749,15 @@ def test_a_host_clock_that_is_set_is_told_once_and_stands_in_the_status(monkeypa
     rig = Rig()
     rig.station.driver.state, rig.station.driver.text = "running", ""
     host = time.time_ns
-    assert rig.station.publish_status({}, 0).text == ""
+    assert rig.station.slew_and_publish_status({}, 0).text == ""
     monkeypatch.setattr(time, "time_ns", lambda: host() + step_s * 1_000_000_000)
-    texts = [rig.station.publish_status({}, 0).text for _ in range(3)]
+    texts = [rig.station.slew_and_publish_status({}, 0).text for _ in range(3)]
     assert all(status in one for one in texts), texts
     (event,) = [event for _, event in rig.caught.events]
     assert event.kind == "clock_jumped"
     assert event.text.startswith(text)
     monkeypatch.undo()
-    assert rig.station.publish_status({}, 0).text == ""
+    assert rig.station.slew_and_publish_status({}, 0).text == ""
 
 
 def test_a_recording_has_its_own_times_whatever_the_host_does(monkeypatch, tmp_path):
@@ -761,7 +767,7 @@ def test_a_recording_has_its_own_times_whatever_the_host_does(monkeypatch, tmp_p
     rig.station.driver.state, rig.station.driver.text = "running", ""
     host = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: host() + 10**13)
-    assert rig.station.publish_status({}, 0).text == ""
+    assert rig.station.slew_and_publish_status({}, 0).text == ""
     assert rig.caught.events == []
 
 
@@ -773,16 +779,16 @@ def replayed(tmp_path, **more):
 
 def test_before_its_first_sample_a_recording_has_no_time(tmp_path):
     rig = replayed(tmp_path)
-    rig.station.publish_status({}, 0)
+    rig.station.slew_and_publish_status({}, 0)
     rig.station.driver.state = "running"
-    rig.station.publish_status({}, 0)
+    rig.station.slew_and_publish_status({}, 0)
     rig.station.publish_event("recording_stopped", "no room")
     rig.work(1000.0)
     assert rig.caught.health_times == [None, None]
     assert rig.caught.events == []
     rig.bring(10)
     rig.work(1001.0)
-    rig.station.publish_status({}, 0)
+    rig.station.slew_and_publish_status({}, 0)
     assert rig.caught.health_times[2:] == [0.09]
     assert [(at_s, event.text) for at_s, event in rig.caught.events] == [(0.09, "no room")]
     rig.station.driver.state = "lost"
@@ -815,7 +821,7 @@ def test_the_time_of_a_device_with_its_own_clock_goes_on_while_it_is_lost(monkey
 
 def test_before_its_first_sample_a_sensor_has_the_host_s_time():
     rig, begun_s = Rig(), time.time()
-    rig.station.publish_status({}, 0)
+    rig.station.slew_and_publish_status({}, 0)
     rig.station.publish_event("recording_stopped", "no room")
     (health_s,), ((event_s, _),) = rig.caught.health_times, rig.caught.events
     assert begun_s - 1.0 <= health_s <= event_s <= time.time() + 1.0
@@ -825,7 +831,7 @@ def test_slow_statistics_of_a_rebuilt_window_have_its_time(tmp_path):
     rig = replayed(tmp_path)
     index = np.arange(400)
     values = 1e-3 * np.random.default_rng(1).standard_normal((400, 6))
-    rig.station.pipeline.replay(make_block(10**9 + index * 10_000_000, values), RATE)
+    rig.station.pipeline.replay_samples(make_block(10**9 + index * 10_000_000, values), RATE)
     for i in range(10_000):
         rig.work(1000.0 + 100.0 * i)
         if rig.caught.totals:

@@ -19,9 +19,9 @@ from drivers.errors import ConfigError
 from drivers.sample import Event
 from monitor.daemon import reload
 from monitor.daemon.output import Output
-from monitor.daemon.outputs import TableOutput
+from monitor.daemon.output_classes import TableOutput
 from monitor.daemon.service import Service
-from monitor.noise.catalogue import read_model
+from monitor.noise.model_catalogue import read_model
 from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.terminal import live_table
 from monitor.settings import loading
@@ -113,10 +113,10 @@ class Gone(Output):
         self.names: list[str] = []
         self.events: list[tuple[str, str]] = []
 
-    def event(self, device: str, unix_s: float, received: int, event: Any) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Any) -> None:
         self.events.append((device, event.kind))
 
-    def device_removed(self, device: str) -> None:
+    def remove_device(self, device: str) -> None:
         self.names.append(device)
 
 
@@ -128,7 +128,7 @@ def running(path: Path, *outputs: Output) -> Iterator[Service]:
     try:
         yield service
     finally:
-        service.stop()
+        service.request_stop()
         thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
@@ -157,7 +157,7 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
                 "imu/*/coefficients",
                 lambda sample: heard.setdefault(str(sample.key_expr).split("/")[1], []).append(bytes(sample.payload)),
             )
-            service.reload()
+            service.request_reload()
             wait_for(lambda: [station.name for station in service.workers] == ["stays", "comes", "changes"])
             wait_for(lambda: gone.names == ["goes", "changes"])
             heard.clear()
@@ -170,13 +170,13 @@ def test_devices_come_go_and_change_while_the_others_run(tmp_path: Path) -> None
         assert new["stays"] is stations["stays"]
         assert (new["stays"].ring, new["stays"].pipeline.estimator) == (ring, estimator)
         # a simulated sensor on a busy machine drops what it has no time to send; nothing else may be missing
-        assert new["stays"].driver.counts.lost <= service.virtual["stays"].truth.dropped
+        assert new["stays"].driver.counts.lost <= new["stays"].simulated.fault_counts.dropped
         assert new["changes"] is not stations["changes"]
         # what was recorded of it is in its window again
         wait_for(lambda: ("changes", "window_rebuilt") in gone.events)
         assert service.viewer is not None
         assert service.viewer.state == "ok"
-        assert set(service.virtual) == {"stays", "comes", "changes"}
+        assert {one.name for one in service.workers if one.simulated is not None} == {"stays", "comes", "changes"}
     assert not [thread.name for thread in threading.enumerate() if thread.name.startswith(("reader of", "virtual imu"))]
 
 
@@ -187,17 +187,17 @@ def test_new_limits_and_hooks_hold_at_once_and_a_wrong_file_changes_nothing(tmp_
         (station,) = service.workers
         wait_for(lambda: station.publisher.latest is not None and station.publisher.published > 500)
         path.write_text("[[device")
-        service.reload()
+        service.request_reload()
         wait_for(lambda: any(line["event"].startswith("not reloaded") for line in lines))
         limit = '[[device.limit]]\naxes = "a*"\nletter = "N"\nabove = 1e-5\nhold = "1s"\n'
         path.write_text(device("a") + limit + '[[hook]]\non = ["*"]\ncommand = ["/bin/true"]\n' + QUIET)
-        service.reload()
-        wait_for(lambda: station.status.health({}, 0).crossed == ("ax N", "ay N", "az N"))
-        assert service.states()["hook"] == "ok"
+        service.request_reload()
+        wait_for(lambda: station.status.build_health({}, 0).crossed == ("ax N", "ay N", "az N"))
+        assert service.output_states()["hook"] == "ok"
         assert service.workers == [station]
         path.write_text(device("a") + QUIET)
-        service.reload()
-        wait_for(lambda: station.status.health({}, 0).crossed == ())
+        service.request_reload()
+        wait_for(lambda: station.status.build_health({}, 0).crossed == ())
     wrong = [line for line in lines if line["event"].startswith("not reloaded")]
     assert [line["log_level"] for line in wrong] == ["error"]
     assert "not TOML" in wrong[0]["error"]
@@ -247,7 +247,7 @@ def test_reloads_leave_nothing_behind(tmp_path: Path) -> None:
         for i in range(8):
             name = "ba"[i % 2]
             path.write_text(device("stays") + device(name) + rest)
-            service.reload()
+            service.request_reload()
             wait_for(
                 lambda name=name: service.workers[-1].name == name and service.workers[-1].publisher.published > 50
             )
@@ -266,9 +266,9 @@ def test_a_device_that_is_gone_has_no_row() -> None:
     board = DeviceStates()
     table = TableOutput(board)
     for name in ("first", "second"):
-        table.health(name, 0.0, made.health())
-        table.event(name, 0.0, 1, Event("moved", 0, f"{name} was moved"))
-    table.device_removed("first")
+        table.publish_health(name, 0.0, made.health())
+        table.publish_event(name, 0.0, 1, Event("moved", 0, f"{name} was moved"))
+    table.remove_device("first")
     with (console := Console(width=200)).capture() as captured:
         console.print(live_table.device_table(board, 0.0))
     assert "second was moved" in captured.get()

@@ -17,7 +17,7 @@ from drivers.sample import Event
 from monitor.common.health import Health
 from monitor.daemon.kernels import kernel_compilation, kernel_parts
 from monitor.daemon.output import Output
-from monitor.daemon.outputs import TableOutput
+from monitor.daemon.output_classes import TableOutput
 from monitor.daemon.service import Service
 from monitor.estimation.detection.model_gap import ModelGap
 from monitor.estimation.estimate import Estimate
@@ -51,7 +51,7 @@ class Rounds(Output):
     def __init__(self) -> None:
         self.healths = 0
 
-    def health(self, device: str, unix_s: float, health: Health) -> None:
+    def publish_health(self, device: str, unix_s: float, health: Health) -> None:
         self.healths += 1
 
 
@@ -76,7 +76,7 @@ def test_the_page_is_told_once_in_the_log_and_stands_above_the_table(
             with (console := Console(width=200)).capture() as captured:
                 console.print(live_table.device_table(board, time.monotonic()))
         finally:
-            service.stop()
+            service.request_stop()
             thread.join(PATIENCE_S)
     assert not thread.is_alive()
     assert url.startswith("http://127.0.0.1:")
@@ -105,10 +105,10 @@ class Times(Output):
         self.healths: list[tuple[float | None, Health]] = []
         self.events: list[float] = []
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.events.append(unix_s)
 
-    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         self.healths.append((unix_s, health))
 
     def count(self, received: bool) -> int:
@@ -196,16 +196,16 @@ class Estimates(Output):
         self.gaps: list[ModelGap] = []
         self.health_text = ""
 
-    def result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         if isinstance(result, Estimate):
             self.all.append(result)
         elif isinstance(result, ModelGap):
             self.gaps.append(result)
 
-    def event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         self.kinds.add(event.kind)
 
-    def health(self, device: str, unix_s: float | None, health: Health) -> None:
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         self.health_text = health.text
 
 
@@ -306,7 +306,7 @@ def test_a_replay_that_is_stopped_loses_nothing_it_has_counted(tmp_path: Path) -
     thread = threading.Thread(target=service.run)
     thread.start()
     wait_for(lambda: station.publisher.published > 0)
-    service.stop()
+    service.request_stop()
     thread.join(PATIENCE_S)
     assert not thread.is_alive()
     assert station.driver.state != "ended"

@@ -8,11 +8,11 @@ from hypothesis import strategies as st
 from drivers.errors import RecordingError
 from monitor.history.bucket import (
     HistoryRow,
-    RunningExtremes,
+    RunningStatistics,
     merge_rows,
-    pack_statistics,
+    pack_count_min_max_last,
     select_columns,
-    unpack_statistics,
+    unpack_count_min_max_last,
 )
 from tests.monitor.history.made import NAMES, numbers_of, row, same, together
 
@@ -37,7 +37,7 @@ def test_merging_in_any_groups_is_merging_at_once(seed: int, cuts: list[int], co
 def test_what_is_unpacked_is_what_was_packed(seed: int, count: int) -> None:
     names = tuple(f"a{i}" for i in range(count))
     one = row(0, np.random.default_rng(seed), names=names)
-    found = unpack_statistics(pack_statistics(one), count)
+    found = unpack_count_min_max_last(pack_count_min_max_last(one), count)
     for part, expected in zip(found, (one.n, one.low, one.high, one.last), strict=True):
         np.testing.assert_array_equal(part, expected)
 
@@ -45,18 +45,18 @@ def test_what_is_unpacked_is_what_was_packed(seed: int, count: int) -> None:
 @given(data=st.binary(max_size=200), count=st.integers(0, 300))
 def test_bytes_that_were_never_packed_are_said(data: bytes, count: int) -> None:
     with pytest.raises(RecordingError):
-        unpack_statistics(data + b"\xff", max(count, 1))
+        unpack_count_min_max_last(data + b"\xff", max(count, 1))
 
 
 def test_a_small_piece_that_unpacks_to_a_flood_is_refused() -> None:
     flood = row(0, np.random.default_rng(1), names=tuple(f"a{i}" for i in range(4000)), missing=1.0)
     with pytest.raises(RecordingError, match="not 48"):
-        unpack_statistics(pack_statistics(flood), 3)
+        unpack_count_min_max_last(pack_count_min_max_last(flood), 3)
 
 
 @given(st.lists(st.tuples(*[st.floats(width=32, allow_infinity=False)] * 3), min_size=1, max_size=30))
 def test_extremes_are_those_of_the_numbers(looks: list[tuple[float, float, float]]) -> None:
-    seen = RunningExtremes(NAMES)
+    seen = RunningStatistics(NAMES)
     for look in looks:
         seen.add(np.array(look))
     for i in range(3):

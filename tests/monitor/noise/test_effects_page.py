@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from monitor.noise.effect import Transform, parameter_units
+from monitor.noise.effect import Transform, gyro_and_accel_units
 from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER
 from monitor.noise.temperature import Temperature
 from tests.contracts.effect_examples import AXIS, model
@@ -34,15 +34,16 @@ def test_section_is_that_of_the_code(name):
     for f in fields(EFFECTS[name]):
         assert rows[f.name] == " / ".join(dict.fromkeys(f.metadata["units"]))
         assert ("may be absent" in section) == any(g.metadata.get("optional", False) for g in fields(EFFECTS[name]))
-    assert all(re.search(rf"^{what}: .+\.$", section, flags=re.MULTILINE) for what in (r"σ²\(τ\)", r"S\(f\)", "Source"))
+    properties = (r"σ²\(τ\)", r"S\(f\)", "source")
+    assert all(re.search(rf"^\| {what} \| [^|]*\w[^|]* \|$", section, flags=re.MULTILINE) for what in properties)
 
 
 @pytest.mark.parametrize("name", sorted(set(EFFECTS) - {"saturation", "resolution"}))  # those depend on their numbers
 def test_page_says_nan_where_the_code_does(name):
     value = model(name).avar(AXIS, np.array([1.0]), 0.02)[0]
-    assert ("σ²(τ): NaN" in SECTIONS[name]) == bool(np.isnan(value))
+    assert ("| σ²(τ) | NaN |" in SECTIONS[name]) == bool(np.isnan(value))
 
 
 def test_temperature_is_there():
     rows = dict(re.findall(r"^\| `(\w+)` \| ([^|]+) \|", SECTIONS["temperature"], flags=re.MULTILINE))
-    assert rows == {name: unit for name, (unit, _) in parameter_units(Temperature).items()}
+    assert rows == {name: unit for name, (unit, _) in gyro_and_accel_units(Temperature).items()}

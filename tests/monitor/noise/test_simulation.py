@@ -24,11 +24,11 @@ from monitor.noise.effects import (
     Outliers,
     PoissonSteps,
     QuantizationNoise,
+    RandomSampleHold,
     RandomTelegraph,
     RateRamp,
     RateRandomWalk,
     Resolution,
-    SampleHold,
     SampleRateError,
     Saturation,
     ScaleFactor,
@@ -72,7 +72,7 @@ def test_axes_leak_what_they_read_by_themselves():
 
 
 def test_held_samples_are_the_same_ones_with_and_without_a_leak():
-    axis = (AngleRandomWalk(N=1.0), SampleHold(fraction=0.5))
+    axis = (AngleRandomWalk(N=1.0), RandomSampleHold(fraction=0.5))
     model = NoiseModel({"gx": axis, "gy": (Bias(value=0.0),)})
     leaking = model + NoiseModel({"gx": (CrossAxis(source="gy", coefficient=1.0),)})
     np.testing.assert_array_equal(model.simulate(5000, RATE_HZ, 2), leaking.simulate(5000, RATE_HZ, 2))
@@ -121,7 +121,11 @@ def test_what_cannot_be_added_is_said_and_changes_nothing():
     for axis, effect, says in (
         ("gq", Bias(value=1.0), 'unknown axis "gq"'),
         ("gz", Sinusoidal(amplitude=1.0, frequency=60.0), "gz.sinusoidal: frequency must be below 50 Hz"),
-        ("gz", SampleRateError(ratio=2.0), "gz.sample_rate_error: the clock of a stream that runs cannot change"),
+        (
+            "gz",
+            SampleRateError(ratio=2.0),
+            "gz.sample_rate_error: the sample rate error of a running stream cannot change",
+        ),
         ("gz", NoiseStep(time=1.0, ratio=2.0), "gz.noise_step: gz has no angle_random_walk"),
         ("gz", CrossAxis(source="gx", coefficient=2.0), "gz.cross_axis: the model has no effect on its source gx"),
         ("gz", TemperatureBias(coefficient=1.0, reference=2.0), "gz.temperature_bias: no temperature"),
@@ -142,14 +146,14 @@ def test_truth_tells_what_the_seed_decided():
             "gx": (PoissonSteps(rate=2.0, height=3.0),),
             "gy": (RandomTelegraph(amplitude=2.0, dwell_time=0.7),),
             "ax": (Outliers(fraction=0.02, scale=5.0),),
-            "ay": (SampleHold(fraction=0.1), RateRamp(R=1.0)),
+            "ay": (RandomSampleHold(fraction=0.1), RateRamp(R=1.0)),
             "az": (BiasInstability(B=1.0),),
         }
     )
     stream = model.stream(RATE_HZ, 8)
-    assert stream.truth()["gx"]["poisson_steps"][0]["count"] == 0
+    assert stream.drawn_values()["gx"]["poisson_steps"][0]["count"] == 0
     values = stream.draw(10_000)
-    truth = json.loads(json.dumps(stream.truth()))
+    truth = json.loads(json.dumps(stream.drawn_values()))
     assert set(truth) == {"gx", "gy", "gz", "ax", "ay"}
 
     one, other = (line["phase"] for line in truth["gz"]["sinusoidal"])  # a stated phase is in the model
@@ -176,7 +180,7 @@ def test_truth_tells_what_the_seed_decided():
 def test_truth_lists_no_more_than_a_stated_number():
     stream = NoiseModel({"gx": (Outliers(fraction=0.5, scale=1.0),)}).stream(RATE_HZ, 0)
     stream.draw(5000)
-    told = stream.truth()["gx"]["outliers"][0]
+    told = stream.drawn_values()["gx"]["outliers"][0]
     assert told["count"] > 2000
     assert len(told["times"]) == len(told["errors"]) == 1000
 
@@ -185,7 +189,7 @@ def test_dwells_are_exponential_and_either_level_comes_first():
     model = NoiseModel({"gx": (RandomTelegraph(amplitude=2.0, dwell_time=0.5),)})
     stream = model.stream(1000.0, 3)
     stream.draw(400_000)
-    dwells = np.diff(stream.truth()["gx"]["random_telegraph"][0]["times"])
+    dwells = np.diff(stream.drawn_values()["gx"]["random_telegraph"][0]["times"])
     assert kstest(dwells, "expon", args=(0.0, 0.5)).pvalue > 0.001
     firsts = [model.simulate(1, 1000.0, seed)[0, 0] for seed in range(200)]
     assert 70 < np.count_nonzero(np.array(firsts) > 0.0) < 130  # 4.2 deviations of a fair coin
@@ -250,7 +254,7 @@ def test_memory_does_not_grow_with_the_length():
         RateRandomWalk(K=1e-5),
         PoissonSteps(rate=5.0, height=1e-4),
         TemperatureLag(coefficient=1e-5, reference=20.0, time_constant=60.0),
-        SampleHold(fraction=0.01),
+        RandomSampleHold(fraction=0.01),
     )
     model = NoiseModel(dict.fromkeys(AXES, axis), None, Temperature(mean=20.0, wander=1.0, wander_time=9.0))
     stream = model.stream(RATE_HZ, 1)

@@ -17,10 +17,10 @@ from monitor.noise.effects import (
     Narrowband,
     NoiseStep,
     QuantizationNoise,
+    RandomSampleHold,
     RateRamp,
     RateRandomWalk,
     Resolution,
-    SampleHold,
     SampleRateError,
     Saturation,
     ScaleFactor,
@@ -102,7 +102,7 @@ def test_held_samples(source: Source, h):
 
     expected = np.array([r[0], *(held(k) for k in range(1, 130))])
     factors = np.array([1, 2, 5, 20, 60])
-    found = NoiseModel({"gx": (source, SampleHold(fraction=h))}).avar("gx", factors * TAU0_S, TAU0_S)
+    found = NoiseModel({"gx": (source, RandomSampleHold(fraction=h))}).avar("gx", factors * TAU0_S, TAU0_S)
     np.testing.assert_allclose(found, avar_of(expected, factors), rtol=1e-3)
 
 

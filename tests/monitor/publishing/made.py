@@ -6,8 +6,8 @@ import numpy as np
 
 from drivers.sample import AXES
 from monitor.common.health import Health
-from monitor.drift.thermal.live_thermal import ThermalUpdate
-from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
+from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
 from monitor.drift.thermal.recursive_least_squares import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
@@ -100,9 +100,9 @@ def look(found: Estimate | None = None, scale: float = 1.0, **agrees: bool) -> M
     return replace(in_force.compare(found), agrees=agrees)
 
 
-def thermal_look(t_ns: int = 0, bias: float = 3e-4) -> ThermalUpdate:
+def thermal_look(t_ns: int = 0, bias: float = 3e-4) -> ThermalIntervalResult:
     """Ten minutes of a device that measures gz and az; az has no model yet."""
-    gz = AxisThermalUpdate(
+    gz = PredictedAxisInterval(
         bias,
         1e-6,
         PredictionInterval(2e-4, 1e-4, 3e-4),
@@ -111,8 +111,8 @@ def thermal_look(t_ns: int = 0, bias: float = 3e-4) -> ThermalUpdate:
         2e-5,
         "",
     )
-    az = AxisThermalUpdate(9.81, np.nan, None, None, "", np.nan, "temperature hardly moved")
-    return ThermalUpdate(t_ns, 600.0, 25.5, {"gz": gz, "az": az})
+    az = PredictedAxisInterval(9.81, np.nan, None, None, "", np.nan, "temperature hardly changed")
+    return ThermalIntervalResult(t_ns, 600.0, 25.5, {"gz": gz, "az": az})
 
 
 def slow_curves() -> tuple[TotalCurve, HadamardCurve]:

@@ -8,7 +8,7 @@ import pytest
 from monitor.common import topics
 from monitor.publishing import remote_devices
 from monitor.publishing.messages.message import decode_message
-from monitor.publishing.messages.results import CoefficientsMessage, GapMessage, ResetMessage, StatusMessage
+from monitor.publishing.messages.results import CoefficientsMessage, GapMessage, ResetReply, StatusMessage
 from monitor.publishing.remote_devices import DeviceCoefficients, RemoteDevice
 from tests.monitor.publishing import made
 
@@ -54,7 +54,7 @@ def test_a_status_may_have_no_time_yet() -> None:
         b"{}",
         StatusMessage.of("a", 1.0, 0, made.health()).encode().replace(b"status/1", b"status/2"),
         StatusMessage.of("a", 1.0, 0, made.health()).encode().replace(b'"received":360000', b'"received":"many"'),
-        ResetMessage.of("a", 1.0, 5, "x").encode(),
+        ResetReply.of("a", 1.0, 5, "x").encode(),
     ],
 )
 def test_anything_else_is_a_value_error(payload: bytes) -> None:

@@ -25,7 +25,7 @@ def test_each_kind_and_each_message_stands_in_one_row() -> None:
     published = [message for kind in RESULT_KINDS for message in kind.messages]
     assert len(set(published)) == len(published)
     known = {one for one in vars(results).values() if isinstance(one, type) and issubclass(one, Message)}
-    answers = {Message, results.WindowMessage, results.ResetMessage, results.ReconcileMessage}
+    answers = {Message, results.WindowResultMessage, results.ResetReply, results.ReconcileReply}
     assert set(published) == known - answers
 
 

@@ -18,11 +18,11 @@ import zenoh
 
 from drivers.errors import LinkUnavailable, NotReady
 from drivers.links import zenoh_link
-from drivers.zenoh.session import build_session_config
+from drivers.zenoh.session_config import build_session_config
 from monitor.common import topics
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.publishing.messages.results import StatusMessage
-from monitor.publishing.zenoh.history_query import query_histories
+from monitor.publishing.zenoh.history_client import query_histories
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
@@ -111,7 +111,7 @@ def daemon(file: Path) -> Iterator[ZenohPublisher]:
         while not ending.wait(0.1):
             out.put(topics.STATUS, "nose", StatusMessage.of("nose", time.time(), 0, made.health()).encode())
             while not out.commands.empty():
-                out.commands.get_nowait().answer(b'"done"')
+                out.commands.get_nowait().reply_result(b'"done"')
 
     worker = threading.Thread(target=work)
     out.start()
@@ -254,7 +254,7 @@ def test_samples_of_another_daemon_come_through_the_link_with_a_certificate(by_c
 
             def come() -> Any:
                 nose.put("imu/nose/samples", b"batch")
-                return link.read(0.1)
+                return link.poll_chunks(0.1)
 
             assert wait_for(come)[0].data == b"batch"
     finally:

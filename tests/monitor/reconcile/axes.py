@@ -13,10 +13,10 @@ from monitor.noise.model import NoiseModel
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.likelihood.axis import Axis, RegressorCache
-from monitor.reconcile.likelihood.hypothesis import fit_with_given_sizes
+from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
 from monitor.reconcile.preparation.recording import Recording
-from monitor.reconcile.search.axis_preparation import prepare_axes
+from monitor.reconcile.search.axis_repair import build_repaired_axes
 
 RATE_HZ = 100.0
 N, B, K = 1e-4, 2e-5, 2e-6  # rad/√s, rad/s, rad/s/√s
@@ -72,7 +72,7 @@ def axes(
     n = next(iter(values.values())).size
     each = effects if isinstance(effects, Mapping) else dict.fromkeys(values, effects)
     given = Recording(values, RATE_HZ, temperature_c)
-    return prepare_axes(given, each, RegressorCache(n, RATE_HZ, temperature_c), np.random.default_rng(seed))
+    return build_repaired_axes(given, each, RegressorCache(n, RATE_HZ, temperature_c), np.random.default_rng(seed))
 
 
 def axis(y: Floats, effects: tuple[Effect, ...] = (), temperature_c: Floats | None = None) -> Axis:
@@ -82,7 +82,7 @@ def axis(y: Floats, effects: tuple[Effect, ...] = (), temperature_c: Floats | No
 
 def seen(one: Axis, effects: tuple[Effect, ...]) -> WhitenedAxis:
     """Beside a model as it stands."""
-    return whiten_axis(fit_with_given_sizes(one, effects).fit)
+    return whiten_axis(fit_with_fixed_noise(one, effects).fit)
 
 
 def recording(

@@ -7,32 +7,32 @@ from monitor.noise.effect import Effect
 from monitor.noise.effects import EFFECTS, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import (
+    AddedOrResizedEffect,
     AxisResult,
     Decision,
+    DiagnosticGap,
     DiagnosticSnapshot,
     Location,
     ParameterInterval,
-    ReconciliationStep,
     RunnerUp,
-    Score,
 )
 from monitor.reconcile.several_recordings.comparison import NamedResult
 from tests.monitor.reconcile import samples
 
-LENS = Score("lines", Location(frequency=(17.0, 18.0)), 1.2, 2.0, 4.0)
+LENS = DiagnosticGap("lines", Location(frequency=(17.0, 18.0)), 1.2, 2.0, 4.0)
 """What a lens shows of an axis of which nothing is to be said."""
 
 
 def step(
     effect: str, gap: float = 30.0, rivals: Sequence[str] = (), kind: str = "added", **given: ParameterInterval | float
-) -> ReconciliationStep:
+) -> AddedOrResizedEffect:
     """Found through ``LENS`` with that gap; a bare number has an interval of one in a hundred."""
     before = replace(LENS, gap=gap)
     parameters = {
         name: one if isinstance(one, ParameterInterval) else around(one, 0.01 * abs(one)) for name, one in given.items()
     }
-    return ReconciliationStep(
-        before, kind, effect, parameters, 0.99, tuple(RunnerUp(one, 0.01) for one in rivals),  # type: ignore[arg-type]
+    return AddedOrResizedEffect(
+        kind, effect, parameters, 0.99, tuple(RunnerUp(one, 0.01) for one in rivals),  # type: ignore[arg-type]
         before, LENS, None, None, "made by hand", "it was made by hand", DiagnosticSnapshot((LENS,), ()),
     )  # fmt: skip
 
@@ -41,7 +41,7 @@ def around(value: float, half: float) -> ParameterInterval:
     return ParameterInterval(value, value - half, value + half)
 
 
-def line(amplitude: float = 1.5e-4, frequency: float = 17.3, half: float = 3e-6) -> ReconciliationStep:
+def line(amplitude: float = 1.5e-4, frequency: float = 17.3, half: float = 3e-6) -> AddedOrResizedEffect:
     return step(
         "sinusoidal",
         amplitude=around(amplitude, half),
@@ -51,7 +51,11 @@ def line(amplitude: float = 1.5e-4, frequency: float = 17.3, half: float = 3e-6)
 
 
 def run(
-    name: str, *steps: ReconciliationStep, axis: str = "gz", seconds: float = 600.0, left: Sequence[Score] = ()
+    name: str,
+    *steps: AddedOrResizedEffect,
+    axis: str = "gz",
+    seconds: float = 600.0,
+    left: Sequence[DiagnosticGap] = (),
 ) -> NamedResult:
     """A recording of one axis with these steps; its model has their effects."""
     verdict: Decision = ("partly_explained" if steps else "unexplained") if left else "explained" if steps else "agrees"
@@ -73,7 +77,7 @@ def run(
     )  # fmt: skip
 
 
-def made(one: ReconciliationStep) -> Effect:
+def made(one: AddedOrResizedEffect) -> Effect:
     extra = {"reference": 25.0} if one.effect == "temperature_lag" else {}
     values = {name: bounds.value for name, bounds in one.parameters.items()}
     return EFFECTS[one.effect](**extra, **values)

@@ -12,15 +12,15 @@ from drivers.sample import AXES, Floats
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import (
+    AddedOrResizedEffect,
     AxisResult,
+    DiagnosticGap,
     DiagnosticSnapshot,
     Location,
     ParameterInterval,
     PlotData,
     Reconciliation,
-    ReconciliationStep,
     RunnerUp,
-    Score,
 )
 
 RATE_HZ, SECONDS = 100.0, 3600.0
@@ -67,11 +67,11 @@ def look(
     peak = Location(frequency=(17.1, 17.5)) if line and not known_line else Location(frequency=(6.0, 11.0))
     psd = 41.2 if line and not known_line else 7.9 if hump else 0.6 + off / 2
     scores = (
-        Score("psd", peak, psd, 1.9, 2.6),
-        Score("allan", Location(tau=(0.01, 0.64)), 0.7 + off, 1.6, 2.4),
-        Score("level", Location(time=(1200.0, 1320.0)), 1.1, 1.7, 2.5),
-        Score("distribution", Location(), 0.4 + off / 9, 1.8, 2.7),
-        Score("other_axes", Location(source="ax" if axis != "ax" else "gx"), 0.2, 1.5, 2.5),
+        DiagnosticGap("psd", peak, psd, 1.9, 2.6),
+        DiagnosticGap("allan", Location(tau=(0.01, 0.64)), 0.7 + off, 1.6, 2.4),
+        DiagnosticGap("level", Location(time=(1200.0, 1320.0)), 1.1, 1.7, 2.5),
+        DiagnosticGap("distribution", Location(), 0.4 + off / 9, 1.8, 2.7),
+        DiagnosticGap("other_axes", Location(source="ax" if axis != "ax" else "gx"), 0.2, 1.5, 2.5),
     )
     return DiagnosticSnapshot(scores, views)
 
@@ -88,8 +88,7 @@ def explained() -> Reconciliation:
     start = look("gz", n_true=MORE_N, line=True)
     with_line = look("gz", n_true=MORE_N, line=True, known_line=True)
     with_all = look("gz", n_model=MORE_N, n_true=MORE_N, line=True, known_line=True)
-    line = ReconciliationStep(
-        found=start.scores[0],
+    line = AddedOrResizedEffect(
         kind="added",
         effect="sinusoidal",
         parameters={
@@ -98,32 +97,31 @@ def explained() -> Reconciliation:
         },
         confidence=0.9983,
         runners_up=(RunnerUp("narrowband", 0.0016), RunnerUp("sample_rate_error", 0.0001)),
-        before=start.scores[0],
-        after=with_line.scores[0],
-        held_out_before=Score("psd", Location(frequency=(17.1, 17.5)), 39.7, 1.9, 2.6),
-        held_out_after=Score("psd", Location(frequency=(17.1, 17.5)), 1.0, 1.9, 2.6),
+        before=start.gaps[0],
+        after=with_line.gaps[0],
+        held_out_before=DiagnosticGap("psd", Location(frequency=(17.1, 17.5)), 39.7, 1.9, 2.6),
+        held_out_after=DiagnosticGap("psd", Location(frequency=(17.1, 17.5)), 1.0, 1.9, 2.6),
         held_out_reason="",
         because="One bin of 0.28 mHz at 17.3 Hz holds 41 times what the model expects there, and its phase holds "
         "from the first minute to the last; a resonance would be at least 1 mHz wide.",
-        look=with_line,
+        snapshot_after=with_line,
     )
-    white = ReconciliationStep(
-        found=with_line.scores[1],
+    white = AddedOrResizedEffect(
         kind="retuned",
         effect="angle_random_walk",
         parameters={"N": ParameterInterval(MORE_N, 1.7958e-4, 1.8042e-4)},
         confidence=0.99996,
         runners_up=(),
-        before=with_line.scores[1],
-        after=with_all.scores[1],
+        before=with_line.gaps[1],
+        after=with_all.gaps[1],
         held_out_before=None,
         held_out_after=None,
         held_out_reason="a known term of another size is not held out",
         because="From 0.01 s to 0.6 s the Allan deviation is higher by one factor, 1.20, with white noise's slope.",
-        look=with_all,
+        snapshot_after=with_all,
     )
     whole = agrees()
-    axes = {**whole.axes, "gz": AxisResult("gz", "explained", start, (line, white), (), white.look)}
+    axes = {**whole.axes, "gz": AxisResult("gz", "explained", start, (line, white), (), white.snapshot_after)}
     found = (AngleRandomWalk(N=MORE_N), *_terms()[1:], Sinusoidal(amplitude=1.5e-4, frequency=17.300012))
     return replace(
         whole,
@@ -138,7 +136,7 @@ def partly_explained() -> Reconciliation:
     """The line of ``explained`` alone: the white noise is left over."""
     whole = explained()
     gz = whole.axes["gz"]
-    left = tuple(score for score in gz.steps[0].look.scores if score.passes)
+    left = tuple(score for score in gz.steps[0].snapshot_after.gaps if score.is_significant)
     result = replace(gz, verdict="partly_explained", steps=gz.steps[:1], left_over=left)
     return replace(whole, verdict="partly_explained", axes={**whole.axes, "gz": result})
 
@@ -146,7 +144,7 @@ def partly_explained() -> Reconciliation:
 def unexplained() -> Reconciliation:
     """One accelerometer with a hump in its spectrum."""
     start = look("ax", hump=True)
-    result = AxisResult("ax", "unexplained", start, (), (start.scores[0],), start)
+    result = AxisResult("ax", "unexplained", start, (), (start.gaps[0],), start)
     model = NoiseModel({"ax": _terms()}, sample_rate_hz=RATE_HZ)
     return Reconciliation("unexplained", {"ax": result}, model, model, True, RATE_HZ, 360_000, SECONDS, 7)
 

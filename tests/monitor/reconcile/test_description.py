@@ -86,11 +86,11 @@ def test_a_line_is_described_with_all_that_it_has():
         assert bounds.lo < bounds.value < bounds.hi
         assert abs(bounds.value - true) < 4.0 * (bounds.hi - bounds.lo) / 3.92
     assert step.confidence > 0.9
-    assert step.found.lens == "lines"
-    lo, hi = step.found.where.frequency
+    assert step.before.lens == "lines"
+    lo, hi = step.before.where.frequency
     assert lo < 17.3 < hi
-    assert step.found.passes
-    assert not step.after.passes
+    assert step.before.is_significant
+    assert not step.after.is_significant
     assert step.after.gap < step.before.gap
     assert step.held_out_before.gap > step.held_out_after.gap
     assert "17.3 Hz" in step.because
@@ -110,7 +110,7 @@ def test_another_size_is_told_as_such():
 def test_single_samples_are_counted():
     (step,) = told("outliers").steps
     assert step.effect == "outliers"
-    assert step.found.lens == "tails"
+    assert step.before.lens == "tails"
     assert step.parameters["fraction"].lo < 1e-3 < step.parameters["fraction"].hi
     assert step.parameters["scale"].lo < 1.5e-2 < step.parameters["scale"].hi
     assert "detected events" in step.because

@@ -29,7 +29,7 @@ from monitor.reconcile.preparation.recording import (
     _smooth_temperature,
     select_usable_axes,
 )
-from monitor.reconcile.reconcile import RunContext, _effects_by_axis, fit_five_terms, reconcile
+from monitor.reconcile.reconcile import RecordingContext, _effects_by_axis, fit_five_terms, reconcile
 from monitor.reconcile.report import encode_report
 from monitor.reconcile.result import combine_decisions
 from tests.monitor.reconcile.axes import (
@@ -91,8 +91,8 @@ def test_what_was_hidden_is_found_on_its_axis(name):
     added = [step for step in found.axes[where].steps if step.kind == "added"]
     assert [step.effect for step in added] == [name]
     (step,) = added
-    assert step.found.passes
-    assert not step.after.passes
+    assert step.before.is_significant
+    assert not step.after.is_significant
     for parameter, bounds in step.parameters.items():
         if bounds.lo is not None and parameter != "phase":
             deviation = (bounds.hi - bounds.lo) / 3.92
@@ -119,7 +119,7 @@ def test_same_seed_same_bytes_also_in_threads():
     assert other.seed == 5
     # other simulated recordings stand behind its thresholds
     for axis in GYRO_AXES:
-        limits = [[score.threshold for score in found.axes[axis].start.scores] for found in (first, other)]
+        limits = [[score.threshold for score in found.axes[axis].start.gaps] for found in (first, other)]
         assert limits[0] != limits[1]
 
 
@@ -134,7 +134,7 @@ def test_a_wrong_clock_is_one_step_for_all_axes():
     assert found.verdict == "explained"
     (step,) = (step for one in found.axes.values() for step in one.steps if step.effect == "sample_rate_error")
     assert step.parameters["ratio"].value == pytest.approx(1.004, abs=1e-4)
-    assert found.model.rate_ratio == pytest.approx(1.004, abs=1e-4)
+    assert found.model.true_to_stated_rate == pytest.approx(1.004, abs=1e-4)
     # what was found in stated time stands in the model in true time
     assert found.axes["gz"].steps[0].parameters["frequency"].value == pytest.approx(31.0 / 1.004, abs=1e-3)
     added = next(effect for effect in found.model.effects["gz"] if isinstance(effect, Sinusoidal))
@@ -174,7 +174,7 @@ def test_only_terms_that_the_data_support_are_fitted():
         "gz": white(n, rng) + 1e-5 * time_s(n),
         "ax": NoiseModel({"ax": (WHITE, QuantizationNoise(Q=5e-6))}).simulate(n, RATE_HZ, 1)[:, 3].copy(),
     }
-    found = fit_five_terms(RunContext(Recording(values, RATE_HZ), 1, RegressorCache(n, RATE_HZ, None), map))
+    found = fit_five_terms(RecordingContext(Recording(values, RATE_HZ), 1, RegressorCache(n, RATE_HZ, None), map))
     kinds = {axis: {type(effect) for effect in effects} for axis, effects in found.effects.items()}
     assert kinds["gx"] == {AngleRandomWalk}
     assert kinds["gy"] >= {AngleRandomWalk, RateRandomWalk}

@@ -8,13 +8,13 @@ import numpy as np
 
 from monitor.reconcile.report import encode_report
 from monitor.reconcile.result import (
+    AddedOrResizedEffect,
     AxisResult,
+    DiagnosticGap,
     DiagnosticSnapshot,
     Location,
     ParameterInterval,
     Reconciliation,
-    ReconciliationStep,
-    Score,
 )
 from tests.monitor.reconcile import samples
 
@@ -76,7 +76,7 @@ def test_what_happens_once_has_a_reason_instead_of_a_held_out_gap() -> None:
 
 
 def test_the_threshold_beside_a_gap_is_the_one_after_the_step() -> None:
-    after = Score("psd", Location(), 1.0, 1.7, 2.2)
+    after = DiagnosticGap("psd", Location(), 1.0, 1.7, 2.2)
     step = written(with_step(samples.explained(), after=after))["axes"]["gz"]["steps"][0]
     assert step["gap"] == {"before": 41.2, "after": 1.0, "null95": 1.7, "threshold": 2.2}
     assert step["found"]["threshold"] == 2.6
@@ -88,8 +88,8 @@ def test_what_is_no_number_is_null_and_an_axis_has_no_interval() -> None:
         "coefficient": ParameterInterval(np.float64(2e-4), np.nan, np.inf),
         "order": ParameterInterval(2),
     }
-    found = Score("other_axes", Location(source="ax", value=(-np.inf, 0.1)), np.inf, np.nan, 2.5)
-    changed = with_step(samples.explained(), parameters=parameters, found=found, confidence=np.nan)
+    found = DiagnosticGap("other_axes", Location(source="ax", value=(-np.inf, 0.1)), np.inf, np.nan, 2.5)
+    changed = with_step(samples.explained(), parameters=parameters, before=found, confidence=np.nan)
     step = written(changed)["axes"]["gz"]["steps"][0]
     assert step["parameters"] == {
         "source": {"value": "ax"},
@@ -120,12 +120,12 @@ def test_the_same_reconciliation_gives_the_same_bytes_in_the_order_of_the_axes()
 
 
 def test_numbers_of_numpy_are_numbers() -> None:
-    score = Score(
+    score = DiagnosticGap(
         "psd", Location(frequency=(np.float64(1), np.float64(2))), np.float64(3), np.float64(1), np.float64(2)
     )
     look = DiagnosticSnapshot((score,), ())
-    step = ReconciliationStep(
-        score, "added", "bias_step", {}, np.float64(0.5), (), score, score, None, None, "once", "it jumps", look
+    step = AddedOrResizedEffect(
+        "added", "bias_step", {}, np.float64(0.5), (), score, score, None, None, "once", "it jumps", look
     )
     axes = {"gx": AxisResult("gx", "explained", look, (step,), (), look)}
     model = samples.explained().model

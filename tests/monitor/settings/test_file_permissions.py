@@ -36,7 +36,7 @@ def made(path: Path, text: str, mode: int) -> Path:
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o644, 0o664, 0o400])
 def test_usual_modes_are_well(folder: Path, mode: int) -> None:
     path = made(folder / "a.toml", VIRTUAL, mode)
-    assert file_permissions.describe_write_access(path) == ""
+    assert file_permissions.explain_untrusted_file(path) == ""
     assert file_permissions.describe_exposed_secret(path) == ""
     config, wrong = loading.read(path)
     assert wrong == []
@@ -55,15 +55,15 @@ def test_a_file_that_anyone_may_change_is_refused(folder: Path) -> None:
 def test_a_link_is_judged_by_where_it_leads(folder: Path) -> None:
     real = made(folder / "real.toml", VIRTUAL, 0o646)
     (folder / "link.toml").symlink_to(real)
-    assert str(real) in file_permissions.describe_write_access(folder / "link.toml")
+    assert str(real) in file_permissions.explain_untrusted_file(folder / "link.toml")
 
 
 def test_a_folder_in_which_anyone_may_swap_the_file_is_refused_but_a_sticky_one_is_not(folder: Path) -> None:
     path = made(folder / "a.toml", VIRTUAL, 0o644)
     folder.chmod(0o777)
-    assert file_permissions.describe_write_access(path).endswith(f"in its place: chmod o-w {folder}")
+    assert file_permissions.explain_untrusted_file(path).endswith(f"in its place: chmod o-w {folder}")
     folder.chmod(0o1777)
-    assert file_permissions.describe_write_access(path) == ""
+    assert file_permissions.explain_untrusted_file(path) == ""
 
 
 def test_a_secret_that_anyone_may_read_is_warned_of(folder: Path) -> None:

@@ -11,14 +11,14 @@ from drivers import discovery
 from drivers.decoders.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
-from monitor.common.config_files import CONFIG_FOLDER, model_path
+from monitor.common.shipped_file_paths import CONFIG_FOLDER, model_path
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH
 from monitor.settings.loading import (
     WINDOW_SAMPLES,
     VirtualTable,
     check_viewer_mode,
     load,
-    period,
+    parse_rate_as_period,
     read,
     seconds,
 )
@@ -571,13 +571,13 @@ def test_words_that_are_no_durations(text):
 
 @pytest.mark.parametrize(("text", "value"), [("10 Hz", 0.1), ("0.5Hz", 2.0), ("always", 0.0)])
 def test_rates(text, value):
-    assert period(text, "always") == value
+    assert parse_rate_as_period(text, "always") == value
 
 
 @pytest.mark.parametrize("text", ["", "10", "10hz", "0 Hz", "-1 Hz", "1.1.1 Hz"])
 def test_words_that_are_no_rates(text):
     with pytest.raises(ConfigError, match="no rate"):
-        period(text, "always")
+        parse_rate_as_period(text, "always")
 
 
 def test_the_viewer_opens_on_so_much_of_what_is_kept(tmp_path):

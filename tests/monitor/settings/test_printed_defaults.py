@@ -11,8 +11,8 @@ from drivers import discovery
 from drivers.decoders.dbc.settings import SignalSettings
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
-from drivers.settings_model import SettingsModel, describe_keys, find_model, read_settings
-from monitor.commands.check import check
+from drivers.settings_model import SettingsModel, fields_by_key, find_model, read_settings
+from monitor.commands.check_config import check_configuration
 from monitor.settings import printed_defaults
 from monitor.settings.driver_settings import FaultsTable, link_names, link_settings
 from monitor.settings.schema import (
@@ -58,7 +58,7 @@ def folder(tmp_path: Path) -> Path:
 
 def check_text(folder: Path, text: str) -> None:
     (folder / "my.toml").write_text(f'[[device]]\nname = "a"\nmodel = "consumer-mems"\n{text}\n', "utf-8")
-    config, wrong = check(folder / "my.toml")
+    config, wrong = check_configuration(folder / "my.toml")
     assert wrong == []
     assert config is not None
 
@@ -69,7 +69,7 @@ def without(text: str, *keys: str) -> str:
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: f"{model.__module__}.{model.__name__}")
 def test_every_key_has_a_description_and_something_to_print(model: type[SettingsModel]) -> None:
-    for key, info in describe_keys(model).items():
+    for key, info in fields_by_key(model).items():
         assert info.description, key
         nothing = info.is_required() or info.default in (None, (), frozenset(), Path())
         assert not nothing or info.examples or find_model(info.annotation), key
@@ -79,9 +79,9 @@ def test_every_key_has_a_description_and_something_to_print(model: type[Settings
 def test_an_example_of_a_default_has_its_value(model: type[SettingsModel]) -> None:
     needed = {Limit: {"above": 1.0}, Hook: {"key": "a"}}.get(model, {})
     required = needed | {
-        key: info.examples[0] for key, info in describe_keys(model).items() if info.is_required() if info.examples
+        key: info.examples[0] for key, info in fields_by_key(model).items() if info.is_required() if info.examples
     }
-    for key, info in describe_keys(model).items():
+    for key, info in fields_by_key(model).items():
         if info.examples and not info.is_required() and info.default not in (None, "", (), frozenset(), Path(), {}):
             settings = read_settings(model, {**required, key: info.examples[0]})
             name = next(name for name, one in model.model_fields.items() if one is info)
@@ -90,7 +90,7 @@ def test_an_example_of_a_default_has_its_value(model: type[SettingsModel]) -> No
 
 def test_the_file_is_a_valid_configuration(tmp_path: Path) -> None:
     (tmp_path / "my.toml").write_text(printed_defaults.format_defaults(), "utf-8")
-    config, wrong = check(tmp_path / "my.toml")
+    config, wrong = check_configuration(tmp_path / "my.toml")
     assert wrong == []
     assert config is not None
     assert config.devices[0].axes == AxisMap()
@@ -98,12 +98,12 @@ def test_the_file_is_a_valid_configuration(tmp_path: Path) -> None:
 
 def test_the_file_has_every_table_with_every_key() -> None:
     text = printed_defaults.format_defaults()
-    for key, info in describe_keys(ConfigFile).items():
+    for key, info in fields_by_key(ConfigFile).items():
         model = find_model(info.annotation)
         assert model is not None
         block = next(one for one in uncommented(text).split("\n[") if one.lstrip("[").startswith(f"{key}]"))
         own = {"driver", "axes", "limit"} if model is Device else set()
-        assert set(printed_keys(f"[{block}")) == set(describe_keys(model)) - own
+        assert set(printed_keys(f"[{block}")) == set(fields_by_key(model)) - own
     for name in LINKS:
         assert f'link = "{name}"' in text
     for name in DECODERS:
@@ -119,7 +119,7 @@ def printed_keys(block: str) -> dict[str, Any]:
 def test_the_table_of_a_link_has_every_key_and_passes_the_check(folder: Path, link: str) -> None:
     text = uncommented(printed_defaults.format_link(link))
     first = text.split("[device.driver.faults]")[0]
-    assert set(printed_keys(first)) - {"link", "decoder"} == set(describe_keys(link_settings(link))) - {"faults"}
+    assert set(printed_keys(first)) - {"link", "decoder"} == set(fields_by_key(link_settings(link))) - {"faults"}
     if link == "can":
         text += "\n" + without(uncommented(printed_defaults.format_decoder("dbc")), "valid")
     check_text(folder, text)
@@ -128,7 +128,7 @@ def test_the_table_of_a_link_has_every_key_and_passes_the_check(folder: Path, li
 @pytest.mark.parametrize("decoder", DECODERS)
 def test_the_table_of_a_decoder_has_every_key_and_passes_the_check(folder: Path, decoder: str) -> None:
     text = uncommented(printed_defaults.format_decoder(decoder))
-    assert set(printed_keys(text)) == set(describe_keys(decoder_settings(decoder)))
+    assert set(printed_keys(text)) == set(fields_by_key(decoder_settings(decoder)))
     # no shipped database with a counter has a signal for valid
     check_text(folder, f'[device.driver]\nlink = "virtual"\ndecoder = "{decoder}"\n{without(text, "valid")}')
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.settings.loading import WINDOW_SAMPLES, VirtualTable, load
 from monitor.simulator.demo import DEMO_CONFIG, demo_config
 

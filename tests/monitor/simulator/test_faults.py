@@ -13,7 +13,7 @@ DATA = bytes(range(40))
 
 def test_each_comes_as_often_as_asked_for() -> None:
     n = 200_000
-    draws = Faults(SHARES, 1, "bytes").draw(n)
+    draws = Faults(SHARES, 1, "bytes").draw_faults(n)
     share = np.bincount(draws.kind, minlength=5) / n
     assert share == pytest.approx([0.01, 0.02, 0.03, 0.04, 0.9], abs=4 * np.sqrt(0.04 / n))
     assert draws.pulled.mean() == pytest.approx(0.05, abs=4 * np.sqrt(0.05 / n))
@@ -22,23 +22,23 @@ def test_each_comes_as_often_as_asked_for() -> None:
 
 
 def test_none_are_asked_for_and_none_come() -> None:
-    draws = Faults(FaultsTable(), 1, "bytes").draw(10_000)
+    draws = Faults(FaultsTable(), 1, "bytes").draw_faults(10_000)
     assert (draws.kind == FaultKind.WHOLE).all()
     assert not draws.pulled.any()
 
 
 def test_all_samples_may_be_lost() -> None:
-    assert (Faults(FaultsTable(lost=1.0), 1, "bytes").draw(10_000).kind == FaultKind.LOST).all()
+    assert (Faults(FaultsTable(lost=1.0), 1, "bytes").draw_faults(10_000).kind == FaultKind.LOST).all()
 
 
 @pytest.mark.parametrize("cuts", [(1,), (7, 8, 500), (999,)])
 def test_the_same_however_samples_are_cut_into_bursts(cuts: tuple[int, ...]) -> None:
-    whole = Faults(SHARES, 5, "bytes").draw(1000)
+    whole = Faults(SHARES, 5, "bytes").draw_faults(1000)
     faults = Faults(SHARES, 5, "bytes")
-    parts = [faults.draw(n) for n in np.diff((0, *cuts, 1000)).tolist()]
+    parts = [faults.draw_faults(n) for n in np.diff((0, *cuts, 1000)).tolist()]
     for name in ("kind", "where", "pulled"):
         assert np.array_equal(getattr(whole, name), np.concatenate([getattr(part, name) for part in parts]))
-    assert not np.array_equal(whole.where, Faults(SHARES, 6, "bytes").draw(1000).where)
+    assert not np.array_equal(whole.where, Faults(SHARES, 6, "bytes").draw_faults(1000).where)
 
 
 def test_holding_back_bursts_changes_no_sample_fault() -> None:
@@ -47,7 +47,7 @@ def test_holding_back_bursts_changes_no_sample_fault() -> None:
     assert 0.0 <= min(held) < 0.02 < 0.08 < max(held) <= 0.1
     calm = Faults(FaultsTable(lost=0.5), 5, "bytes")
     assert calm.draw_delay_s() == 0.0
-    assert np.array_equal(faults.draw(100).kind, calm.draw(100).kind)
+    assert np.array_equal(faults.draw_faults(100).kind, calm.draw_faults(100).kind)
 
 
 @pytest.mark.parametrize("where", [0.0, 0.37, 1.0 - 2**-53])
@@ -76,8 +76,8 @@ def test_a_flipped_can_frame_does_not_arrive() -> None:
 def test_the_truth_adds_up() -> None:
     truth = FaultCounts()
     for kind in FaultKind:
-        truth.count(kind, out=True)
-        truth.count(kind, out=False)
+        truth.count_sample(kind, all_sent=True)
+        truth.count_sample(kind, all_sent=False)
     assert (truth.sent, truth.repeated, truth.lost, truth.flipped, truth.cut) == (2, 1, 1, 1, 1)
     assert truth.dropped == len(FaultKind)
-    assert truth.made == 2 * len(FaultKind)
+    assert truth.sample_count == 2 * len(FaultKind)

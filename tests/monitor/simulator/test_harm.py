@@ -11,9 +11,9 @@ import pytest
 from drivers.driver import Driver
 from drivers.sample import SampleBlock
 from drivers.timing.sample_clock import SampleClock
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.settings.loading import FaultsTable, VirtualTable
-from monitor.simulator import VirtualImu
+from monitor.simulator import SimulatedDevice
 from monitor.simulator.can_port import CanPort
 from monitor.simulator.faults import FaultKind, Faults
 from monitor.simulator.pty_port import PtyPort
@@ -55,8 +55,8 @@ class Rig:
         shares = FaultsTable(**faults)
         silence_s = SILENCE_S if samples is None else 0.0  # a thread that waits for a processor is silent too
         table = VirtualTable(model=MODEL, seed=seed, speed=speed, silence=silence_s, faults=shares)
-        self.imu = VirtualImu(table, decoder)
-        self.truth = self.imu.truth
+        self.imu = SimulatedDevice(table, decoder)
+        self.truth = self.imu.fault_counts
         self.blocks: list[SampleBlock] = []
         self.pushed_s: list[float] = []
         clock = SampleClock(decoder.timing, 100.0)
@@ -64,7 +64,9 @@ class Rig:
         self.counts = self.driver.counts
         self._thread = threading.Thread(target=self.driver.run, daemon=True)
         self.kinds: list[str] = []
-        self.samples = samples and whole_at_end(Faults(shares, seed, decoder.carrier).draw(DRAWN).kind, samples, of)
+        self.samples = samples and whole_at_end(
+            Faults(shares, seed, decoder.carrier).draw_faults(DRAWN).kind, samples, of
+        )
         if self.samples is not None:
             all_of_them = float(self.samples)
             follow_reader(self.imu, self.driver, lambda: all_of_them)
@@ -98,7 +100,7 @@ class Rig:
         truth, counts = self.truth, self.counts
         self.wait(
             lambda: (
-                truth.made == self.samples
+                truth.sample_count == self.samples
                 and self.received == truth.sent + truth.repeated
                 and counts.lost + counts.bad == truth.lost + truth.flipped + truth.cut
             )
@@ -108,7 +110,7 @@ class Rig:
     @property
     def received(self) -> int:
         """Samples that have come, the repeated ones that were left out among them."""
-        return self.counts.received + self.driver.clock.repeated_rows
+        return self.counts.received + self.driver.clock.dropped_repeated_rows
 
 
 def whole_at_end(kinds: np.ndarray, samples: int, of: FaultKind) -> int:
@@ -150,7 +152,7 @@ def test_repeated_samples_are_left_out(name: str, tmp_path: Path) -> None:
     with Rig(BY_NAME[name], tmp_path, of=FaultKind.REPEATED, repeated=0.1) as rig:
         rig.read_all()
         assert rig.truth.repeated >= ENOUGH
-        assert 0 <= rig.truth.repeated - rig.driver.clock.repeated_rows <= 5
+        assert 0 <= rig.truth.repeated - rig.driver.clock.dropped_repeated_rows <= 5
         rig.wait(lambda: "samples_repeated" in rig.kinds)
 
 
@@ -186,7 +188,7 @@ def test_bursts_held_back_lose_nothing(tmp_path: Path) -> None:
 def test_a_clock_that_is_off_shows_in_the_rate(tmp_path: Path) -> None:
     example = next(example for example in EXAMPLES if example.name == "dbc")  # without a counter of its own
     with Rig(example, tmp_path, speed=1.0, samples=None, clock=1.25) as rig:
-        rig.wait(lambda: rig.truth.made >= 350)
+        rig.wait(lambda: rig.truth.sample_count >= 350)
         # the measured rate converges; late arrivals on a loaded machine only delay it
         rig.wait(lambda: rig.driver.clock.measured_hz == pytest.approx(125.0, rel=0.03))
 
@@ -206,5 +208,5 @@ def test_a_pulled_cable_is_lost_and_found_again(name: str, tmp_path: Path) -> No
 
 def pulled_once(seed: int, table: FaultsTable) -> bool:
     """Soon, and then not again for as long as the test may take to find the sensor."""
-    pulled = np.flatnonzero(Faults(table, seed, "bytes").draw(2000).pulled)
+    pulled = np.flatnonzero(Faults(table, seed, "bytes").draw_faults(2000).pulled)
     return bool(pulled.size) and 30 <= pulled[0] < 100 and not (pulled > pulled[0] + 150).any()

@@ -5,13 +5,14 @@ from typing import ClassVar
 
 import numpy as np
 
-from monitor.noise.effect import FunctionSeries, Source, parameter
+from monitor.noise.effect import Source, StatelessSeries, parameter
 from monitor.noise.spectrum import Spectrum, zero_spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class Bias(Source):
-    """Constant bias, without Allan variance or spectrum. The share of gravity on an accelerometer is also a bias.
+    """Constant bias. Its Allan variance and its spectrum are zero. Gravity on an accelerometer axis is simulated as a
+    bias.
 
     >>> Bias(value=9.8).spectrum(0.01).level
     9.8
@@ -19,12 +20,12 @@ class Bias(Source):
 
     value: float = parameter("rad/s", "m/s²", signed=True)
 
-    description: ClassVar[str] = "What the sensor reads when it should read zero."
+    description: ClassVar[str] = "The sensor reads a constant value when the true value is zero."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return a spectrum that has only a constant level."""
         return replace(zero_spectrum(tau0_s), level=self.value)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> FunctionSeries:
+    def start(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
         """Return a constant series."""
-        return FunctionSeries(lambda values, block: np.add(values, self.value, out=values))
+        return StatelessSeries(lambda values, block: np.add(values, self.value, out=values))

@@ -6,13 +6,13 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import FunctionSeries, SampleBlockContext, Source, first_sample, parameter
+from monitor.noise.effect import SampleBlockContext, Source, StatelessSeries, first_sample_index, parameter
 from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class BiasStep(Source):
-    """Step of the bias: zero before ``time``, ``height`` from the first sample at or after ``time``.
+    """Step of the bias by ``height``, from the first sample at or after ``time``.
 
     >>> bool(np.isnan(BiasStep(time=60.0, height=1e-3).avar(np.array([1.0]), 0.01)[0]))
     True
@@ -21,17 +21,17 @@ class BiasStep(Source):
     time: float = parameter("s")
     height: float = parameter("rad/s", "m/s²", signed=True)
 
-    description: ClassVar[str] = "The bias jumps once and stays there, as after a knock."
+    description: ClassVar[str] = "The bias jumps once and keeps the new value, for example after a knock."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return NaN, because the effect of a single step depends on the length of the recording."""
         return undefined_spectrum(tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> FunctionSeries:
+    def start(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
         """Return a series in which ``time`` counts from the first sample of the stream."""
-        first = first_sample(self.time, rate_hz)
+        first = first_sample_index(self.time, rate_hz)
 
         def add(values: Floats, block: SampleBlockContext) -> None:
             values[max(0, first - block.first) :] += self.height
 
-        return FunctionSeries(add)
+        return StatelessSeries(add)

@@ -17,8 +17,8 @@ class TemperatureLag(Source):
     """Bias that follows temperature with a first-order lag (Newton's law of cooling): b = c (T_l − T_r), dT_l/dt = (T −
     T_l)/τ.
 
-    T_l is the lagged temperature. It starts at the first temperature of the series. The temperature is constant between
-    samples.
+    The lagged temperature T_l starts at the first temperature of the series. The temperature is assumed to be constant
+    between samples.
 
     >>> lag = TemperatureLag(coefficient=1e-4, reference=25.0, time_constant=60.0)
     >>> bool(np.isnan(lag.avar(np.array([1.0]), 0.01)[0]))
@@ -29,7 +29,7 @@ class TemperatureLag(Source):
     reference: float = parameter("°C", signed=True)
     time_constant: float = parameter("s", positive=True)
 
-    description: ClassVar[str] = "The bias follows the temperature of the sensor, but later: heat takes its time."
+    description: ClassVar[str] = "The bias follows the temperature of the sensor with a delay."
     uses_temperature: ClassVar[bool] = True
 
     def spectrum(self, tau0_s: float) -> Spectrum:
@@ -37,7 +37,7 @@ class TemperatureLag(Source):
         return undefined_spectrum(tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_LaggedBias":
-        """Return a series that is settled at the first temperature."""
+        """Return a series whose lagged temperature starts at the first temperature."""
         return _LaggedBias(self.coefficient, self.reference, -expm1(-1.0 / (self.time_constant * rate_hz)))
 
 

@@ -14,7 +14,7 @@ from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
 @dataclass(frozen=True, slots=True)
 class TurnOnTransient(Source):
-    """Exponential transient A exp(−t/τ) from the first sample on: the warm-up term of the drift model of IEEE Std 952.
+    """Exponential transient A exp(−t/τ), which begins at the first sample (warm-up term of IEEE Std 952).
 
     >>> bool(np.isnan(TurnOnTransient(amplitude=1e-3, time_constant=60.0).avar(np.array([1.0]), 0.01)[0]))
     True
@@ -23,14 +23,14 @@ class TurnOnTransient(Source):
     amplitude: float = parameter("rad/s", "m/s²", signed=True)
     time_constant: float = parameter("s", positive=True)
 
-    description: ClassVar[str] = "After switching on the bias runs in, quickly at first, then ever more slowly."
+    description: ClassVar[str] = "After the sensor is switched on, the bias decays exponentially to its final value."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return NaN, because the effect of a single transient depends on the length of the recording."""
         return undefined_spectrum(tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_Decay":
-        """Return a transient that begins at its first sample, even if it is added to a running stream."""
+        """Return a transient that begins at the first sample after the call, also in a running stream."""
         return _Decay(self.amplitude, 1.0 / (self.time_constant * rate_hz))
 
 

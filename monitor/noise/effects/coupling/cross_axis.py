@@ -4,23 +4,23 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from drivers.errors import ConfigError
-from monitor.noise.effect import GYROS, Leak, parameter, source_axis
+from monitor.noise.effect import GYROS, Leak, parameter, source_axis_field
 
 
 @dataclass(frozen=True, slots=True)
 class CrossAxis(Leak):
-    """Leak y += c·x, where x is the measurement of the axis ``source`` without leaks (IEEE Std 1293: cross-axis
-    sensitivity).
+    """Cross-axis sensitivity (IEEE Std 1293): the measurement changes by c·x. x is the measurement of the axis
+    ``source`` without leaks.
 
     >>> CrossAxis(source="gx", coefficient=0.02).check_axis("gx")
     Traceback (most recent call last):
     drivers.errors.ConfigError: cross_axis: source must be another axis than gx itself
     """
 
-    source: str = source_axis()
+    source: str = source_axis_field()
     coefficient: float = parameter("1", signed=True)
 
-    description: ClassVar[str] = "The axis is not square to its neighbour and reads a little of it."
+    description: ClassVar[str] = "A misalignment adds a share of the signal of another axis."
 
     def check_axis(self, axis: str) -> None:
         """Raise ConfigError if the source is the same axis or an axis of the other kind."""

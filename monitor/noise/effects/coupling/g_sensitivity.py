@@ -4,24 +4,24 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from drivers.errors import ConfigError
-from monitor.noise.effect import ACCELEROMETERS, GYROS, Leak, parameter, source_axis
+from monitor.noise.effect import ACCELEROMETERS, GYROS, Leak, parameter, source_axis_field
 
 
 @dataclass(frozen=True, slots=True)
 class GSensitivity(Leak):
-    """Leak of acceleration ω += c·a (IEEE Std 952: g-sensitive drift).
+    """g-sensitive drift (IEEE Std 952): the rate changes by c·a.
 
-    a is the measurement of the accelerometer ``source`` without leaks.
+    a is the measurement of the accelerometer axis ``source`` without leaks.
 
     >>> GSensitivity(source="az", coefficient=1e-5).check_axis("ax")
     Traceback (most recent call last):
     drivers.errors.ConfigError: g_sensitivity: belongs on a gyroscope, not on ax
     """
 
-    source: str = source_axis()
+    source: str = source_axis_field()
     coefficient: float = parameter("rad/s per m/s²", "1", signed=True)
 
-    description: ClassVar[str] = "The gyroscope feels acceleration: gravity and vibration shift its reading."
+    description: ClassVar[str] = "Gravity and vibration change the reading of the gyroscope."
 
     def check_axis(self, axis: str) -> None:
         """Raise ConfigError if the axis is not a gyroscope, or the source not an accelerometer."""

@@ -15,11 +15,13 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class Narrowband(Source):
-    """White noise through a second-order resonance: autocovariance σ² exp(−πΔ|t|) cos 2πft, Δ the full width.
+    """White noise through a second-order resonance of frequency f and bandwidth Δ. The autocovariance is σ² exp(−πΔ|t|)
+    cos 2πft.
 
-    The series is the real part of complex first-order noise: z ← φz + w, φ = exp((−πΔ + 2πif)τ0). S(f) is therefore a
-    pair of Lorentzian lines at ±f with full width Δ at half power. σ²(τ) is the real part of the closed form of
-    exponentially correlated noise with this φ. Both are exact for the samples.
+    The series is the real part of complex first-order noise, z ← φz + w with φ = exp((−πΔ + 2πif)τ0). The spectrum is
+    therefore a pair of Lorentzian lines at ±f with full width Δ at half power. The Allan variance is the real part of
+    the closed form for exponentially correlated noise with this φ. Spectrum and Allan variance are exact for the
+    samples.
 
     >>> hum = Narrowband(sigma=1.0, frequency=20.0, bandwidth=1.0)
     >>> peak, half = hum.psd(np.array([20.0, 20.5]), 1e-4)
@@ -31,15 +33,15 @@ class Narrowband(Source):
     frequency: float = parameter("Hz", positive=True, below_nyquist=True)
     bandwidth: float = parameter("Hz", positive=True)
 
-    description: ClassVar[str] = "Something near rings at its own frequency, with an amplitude that comes and goes."
+    description: ClassVar[str] = "A nearby resonance adds an oscillation with a randomly varying amplitude."
 
     @property
     def _decay(self) -> complex:
-        """Return 1/T_c − iω of the complex process, 1/s."""
+        """Return the complex decay rate 1/T_c − iω in 1/s."""
         return pi * self.bandwidth - 2j * pi * self.frequency
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return the closed forms with the position of the peak, which refines the grid of an integral."""
+        """Return spectrum and Allan variance in closed form. The position of the peak refines the grid of integrals."""
         peaks = ((self.frequency, self.bandwidth),)
         return replace(gauss_markov_spectrum(self.sigma, self._decay, tau0_s), peaks=peaks)
 
@@ -67,7 +69,7 @@ class _Resonance(NoiseSeries):
 def _add_resonance(
     values: Floats, white: Floats, c: float, s: float, drive: float, x: float, y: float
 ) -> tuple[float, float]:
-    """Add x of the rotating pair (x, y) to the values [n], and return the pair."""
+    """Add the real part x of the complex noise x + iy to the values [n], and return the last x and y."""
     for k in range(values.size):
         values[k] += x
         x, y = c * x - s * y + drive * white[k, 0], s * x + c * y + drive * white[k, 1]

@@ -8,10 +8,10 @@ from monitor.noise.effect import Effect, parameter
 
 @dataclass(frozen=True, slots=True)
 class NoiseStep(Effect):
-    """Factor ``ratio`` on the angle random walk of the axis, from the first sample at or after ``time``.
+    """Multiplication of the angle random walk by ``ratio``, from the first sample at or after ``time``.
 
-    The factors of two noise steps multiply. A step occurs once. The Allan variance and spectrum of its axis therefore
-    depend on the length of the recording and are NaN.
+    The factors of two noise steps multiply. Allan variance and spectrum of the axis depend on the length of the
+    recording, so they are NaN.
 
     >>> NoiseStep(time=600.0, ratio=2.0).name
     'noise_step'
@@ -20,4 +20,4 @@ class NoiseStep(Effect):
     time: float = parameter("s")
     ratio: float = parameter("1")
 
-    description: ClassVar[str] = "From one moment on the white noise is stronger, or weaker, by a factor."
+    description: ClassVar[str] = "The size of the white noise changes once by a factor."

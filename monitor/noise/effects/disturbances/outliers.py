@@ -13,10 +13,11 @@ from monitor.noise.spectrum import Spectrum, white_noise_spectrum
 
 @dataclass(frozen=True, slots=True)
 class Outliers(Source):
-    """Tukey's contaminated noise: each sample has, with probability p, an additional Gaussian error of standard
-    deviation s.
+    """Tukey's contaminated noise. With probability p, a sample has an additional Gaussian error of standard deviation
+    s.
 
-    The errors are independent samples of variance ps²: S(f) = ps²τ0, σ²(τ) = ps²τ0/τ.
+    The errors are white noise with a variance of p s² per sample. The spectrum is S(f) = p s² τ0, and the Allan
+    variance is σ²(τ) = p s² τ0/τ.
 
     >>> print(f"{Outliers(fraction=1e-4, scale=0.1).avar(np.array([1.0]), 0.01)[0]:.6g}")
     1e-08
@@ -25,10 +26,10 @@ class Outliers(Source):
     fraction: float = parameter("1", most=1.0)
     scale: float = parameter("rad/s", "m/s²")
 
-    description: ClassVar[str] = "Single samples are far off, the next ones are right again."
+    description: ClassVar[str] = "Single samples deviate strongly from their neighbours."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return the spectrum of independent samples of variance ps²."""
+        """Return the spectrum of white noise with the mean square of the errors."""
         return white_noise_spectrum(self.fraction * self.scale**2, tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_IsolatedErrors":
@@ -49,5 +50,5 @@ class _IsolatedErrors(NoiseSeries):
         when, errors = self._events.take(block.first, values.size)
         values[when] += errors
 
-    def truth(self) -> dict[str, Any]:
-        return self._events.truth("errors")
+    def drawn_values(self) -> dict[str, Any]:
+        return self._events.drawn_values("errors")

@@ -17,7 +17,7 @@ from monitor.noise.spectrum import Spectrum
 class PoissonSteps(Source):
     """Compound Poisson process: Gaussian steps, λ per second on average (Cox & Miller, Theory of Stochastic Processes).
 
-    Its increments are independent. Its second moments therefore equal those of rate random walk with K² = λh².
+    The increments are independent, so the second moments equal those of rate random walk with K² = λh².
 
     >>> jumps = PoissonSteps(rate=0.01, height=1e-4)
     >>> print(f"{jumps.avar(np.array([300.0]), 0.01)[0]:.6g}")
@@ -27,7 +27,7 @@ class PoissonSteps(Source):
     rate: float = parameter("1/s")
     height: float = parameter("rad/s", "m/s²")
 
-    description: ClassVar[str] = "Now and then the bias jumps to a new place and stays there."
+    description: ClassVar[str] = "The bias jumps at random times and keeps each new value."
 
     @property
     def events_hz(self) -> float:
@@ -58,5 +58,5 @@ class _RandomSteps(NoiseSeries):
             self._level += jump
             values[begin:end] += self._level
 
-    def truth(self) -> dict[str, Any]:
-        return self._events.truth("heights")
+    def drawn_values(self) -> dict[str, Any]:
+        return self._events.drawn_values("heights")

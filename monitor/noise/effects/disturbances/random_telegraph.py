@@ -15,7 +15,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class RandomTelegraph(Source):
-    """Random switching between two levels ±a/2, with exponential dwell times of mean T: switches at the rate λ = 1/T.
+    """Random switching between two levels ±a/2, with exponential dwell times of mean T. The switching rate is λ = 1/T.
 
     The autocovariance is (a²/4) exp(−2λ|t|) (Machlup, "Noise in semiconductors: spectrum of a two-parameter random
     signal", 1954). The second moments equal those of exponentially correlated noise with σ = a/2 and T_c = T/2.
@@ -28,7 +28,9 @@ class RandomTelegraph(Source):
     amplitude: float = parameter("rad/s", "m/s²")
     dwell_time: float = parameter("s", positive=True)
 
-    description: ClassVar[str] = "The bias jumps between two levels at random times, like popcorn."
+    description: ClassVar[str] = (
+        "The bias jumps between two levels at random times, which is also called popcorn noise."
+    )
 
     @property
     def events_hz(self) -> float:
@@ -59,7 +61,7 @@ class _TwoLevels(NoiseSeries):
         for begin, end in pairwise(edges):
             values[begin:end] += self._level
             self._level = -self._level
-        self._level = -self._level  # The loop also switches at the end of a block, which is no event.
+        self._level = -self._level  # The loop also switched at the end of the block, where there is no event.
 
-    def truth(self) -> dict[str, Any]:
-        return {"first_level": self._first_level, **self._flips.truth()}
+    def drawn_values(self) -> dict[str, Any]:
+        return {"first_level": self._first_level, **self._flips.drawn_values()}

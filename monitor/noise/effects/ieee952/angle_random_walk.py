@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class AngleRandomWalk(Source):
-    """White noise of the rate, IEEE Std 952 eq. C.18–C.19: S(f) = N², σ²(τ) = N²/τ.
+    """White noise of the rate: S(f) = N² and σ²(τ) = N²/τ (IEEE Std 952 eq. C.18–C.19).
 
     >>> print(f"{AngleRandomWalk(N=1.5e-4).avar(np.array([9.0]), 0.01)[0]:.6g}")
     2.5e-09
@@ -20,10 +20,10 @@ class AngleRandomWalk(Source):
 
     N: float = parameter("rad/√s", "m/s/√s")
 
-    description: ClassVar[str] = "White noise of the rate: averaging four times as long halves it."
+    description: ClassVar[str] = "White noise of the rate averages out with the square root of the averaging time."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return S = N² and σ² = N²/τ."""
+        """Return the spectrum N² and the Allan variance N²/τ."""
         return Spectrum(lambda f: np.full_like(f, self.N**2), lambda tau: self.N**2 / tau, tau0_s)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_WhiteNoise":

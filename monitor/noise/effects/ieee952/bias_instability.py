@@ -2,10 +2,10 @@
 
 The series is white noise through a filter. The squared response of the filter is 1/f within 0.1 % from 1e-8 to 1/2 of
 the sample rate, and constant below. 28 hours at 100 Hz correspond to 1e-7. The poles and zeros of the filter are real
-and alternate. They were fitted by least squares on the logarithm of the spectrum. The tables hold them as 1 − p and 1 −
-z, because most of them are close to one. The filter runs as the sum of its partial fractions, which are all driven by
-the same white noise. This form starts exactly in its stationary state, so the first minute of a series has the same
-statistics as any other.
+and alternate. Poles and zeros were fitted to the logarithm of the spectrum by least squares. The tables list the
+differences 1 − p and 1 − z, because most poles and zeros are close to one. The filter runs as the sum of its partial
+fractions, which are all driven by the same white noise. This form starts exactly in its stationary state, so the first
+minute of a series has the same statistics as any other.
 """
 
 from dataclasses import dataclass
@@ -40,8 +40,8 @@ FLICKER_AVAR: Final = float(2.0 * np.log(2.0) / np.pi)
 FLICKER_FLOOR: Final = float(FLICKER_AVAR**0.5)
 """Allan deviation of continuous flicker noise divided by B, 0.664."""
 MAX_SAMPLED_FACTOR: Final = 128
-"""Largest number of samples per cluster for which the sampled form of σ² is integrated. Above, it differs from the
-continuous form by less than 1e-4."""
+"""Largest number of samples per cluster for which the sampled form of σ² is integrated. For larger clusters, the
+sampled form differs from the continuous form by less than 1e-4."""
 
 _MIDPOINT_COUNT: Final = 8192
 """Points of the midpoint rule."""
@@ -49,7 +49,8 @@ _MIDPOINT_COUNT: Final = 8192
 
 @dataclass(frozen=True, slots=True)
 class BiasInstability(Source):
-    """1/f noise of the rate, IEEE Std 952 eq. C.22–C.24: S(f) = B²/(2πf), σ²(τ) = (2 ln 2/π) B², floor 0.664 B.
+    """1/f noise of the rate: S(f) = B²/(2πf) and σ²(τ) = (2 ln 2/π) B² (IEEE Std 952 eq. C.22–C.24). The Allan
+    deviation is 0.664 B.
 
     >>> print(f"{BiasInstability(B=1.0).avar(np.array([100.0]), 0.01)[0] ** 0.5:.3f}")
     0.664
@@ -57,12 +58,14 @@ class BiasInstability(Source):
 
     B: float = parameter("rad/s", "m/s²")
 
-    description: ClassVar[str] = "Slow flicker of the bias: the floor that no averaging gets below."
+    description: ClassVar[str] = (
+        "The bias fluctuates with 1/f noise, so longer averaging does not reduce the error below a floor."
+    )
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return S = B²/(2πf) and σ² = (2 ln 2/π) B².
+        """Return the spectrum B²/(2πf) and the Allan variance (2 ln 2/π) B².
 
-        For clusters of few samples, σ² is the value for samples, whose spectrum ends at 1/(2 τ0).
+        For clusters of few samples, σ² is integrated over the spectrum up to half the sample rate.
         """
 
         def avar(tau_s: Floats) -> Floats:
@@ -88,10 +91,12 @@ def _sampled_allan_variance(m: Floats) -> Floats:
 
 
 class _Flicker(NoiseSeries):
-    """Series of the filter in partial fractions: y = direct·w + Σ residue·s, s ← pole·s + w."""
+    """White noise w through the filter in partial fractions: y = direct·w + Σ residue·s, with the states s ← pole·s +
+    w."""
 
     def __init__(self, B: float, rng: np.random.Generator) -> None:
-        # Unit white noise has density τ0, so S = τ0 gain² / (RESPONSE_CONSTANT f τ0). It must equal B²/(2πf).
+        # White noise of variance 1 has the density τ0. The output density gain² / (RESPONSE_CONSTANT f) must equal
+        # B²/(2πf).
         gain = B * np.sqrt(RESPONSE_CONSTANT / (2.0 * np.pi))
         self._rng = rng
         self._poles = 1.0 - ONE_MINUS_POLE
@@ -106,8 +111,8 @@ class _Flicker(NoiseSeries):
 
 
 def _residues() -> Floats:
-    """Return the residues r of H(z) = Π(1 − z_i/z)/Π(1 − p_i/z) = direct + Σ r_i/(1 − p_i/z), from the differences to
-    one."""
+    """Return the residues r_i of the partial fractions H(z) = Π(1 − z_i/z)/Π(1 − p_i/z) = direct + Σ r_i/(1 −
+    p_i/z)."""
     p, z = ONE_MINUS_POLE, ONE_MINUS_ZERO
     others = p[None, :] - p[:, None]
     np.fill_diagonal(others, 1.0)

@@ -14,9 +14,9 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class ExponentiallyCorrelated(Source):
-    """Markov noise of IEEE Std 952 annex C for samples: autocovariance σ²φ^|n|, φ = exp(−τ0/T_c).
+    """Sampled Markov noise (IEEE Std 952 annex C) with the autocovariance σ²φ^|n|, φ = exp(−τ0/T_c).
 
-    The closed forms, with n = τ/τ0, are:
+    Allan variance and spectrum, with n = τ/τ0, are:
 
         σ²(τ) = σ²(1 − φ²)[n − 3φ − nφ² + 4φ^(n+1) − φ^(2n+1)] / [n²(1 − φ)²(1 − φ²)]
         S(f) = σ²τ0(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)
@@ -29,7 +29,7 @@ class ExponentiallyCorrelated(Source):
     sigma: float = parameter("rad/s", "m/s²")
     correlation_time: float = parameter("s", positive=True)
 
-    description: ClassVar[str] = "The bias wanders and comes back, and forgets where it was after a correlation time."
+    description: ClassVar[str] = "The bias fluctuates about zero with an exponential autocorrelation."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return the closed forms of the class docstring."""

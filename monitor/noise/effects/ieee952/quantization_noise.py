@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class QuantizationNoise(Source):
-    """White noise of the angle, IEEE Std 952 eq. C.14–C.15: σ²(τ) = 3Q²/τ², S(f) = 4Q²/τ0 sin²(πfτ0).
+    """White noise of the angle: σ²(τ) = 3Q²/τ² and S(f) = 4Q²/τ0 sin²(πfτ0) (IEEE Std 952 eq. C.14–C.15).
 
     >>> print(f"{QuantizationNoise(Q=2e-6).avar(np.array([0.1]), 0.01)[0]:.6g}")
     1.2e-09
@@ -20,12 +20,10 @@ class QuantizationNoise(Source):
 
     Q: float = parameter("rad", "m/s")
 
-    description: ClassVar[str] = (
-        "The angle is rounded anew at every reading: strong between neighbouring samples, gone over seconds."
-    )
+    description: ClassVar[str] = "Rounding of the angle adds noise that averages out faster than white noise."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return S = 4Q²/τ0 sin²(πfτ0) and σ² = 3Q²/τ²."""
+        """Return the spectrum 4Q²/τ0 sin²(πfτ0) and the Allan variance 3Q²/τ²."""
         return Spectrum(
             lambda f: 4.0 * self.Q**2 / tau0_s * np.sin(np.pi * f * tau0_s) ** 2,
             lambda tau: 3.0 * self.Q**2 / tau**2,

@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class RateRamp(Source):
-    """Constant slope, IEEE Std 952 eq. C.32: σ²(τ) = R²τ²/2. It is deterministic and has no noise spectrum.
+    """Constant slope of the rate: σ²(τ) = R²τ²/2 (IEEE Std 952 eq. C.32). A ramp is deterministic and has no spectrum.
 
     >>> float(RateRamp(R=2e-6).avar(np.array([1000.0]), 0.01)[0])
     2e-06
@@ -20,7 +20,7 @@ class RateRamp(Source):
 
     R: float = parameter("rad/s²", "m/s³")
 
-    description: ClassVar[str] = "The bias moves steadily in one direction, as while a sensor warms up."
+    description: ClassVar[str] = "The bias changes at a constant rate, for example while a sensor warms up."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return a spectrum that has only a slope."""

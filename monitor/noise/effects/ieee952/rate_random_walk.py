@@ -13,10 +13,11 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class RateRandomWalk(Source):
-    """Integrated white noise, IEEE Std 952 eq. C.28–C.29, S(f) = K²/(2πf)² and σ²(τ) = K²τ/3, for samples.
+    """Sampled integrated white noise (IEEE Std 952 eq. C.28–C.29).
 
-    The sum of independent steps of variance K²τ0 has S(f) = K²τ0²/(4 sin²(πfτ0)) and, with m = τ/τ0, σ² = K²τ/3 · (1 +
-    1/(2m²)). These differ from the continuous forms only for clusters of few samples.
+    The continuous process has the spectrum S(f) = K²/(2πf)² and the Allan variance σ²(τ) = K²τ/3. The sum of
+    independent steps of variance K²τ0 has S(f) = K²τ0²/(4 sin²(πfτ0)) and σ²(τ) = K²τ/3 · (1 + 1/(2m²)) with m = τ/τ0.
+    Sampled and continuous forms differ only for clusters of few samples.
 
     >>> print(f"{RateRandomWalk(K=3e-6).avar(np.array([1e4]), 0.01)[0]:.6g}")
     3e-08
@@ -24,10 +25,10 @@ class RateRandomWalk(Source):
 
     K: float = parameter("rad/s/√s", "m/s²/√s")
 
-    description: ClassVar[str] = "The bias itself takes random steps and never returns: worse the longer one averages."
+    description: ClassVar[str] = "The bias takes independent random steps, so the error grows with the averaging time."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return S = K²τ0²/(4 sin²(πfτ0)) and σ² = K²τ/3 (1 + τ0²/(2τ²))."""
+        """Return the spectrum and the Allan variance of the sampled process."""
         return Spectrum(
             lambda f: (0.5 * self.K * tau0_s / np.sin(np.pi * f * tau0_s)) ** 2,
             lambda tau: self.K**2 / 3.0 * (tau + 0.5 * tau0_s**2 / tau),
@@ -51,7 +52,8 @@ class _RandomWalk(NoiseSeries):
 
 @compiled
 def _add_random_walk(values: Floats, steps: Floats, step: float, level: float) -> float:
-    """Add the running sum to the values [n] and return it. The order of additions does not depend on the blocks."""
+    """Add the running sum of the steps to the values [n], and return the sum. The order of additions does not depend on
+    the blocks."""
     for k in range(values.size):
         level += step * steps[k]
         values[k] += level

@@ -12,7 +12,7 @@ from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parame
 from monitor.noise.spectrum import Spectrum, allan_of_line
 
 RENEWAL_SAMPLES: Final = 64
-"""Samples after which the rotation that generates the sinusoid starts from an exact value. This limits the rounding
+"""Samples after which the rotation that generates the sinusoid starts from an exact value, which limits the rounding
 error."""
 
 
@@ -20,9 +20,9 @@ error."""
 class Sinusoidal(Source):
     """Sinusoid A sin(2πft + φ) of IEEE Std 952 annex C.
 
-    For samples, σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)), m = τ/τ0. The textbook form A² sin⁴(πfτ)/(πfτ)² is its limit for
-    τ0 → 0. The spectrum is a line of A²/4 at ±f and has no density. If the phase is absent, it is drawn at random from
-    the seed.
+    The Allan variance of the samples is σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)) with m = τ/τ0. The textbook form A²
+    sin⁴(πfτ)/(πfτ)² is the limit for τ0 → 0. The spectrum consists of two lines with the mean square A²/4 at ±f and has
+    no density. If no phase is given, the phase is drawn at random from the seed.
 
     >>> line = Sinusoidal(amplitude=1.0, frequency=25.0)
     >>> [round(float(x), 6) for x in line.avar(np.array([0.01, 0.02, 0.04]), 0.01)]
@@ -33,9 +33,7 @@ class Sinusoidal(Source):
     frequency: float = parameter("Hz", positive=True, below_nyquist=True)
     phase: float | None = parameter("rad", signed=True, optional=True)
 
-    description: ClassVar[str] = (
-        "A steady oscillation at one frequency: a line in the spectrum, waves in the Allan curve."
-    )
+    description: ClassVar[str] = "A steady oscillation adds a line to the spectrum and waves to the Allan deviation."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return a spectrum that has only one line, because a line has power but no density."""
@@ -56,7 +54,7 @@ class _Sinusoid(NoiseSeries):
     def add(self, values: Floats, block: SampleBlockContext) -> None:
         _add_sinusoid(values, block.first, self._amplitude, self._step, self._phase)
 
-    def truth(self) -> dict[str, Any]:
+    def drawn_values(self) -> dict[str, Any]:
         return {"phase": self._phase} if self._drawn else {}
 
 

@@ -16,7 +16,7 @@ class BandwidthLimit(Transform):
     """Butterworth low-pass, digital by the bilinear transform: |H|² = 1/(1 + (tan(πfτ0)/tan(πf_cτ0))^(2n)).
 
     Butterworth, "On the theory of filter amplifiers", 1930. The Allan variance after the filter is an integral over the
-    spectrum. The filter starts in its settled state at the first sample, so that gravity causes no transient.
+    spectrum. The filter starts in the steady state for the first sample, so that gravity causes no transient.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> filtered = BandwidthLimit(cutoff=10.0, order=2).transform_spectrum(white_noise_spectrum(1.0, 0.01))
@@ -27,7 +27,7 @@ class BandwidthLimit(Transform):
     cutoff: float = parameter("Hz", positive=True, below_nyquist=True)
     order: int = parameter("1", positive=True, whole=True, most=8)
 
-    description: ClassVar[str] = "The sensor's own filter lets slow motion through and damps what is fast, noise too."
+    description: ClassVar[str] = "The low-pass filter of the sensor attenuates fast motion and high-frequency noise."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum times |H|²."""
@@ -42,7 +42,7 @@ class BandwidthLimit(Transform):
         return spectrum.filtered(gain)
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
-        """Return the filter, which settles at the first sample."""
+        """Return the filter. The first sample sets the state of the filter, so there is no transient."""
         return _LowPass(butterworth_sections(int(self.order), self.cutoff, rate_hz))
 
 
@@ -50,8 +50,8 @@ def butterworth_sections(order: int, cutoff_hz: float, rate_hz: float) -> Floats
     """Return the second-order sections of a digital Butterworth low-pass with unit gain at f = 0.
 
     In the s plane, the poles lie on a circle at angles θ from the negative real axis. Each pair of poles gives a
-    section of s² + 2 cos θ s + 1. An odd order adds a section of s + 1. The bilinear transform sets
-    s = (1 − z⁻¹)/(1 + z⁻¹) / tan(πf_c/f_s).
+    section of s² + 2 cos θ s + 1. A filter of odd order has one more section, s + 1. The bilinear transform sets s = (1
+    − z⁻¹)/(1 + z⁻¹) / tan(πf_c/f_s).
 
     Parameters
     ----------

@@ -18,10 +18,10 @@ below exp(−2π²·0.6²) = 8·10⁻⁴."""
 class Resolution(Transform):
     """Rounding to whole steps.
 
-    If neighbouring samples differ by more than a step, rounding adds independent errors of variance step²/12 (Widrow &
-    Kollár, Quantization Noise, 2008): S(f) + step²τ0/12, σ²(τ) + step²τ0/(12τ). This requires an Allan deviation at τ0
-    of at least 0.6 steps. Below, the output depends on the position of the rate between two steps, and the result is
-    NaN.
+    If neighbouring samples differ by more than a step, rounding adds white noise with a variance of step²/12 per sample
+    (Widrow & Kollár, Quantization Noise, 2008). The spectrum grows by step²τ0/12, and the Allan variance grows by
+    step²τ0/(12τ). The Allan deviation at τ0 must be at least 0.6 steps. With less noise, the output depends on the
+    position of the rate between two steps, and the result is NaN.
 
     >>> one = white_noise_spectrum(1.0, 0.01)
     >>> [round(float(Resolution(step=x).transform_spectrum(one).avar(np.array([1.0]))[0]), 6) for x in (1.2, 3.0)]
@@ -30,7 +30,7 @@ class Resolution(Transform):
 
     step: float = parameter("rad/s", "m/s²", positive=True)
 
-    description: ClassVar[str] = "The output moves in steps of one least significant bit."
+    description: ClassVar[str] = "The output changes in steps of one least significant bit."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum plus white noise of variance step²/12, or NaN if the Allan deviation is too small."""

@@ -1,4 +1,4 @@
-"""Repeated samples: some samples repeat the one before."""
+"""Random repetition of samples."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -12,23 +12,23 @@ from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
-class SampleHold(Transform):
-    """Random repetition of samples: each sample repeats, with probability h, the sample before.
+class RandomSampleHold(Transform):
+    """Random repetition of samples. With probability h, a sample repeats the previous output.
 
-    The age of the value that is read has a geometric distribution. On average, the output is the input through G = (1 −
-    h)/(1 − h/z). The remainder is noise whose correlation decays as hⁿ. With V the mean square of (1 − |G|²) S,
-    S_out(f) = |G|² S + V τ0 (1 − h²)/|1 − h/z|². This is exact for any input with stationary increments. The Allan
-    variance is an integral over this spectrum.
+    The age of an output value has a geometric distribution. On average, the output equals the input after the filter G
+    = (1 − h)/(1 − h/z). The remainder is noise whose correlation decays as hⁿ. The output spectrum is S_out(f) = |G|² S
+    + V τ0 (1 − h²)/|1 − h/z|², where V is the mean square of (1 − |G|²) S. This formula is exact for any input with
+    stationary increments. The Allan variance is an integral over this spectrum.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
-    >>> held = SampleHold(fraction=0.5).transform_spectrum(white_noise_spectrum(1.0, 0.01))
+    >>> held = RandomSampleHold(fraction=0.5).transform_spectrum(white_noise_spectrum(1.0, 0.01))
     >>> print(f"{held.avar(np.array([0.01]))[0]:.3f}")  # r(0) − r(1) of white_noise_spectrum noise held: 1 − h
     0.500
     """
 
     fraction: float = parameter("1", most=0.999)
 
-    description: ClassVar[str] = "Some samples are not new: the value before is sent once more."
+    description: ClassVar[str] = "Some samples repeat the previous value."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum by the formula of the class docstring."""
@@ -41,7 +41,7 @@ class SampleHold(Transform):
             return (1.0 - h) ** 2 / squared(f_hz)
 
         lowest = 1e-7 / tau0_s
-        # The mean square of 1 − |G|² is computed without cancellation at low f.
+        # 4h sin²(πfτ0)/|1 − h/z|² equals 1 − |G|², without cancellation at low frequencies.
         lost = (
             spectrum.mean_square(lowest, lambda f: 4.0 * h * np.sin(np.pi * f * tau0_s) ** 2 / squared(f))
             + spectrum.slope**2 * tau0_s**2 * h / (1.0 - h) ** 2
@@ -50,7 +50,7 @@ class SampleHold(Transform):
         return spectrum.filtered(gain, around=((0.0, (1.0 - h) / (2.0 * np.pi * tau0_s)),)) + rest
 
     def start(self, rate_hz: float, rng: np.random.Generator) -> "_RepeatedSamples":
-        """Return a transform whose first sample is always new."""
+        """Return a transform that never repeats a sample from before its first call."""
         return _RepeatedSamples(self.fraction, rng)
 
 
@@ -66,7 +66,7 @@ class _RepeatedSamples(RunningTransform):
         self._last, held = _repeat_samples(values, tosses, self._fraction, self._last)
         self._repeat_count += held
 
-    def truth(self) -> dict[str, Any]:
+    def drawn_values(self) -> dict[str, Any]:
         return {"count": self._repeat_count}
 
 

@@ -5,35 +5,36 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.quantities import RATE_RATIO
+from drivers.number_ranges import RATE_RATIO
 from monitor.noise.effect import MemorylessTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class SampleRateError(Transform):
-    """Ratio r of the true to the stated sample rate of the whole recording: σ²(τ) ← σ²(τ/r), S(f) ← r·S(rf) by
-    substitution.
+    """Ratio r of the true sample rate to the sample rate that the recording states.
 
-    Every effect of every axis is simulated at the true rate, and nothing is resampled. The samples are correct and only
-    the clock is wrong. The effect applies to all axes, whichever axis names it. If it is named twice, the ratios must
-    be equal.
+    At the stated rate, the Allan variance becomes σ²(τ/r), and the spectrum becomes r·S(rf). All axes are simulated at
+    the true rate, so only the times of the samples are wrong. The effect applies to all axes, even if a model lists the
+    effect on one axis only. If a model lists the effect twice, the ratios must be equal.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
-    >>> stated = SampleRateError(ratio=2.0).restated(white_noise_spectrum(1.0, 0.005))
+    >>> stated = SampleRateError(ratio=2.0).restate_spectrum(white_noise_spectrum(1.0, 0.005))
     >>> stated.tau0_s, float(stated.avar(np.array([0.01]))[0])
     (0.01, 1.0)
     """
 
     ratio: float = parameter("1", positive=True, quantity=RATE_RATIO)
 
-    description: ClassVar[str] = "The clock is off: what happens at one frequency is seen at another."
+    description: ClassVar[str] = (
+        "The true sample rate differs from the stated rate, which scales all times and frequencies."
+    )
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum unchanged; ``restated`` converts its time scale after all transforms."""
+        """Return the spectrum unchanged; ``restate_spectrum`` converts its time scale after all transforms."""
         return spectrum
 
-    def restated(self, spectrum: Spectrum) -> Spectrum:
+    def restate_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum of samples at the true rate, converted to the time scale that the recording states."""
         r, closed = self.ratio, spectrum.closed_form_avar
         return Spectrum(

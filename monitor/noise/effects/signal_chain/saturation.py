@@ -5,7 +5,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.quantities import HOUR_S
+from drivers.number_ranges import HOUR_S
 from monitor.noise.effect import MemorylessTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum, undefined_spectrum
 
@@ -17,10 +17,11 @@ NOISE_SIGMAS: Final = 6.0
 
 @dataclass(frozen=True, slots=True)
 class Saturation(Transform):
-    """Clipping at the range: y = x clipped at ± limit.
+    """Clipping of the measurement at ± limit.
 
-    If level, lines and six standard deviations of the noise of an hour stay within the range, nothing is clipped.
-    Spectrum and Allan variance are then unchanged. Otherwise there is no closed form, and they are NaN.
+    The range must contain the bias, all sinusoids, the slope, and six standard deviations of the noise during one hour.
+    In this case, nothing is clipped, and spectrum and Allan variance do not change. Otherwise, no closed form is known,
+    and spectrum and Allan variance are NaN.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> clipped = [Saturation(limit=x).transform_spectrum(white_noise_spectrum(1.0, 0.01)) for x in (10.0, 1.0)]
@@ -30,7 +31,7 @@ class Saturation(Transform):
 
     limit: float = parameter("rad/s", "m/s²", positive=True)
 
-    description: ClassVar[str] = "Beyond its range the sensor reads the end of the range."
+    description: ClassVar[str] = "Values beyond the measurement range are replaced by the end of the range."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum unchanged if the series stays within the range for an hour, else NaN."""

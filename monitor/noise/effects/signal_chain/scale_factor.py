@@ -11,7 +11,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class ScaleFactor(Transform):
-    """Factor on the measurement of the axis, y = f·x: σ²(τ) and S(f) times f² (IEEE Std 952, scale factor).
+    """Scale factor f of the axis (IEEE Std 952). The factor multiplies Allan variance and spectrum by f².
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> float(ScaleFactor(factor=2.0).transform_spectrum(white_noise_spectrum(1.0, 0.01)).avar(np.array([0.01]))[0])
@@ -21,7 +21,7 @@ class ScaleFactor(Transform):
     factor: float = parameter("1")
 
     description: ClassVar[str] = (
-        "Everything the axis reads is too large or too small by one factor, as after a slip of units."
+        "All values of the axis are multiplied by a constant, for example after an error of units."
     )
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:

@@ -4,21 +4,29 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import NO_TICK, ArrivalTiming, CounterTiming, SampleBlock, SenderTiming, Timing, make_block
+from drivers.sample import (
+    NO_TICK,
+    ArrivalTimedFormat,
+    CounterTimedFormat,
+    SampleBlock,
+    SenderTimedFormat,
+    Timing,
+    make_block,
+)
 from tests.experiments.fuzz.stamped import Stamped
 from tests.experiments.fuzz.tape import Tape
 from tests.experiments.fuzz.target import target
 
 TIMINGS: Final[tuple[Timing, ...]] = (
-    ArrivalTiming(),
-    SenderTiming(),
-    CounterTiming(256, 1.0 / 2000.0),
-    CounterTiming(1 << 16),
-    CounterTiming(1 << 32, 1e-4),
-    CounterTiming(1 << 62, 1e-9),
-    CounterTiming((1 << 32) * 1_000_000, 1e-9),
-    CounterTiming(1 << 32),
-    CounterTiming(2),
+    ArrivalTimedFormat(),
+    SenderTimedFormat(),
+    CounterTimedFormat(256, 1.0 / 2000.0),
+    CounterTimedFormat(1 << 16),
+    CounterTimedFormat(1 << 32, 1e-4),
+    CounterTimedFormat(1 << 62, 1e-9),
+    CounterTimedFormat((1 << 32) * 1_000_000, 1e-9),
+    CounterTimedFormat(1 << 32),
+    CounterTimedFormat(2),
 )
 RATES_HZ: Final = (None, 100.0, 1.0, 8000.0, 1e-3)
 STEPS: Final = (0, 1, 1_000, 1_000_000, 10_000_000, 10_000_000, 1_000_000_000, 3_600_000_000_000, -1, -1_000_000_000)
@@ -53,14 +61,14 @@ def clock(data: bytes) -> None:
         i += 1
         kind = tape.byte()
         if kind % 16 == 15:
-            stamped.clock.pause()
+            stamped.clock.note_link_closed()
             continue
         n = 1 + kind % 8
-        given = isinstance(timing, SenderTiming)
+        given = isinstance(timing, SenderTimedFormat)
         times = _walk(tape, n if given else 1, t_ns, 0)
         t_ns = times[-1]
         ticks = [NO_TICK] * n
-        if isinstance(timing, CounterTiming) and kind & 64 == 0:
+        if isinstance(timing, CounterTimedFormat) and kind & 64 == 0:
             ticks = _walk(tape, n, tick, timing.modulus)
             tick = ticks[-1]
         stamped.put(_rows(times if given else times * n, ticks, i if kind & 128 == 0 else 0, kind // 16 % 4))

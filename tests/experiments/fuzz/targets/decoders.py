@@ -22,7 +22,7 @@ from drivers.decoders.base import Decoder
 from drivers.decoders.dbc import DbcDecoder
 from drivers.decoders.dbc import Settings as DbcSettings
 from drivers.decoders.dbc.database import Database
-from drivers.sample import AXES, EXTENDED_ID, NO_TICK, Chunk, CounterTiming, SampleBlock, make_block
+from drivers.sample import AXES, EXTENDED_ID, NO_TICK, Chunk, CounterTimedFormat, SampleBlock, make_block
 from drivers.settings_model import read_settings
 from drivers.zenoh.sample_message import COLUMNS, SCHEMA, SCHEMAS
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS, EXAMPLES, NAMES, Example
@@ -52,7 +52,7 @@ def samples_of(data: bytes, decoder: Decoder) -> SampleBlock:
     n = 1 + min(len(data) // 8, 7)
     table = np.frombuffer(data.ljust(8 * n, b"\0")[: 8 * n], np.int8).reshape(n, 8) / 16.0
     ticks = np.full(n, NO_TICK, np.int64)
-    if isinstance(decoder.timing, CounterTiming):
+    if isinstance(decoder.timing, CounterTimedFormat):
         ticks = (np.arange(n, dtype=np.int64) * 4 + (data[0] if data else 0)) % decoder.timing.modulus
     return make_block(START_NS + np.arange(n, dtype=np.int64) * 10**7, table[:, :6].copy(), 20.0 + table[:, 6], ticks)
 
@@ -224,7 +224,7 @@ def _can(i: int) -> tuple[Any, DbcSettings, Any]:
         path.write_text(text or "")
         settings = read_settings(DbcSettings, {"file": str(path) if text else file, **keys})
         database = Database(settings)
-        return database.messages(), settings, database.timing()
+        return database.messages, settings, database.timing
 
 
 def _can_decoder(i: int) -> DbcDecoder:

@@ -20,7 +20,7 @@ from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.terminal.live_table import device_table
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
-from monitor.simulator.scheduled_effects import parse_effects
+from monitor.simulator.scheduled_effect_parser import parse_effects
 from tests.experiments.fuzz.checks import one_line
 from tests.experiments.fuzz.tape import Tape
 from tests.experiments.fuzz.target import target
@@ -215,7 +215,7 @@ def duration(data: bytes) -> None:
 def rate(data: bytes) -> None:
     """Rates: seconds between two, or a line."""
     try:
-        seconds = loading.period(_text(data), "every sample")
+        seconds = loading.parse_rate_as_period(_text(data), "every sample")
     except ConfigError as error:
         one_line(error)
         return
@@ -232,7 +232,7 @@ def command_line(data: bytes) -> None:
         options.tau,
         options.order,
         loading.check_viewer_mode,
-        lambda word: options.duration("--window", word),
+        lambda word: options.parse_duration("--window", word),
     ):
         try:
             possible(read(text))

@@ -9,7 +9,7 @@ from drivers.errors import RecordingError
 from drivers.recordings.segment import (
     DaemonState,
     SegmentMetadata,
-    SegmentWriter,
+    SingleSegmentWriter,
     compress_segment,
     read_chunks,
     read_last_piece,
@@ -26,7 +26,7 @@ NAME: Final = "00000001_2026-11-22T03-00-00Z.arrows"
 
 def _written(of: SegmentMetadata, packed: bool) -> bytes:
     path = folder() / f"seed-{NAME}"
-    writer = SegmentWriter(path, of)
+    writer = SingleSegmentWriter(path, of)
     for i in range(3):
         rng = np.random.default_rng(i)
         rows = make_block(10**18 + np.arange(4) * 10**7, rng.normal(size=(4, 6)), np.full(4, 20.0), np.arange(4), i)

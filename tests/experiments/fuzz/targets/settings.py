@@ -17,9 +17,9 @@ from drivers.decoders import dbc
 from drivers.errors import ConfigError
 from drivers.sample import Chunk
 from drivers.settings_model import SettingsModel, read_settings
-from monitor.common import config_files
-from monitor.noise.catalogue import read_model
+from monitor.common import shipped_file_paths
 from monitor.noise.model import NoiseModel
+from monitor.noise.model_catalogue import read_model
 from monitor.settings import loading
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS
 from tests.experiments.fuzz.checks import fed, one_line
@@ -28,7 +28,7 @@ from tests.experiments.fuzz.target import target
 from tests.experiments.fuzz.targets.decoders import SECOND_DATABASE, SECOND_SIGNALS
 from tests.experiments.fuzz.targets.files import folder
 
-CONFIG: Final = config_files.CONFIG_FOLDER
+CONFIG: Final = shipped_file_paths.CONFIG_FOLDER
 LINES_AT_MOST: Final = 2000
 
 

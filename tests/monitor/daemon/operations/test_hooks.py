@@ -51,7 +51,7 @@ class Running:
         self.hooks.close()
 
     def happen(self, event: Event = EVENT, device: str = "d") -> None:
-        self.hooks.event(device, 1.76e9, 7, event)
+        self.hooks.publish_event(device, 1.76e9, 7, event)
 
 
 def test_a_command_gets_the_event_and_no_word_of_it_is_run(tmp_path: Path) -> None:

@@ -39,7 +39,7 @@ def look(
 
 def told(limits: LimitMonitor, course: list[tuple[float, float]], **more: object) -> list[tuple[float, Event]]:
     """Events and when they came, of (time, value)."""
-    return [(at_s, e) for at_s, value in course for e in limits.update(look(at_s, value, **more))]  # type: ignore[arg-type]
+    return [(at_s, e) for at_s, value in course for e in limits.check_estimate(look(at_s, value, **more))]  # type: ignore[arg-type]
 
 
 def test_a_limit_is_crossed_once_and_back_once() -> None:
@@ -59,7 +59,7 @@ def test_a_limit_is_crossed_once_and_back_once() -> None:
 def test_a_value_whose_interval_reaches_under_the_limit_has_not_crossed_it() -> None:
     limits = LimitMonitor([N_ABOVE], None)
     assert told(limits, [(float(t), 2.5e-4) for t in range(600)], error=0.6e-4) == []
-    assert limits.crossed == ()
+    assert limits.limits_crossed_now == ()
 
 
 def test_one_look_under_the_limit_begins_the_time_anew() -> None:
@@ -71,25 +71,29 @@ def test_one_look_under_the_limit_begins_the_time_anew() -> None:
 def test_a_look_without_an_answer_shows_nothing_either_way() -> None:
     limits = LimitMonitor([N_ABOVE], None)
     assert told(limits, [(float(t), 2.5e-4) for t in range(59)]) == []
-    assert limits.update(look(59.0, 0.0, status=Status.UNESTIMATED)) == []
+    assert limits.check_estimate(look(59.0, 0.0, status=Status.UNESTIMATED)) == []
     assert [at_s for at_s, _ in told(limits, [(60.0 + t, 2.5e-4) for t in range(100)])] == [120.0]
-    unknown = [e for t in range(200, 400) for e in limits.update(look(float(t), 0.0, status=Status.UNESTIMATED))]
+    unknown = [
+        e for t in range(200, 400) for e in limits.check_estimate(look(float(t), 0.0, status=Status.UNESTIMATED))
+    ]
     assert unknown == []
-    assert limits.crossed == ("gz N",)
+    assert limits.limits_crossed_now == ("gz N",)
 
 
 def test_what_is_missing_proves_nothing() -> None:
     """An hour without samples is no hour of noise: time is counted in samples."""
     limits = LimitMonitor([N_ABOVE], None)
-    assert limits.update(look(0.0, 2.5e-4)) == []
+    assert limits.check_estimate(look(0.0, 2.5e-4)) == []
     later = replace(look(0.5, 2.5e-4), t_ns=3_600_000_000_000)
-    assert limits.update(later) == []
-    assert limits.crossed == ()
+    assert limits.check_estimate(later) == []
+    assert limits.limits_crossed_now == ()
 
 
 def test_an_upper_bound_counts_under_a_lower_limit_and_never_above_an_upper_one() -> None:
     both = LimitMonitor([N_ABOVE, N_BELOW], None)
-    bound = [event for t in range(100) for event in both.update(look(float(t), 0.4e-4, 0.1e-4, Status.UPPER_BOUND))]
+    bound = [
+        event for t in range(100) for event in both.check_estimate(look(float(t), 0.4e-4, 0.1e-4, Status.UPPER_BOUND))
+    ]
     assert [(event.kind, event.sigma) for event in bound] == [("limit_crossed", None)]
     assert bound[0].values["N"]["limit"] == 1e-4
     assert bound[0].text == "gz angle random walk at most 0.172 °/√h is below 0.344 °/√h, its lower limit"
@@ -97,16 +101,16 @@ def test_an_upper_bound_counts_under_a_lower_limit_and_never_above_an_upper_one(
     back = told(both, [(100.0 + t, 1.5e-4) for t in range(100)])
     assert [event.kind for _, event in back] == ["limit_back"]
     high = LimitMonitor([N_ABOVE], None)
-    assert [e for t in range(100) for e in high.update(look(float(t), 9e-4, 1e-4, Status.UPPER_BOUND))] == []
+    assert [e for t in range(100) for e in high.check_estimate(look(float(t), 9e-4, 1e-4, Status.UPPER_BOUND))] == []
 
 
 def test_an_upper_bound_is_back_only_when_it_is_under_the_limit_itself() -> None:
     limits = LimitMonitor([N_ABOVE], None)
     told(limits, [(float(t), 2.5e-4) for t in range(61)])
-    assert limits.crossed == ("gz N",)
-    loose = [e for t in range(61, 200) for e in limits.update(look(float(t), 2.5e-4, 1e-5, Status.UPPER_BOUND))]
+    assert limits.limits_crossed_now == ("gz N",)
+    loose = [e for t in range(61, 200) for e in limits.check_estimate(look(float(t), 2.5e-4, 1e-5, Status.UPPER_BOUND))]
     assert loose == []
-    tight = [e for t in range(200, 300) for e in limits.update(look(float(t), 1e-4, 1e-5, Status.UPPER_BOUND))]
+    tight = [e for t in range(200, 300) for e in limits.check_estimate(look(float(t), 1e-4, 1e-5, Status.UPPER_BOUND))]
     assert [event.kind for event in tight] == ["limit_back"]
 
 
@@ -129,6 +133,6 @@ def test_new_limits_go_on_where_the_old_ones_were() -> None:
     old = LimitMonitor([N_ABOVE], None)
     told(old, [(float(t), 2.5e-4) for t in range(61)])
     same, other = LimitMonitor([N_ABOVE, N_BELOW], None), LimitMonitor([N_BELOW], None)
-    same.take_over(old)
-    other.take_over(old)
-    assert (same.crossed, other.crossed) == (("gz N",), ())
+    same.copy_states_from(old)
+    other.copy_states_from(old)
+    assert (same.limits_crossed_now, other.limits_crossed_now) == (("gz N",), ())

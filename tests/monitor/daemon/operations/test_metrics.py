@@ -55,12 +55,12 @@ def test_every_number_is_the_newest_one_in_si() -> None:
     health = made.health(outputs={"zenoh": "ok", "viewer": "stalled (3 dropped)", "hook": "off"}, crossed=("gz N",))
     with serving() as output:
         wait_for(lambda: output.state == "ok")
-        output.health("a", 0.0, made.health(received=1))
-        output.health("a", 0.0, health)
-        output.health("b", 0.0, replace(health, state="lost", rate_hz=None, latency_p50_s=None))
-        output.result("a", 0.0, 0, estimate)
+        output.publish_health("a", 0.0, made.health(received=1))
+        output.publish_health("a", 0.0, health)
+        output.publish_health("b", 0.0, replace(health, state="lost", rate_hz=None, latency_p50_s=None))
+        output.publish_result("a", 0.0, 0, estimate)
         for _ in range(3):
-            output.event("a", 0.0, 1, Event("link_lost", 0, ""))
+            output.publish_event("a", 0.0, 1, Event("link_lost", 0, ""))
         numbers = scrape(output.port)
     for name in ("received", "lost", "bad", "overflowed", "repeated", "late"):
         assert at(numbers, f"samples_{name}_total", device="a") == getattr(health, name)
@@ -91,10 +91,10 @@ def test_a_device_that_is_gone_has_no_numbers() -> None:
     with serving() as output:
         wait_for(lambda: output.state == "ok")
         for name in ("a", "b"):
-            output.health(name, 0.0, made.health())
-            output.result(name, 0.0, 0, made.estimate())
-            output.event(name, 0.0, 1, Event("moved", 0, ""))
-        output.device_removed("a")
+            output.publish_health(name, 0.0, made.health())
+            output.publish_result(name, 0.0, 0, made.estimate())
+            output.publish_event(name, 0.0, 1, Event("moved", 0, ""))
+        output.remove_device("a")
         devices = {dict(labels).get("device") for _, labels in scrape(output.port)}
     assert devices == {"b", None}
 

@@ -13,7 +13,7 @@ import pytest
 from drivers.errors import LinkLost
 from drivers.links.base import Carrier
 from drivers.sample import Chunk
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.service import Service
 from monitor.settings import loading
@@ -121,7 +121,7 @@ class Freezing:
     def open(self) -> None:
         self._closed.clear()
 
-    def read(self, timeout_s: float) -> list[Chunk] | None:
+    def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
         if self.frozen.is_set():
             self._closed.wait()
             raise LinkLost("closed")
@@ -161,7 +161,7 @@ def test_a_frozen_reader_ends_the_signs_of_life_and_nothing_else(tmp_path: Path)
             wait_for(lambda: service.workers[0].driver.counts.received > received + 200)
             assert systemd.count("WATCHDOG=1") == signs
         finally:
-            service.stop()
+            service.request_stop()
             thread.join(PATIENCE_S)
         assert not thread.is_alive()
         assert systemd.lines()[-1].startswith(("STOPPING=1", "STATUS="))

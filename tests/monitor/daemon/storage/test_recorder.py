@@ -16,12 +16,12 @@ import pytest
 from drivers.decoders import text
 from drivers.driver import AxisMap
 from drivers.recordings import load_samples, segment
-from drivers.recordings.segment import DaemonState, SegmentMetadata, SegmentWriter
+from drivers.recordings.segment import DaemonState, SegmentMetadata, SingleSegmentWriter
 from drivers.sample import Chunk, SampleBlock, concatenate_blocks, make_block
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.daemon.storage import recorder, recording_track, retention
-from monitor.daemon.storage.recorder import Recorder, origin
+from monitor.daemon.storage.recorder import Recorder, segment_metadata
 from monitor.settings.loading import Device, Driver, Storage
 from tests.support.loopback_link import LoopbackLink
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -45,7 +45,7 @@ def written(folder: Path) -> list[segment.SegmentPiece]:
 
 def all_written(keeper: Recorder) -> None:
     """Wait until the recorder has written all that it was given."""
-    wait_for(lambda: not any(track.waiting for track in keeper._tracks.values()))
+    wait_for(lambda: not any(track.has_unwritten_rows for track in keeper._tracks.values()))
 
 
 @pytest.fixture(autouse=True)
@@ -58,11 +58,11 @@ def _brisk(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_every_value_counter_and_hole_comes_back(tmp_path: Path) -> None:
     keeper = Recorder(Storage.model_construct(folder=tmp_path, segment_s=3.0), [SAMPLES])
-    keeper.set_state("bench", DaemonState(RATE, (None, None, 5.0, None, None, None), 1.0))
+    keeper.set_estimate_state("bench", DaemonState(RATE, (None, None, 5.0, None, None, None), 1.0))
     keeper.start()
     given = [rows(0, 150), rows(160, 150, lost=10), rows(310, 1), rows(311, 700)]
     for one in given:
-        keeper.samples("bench", one, 0)
+        keeper.queue_samples("bench", one, 0)
         all_written(keeper)  # as a batch of its own
     keeper.close(PATIENCE_S)
     back = written(tmp_path / "bench")
@@ -84,7 +84,7 @@ def test_segments_that_have_ended_are_packed_and_say_the_same(tmp_path: Path) ->
     keeper.start()
     given = [rows(first, 20) for first in range(0, 2000, 20)]
     for one in given:
-        keeper.samples("bench", one, 0)
+        keeper.queue_samples("bench", one, 0)
         all_written(keeper)
     packed = lambda: [segment.read_metadata(path).packed for path in segment.list_segments(tmp_path / "bench")]  # noqa: E731
     wait_for(lambda: len(packed()) >= 3 and all(packed()[:-1]))
@@ -101,7 +101,7 @@ def test_raw_bytes_come_back_as_chunks(tmp_path: Path) -> None:
     keeper = Recorder(Storage(folder=tmp_path), [of])
     keeper.start()
     given = [Chunk(bytes([i] * (i + 1)), 1000 + i, address=i, attachment=b"a" * (i % 3)) for i in range(50)]
-    keeper.chunks("bench", given, offset_ns=START_NS)
+    keeper.queue_chunks("bench", given, offset_ns=START_NS)
     keeper.close(PATIENCE_S)
     (path,) = segment.list_segments(tmp_path / "bench" / "raw")
     back = list(segment.read_chunks(path))
@@ -113,8 +113,8 @@ def test_raw_bytes_come_back_as_chunks(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("cut", [1, 7, 200, 1999, 2600])
 def test_a_segment_that_was_cut_is_read_up_to_the_cut(tmp_path: Path, cut: int) -> None:
-    path = tmp_path / segment.segment_name(1, 1.7e9)
-    writer = SegmentWriter(path, SAMPLES)
+    path = tmp_path / segment.format_segment_name(1, 1.7e9)
+    writer = SingleSegmentWriter(path, SAMPLES)
     for first in range(0, 100, 10):
         writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
@@ -137,8 +137,8 @@ def test_a_segment_that_was_cut_is_read_up_to_the_cut(tmp_path: Path, cut: int) 
 def test_a_segment_that_is_packed_while_it_is_opened_is_read_whole(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, read: Callable[[Path], object]
 ) -> None:
-    path = tmp_path / segment.segment_name(1, 1.7e9)
-    writer = SegmentWriter(path, SAMPLES)
+    path = tmp_path / segment.format_segment_name(1, 1.7e9)
+    writer = SingleSegmentWriter(path, SAMPLES)
     for first in range(0, 100, 10):
         writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
@@ -161,7 +161,7 @@ def rows_of(n: int) -> np.ndarray:
     return np.concatenate([rows(first, 10).values for first in range(0, n, 10)])
 
 
-class Broken(SegmentWriter):
+class Broken(SingleSegmentWriter):
     """A disk that fails in the middle of a batch while ``why`` is set; it writes nothing until it is ``released``."""
 
     why: int | None = None
@@ -192,13 +192,13 @@ def disk():
 def test_a_disk_that_fails_stops_the_recording_with_an_event_until_it_can_go_on(tmp_path, disk, why: int) -> None:
     keeper = Recorder(Storage(folder=tmp_path), [SAMPLES], Broken)
     keeper.start()
-    keeper.samples("bench", rows(0, 100), 0)
+    keeper.queue_samples("bench", rows(0, 100), 0)
     wait_for(lambda: len(written(tmp_path / "bench")) == 1)
     disk.why = why
-    keeper.samples("bench", rows(100, 100), 0)
+    keeper.queue_samples("bench", rows(100, 100), 0)
     wait_for(lambda: keeper.state != "ok")
     assert os.strerror(why) in keeper.state
-    keeper.samples("bench", rows(200, 100), 0)
+    keeper.queue_samples("bench", rows(200, 100), 0)
     refused = disk.refused
     wait_for(lambda: disk.refused >= refused + 3)  # it is tried again and again
     disk.why = None
@@ -219,7 +219,7 @@ def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, 
     for first in range(0, 20_000, 2000):
         disk.released.clear()
         for at in range(first, first + 2000, 100):
-            keeper.samples("bench", rows(at, 100), 0)  # returns, although the disk writes nothing
+            keeper.queue_samples("bench", rows(at, 100), 0)  # returns, although the disk writes nothing
         disk.released.set()
         all_written(keeper)
     keeper.close(PATIENCE_S)
@@ -239,11 +239,11 @@ def test_what_a_slow_disk_cannot_take_is_a_hole_that_is_counted(tmp_path, disk, 
 def test_old_segments_go_when_both_their_names_and_their_number_say_so(tmp_path: Path) -> None:
     folder = tmp_path / "bench"
     folder.mkdir()
-    names = [segment.segment_name(i, 1.7e9 + 100.0 * i) for i in range(10)]
+    names = [segment.format_segment_name(i, 1.7e9 + 100.0 * i) for i in range(10)]
     for name in names:
         (folder / name).write_bytes(b"x")
     (folder / "notes.txt").write_text("mine")
-    retention.delete_old([folder], keep_s=350.0, segment_s=100.0)
+    retention.delete_old_segments([folder], keep_s=350.0, segment_s=100.0)
     assert [path.name for path in segment.list_segments(folder)] == names[5:]
     assert (folder / "notes.txt").exists()
 
@@ -254,8 +254,8 @@ def test_neither_a_clock_set_wrong_nor_many_restarts_delete_what_is_new(tmp_path
     folder.mkdir()
     began = [1.7e9 + step_s * i for i in range(9)] + [1.7e9 + newest_s]
     for i, unix_s in enumerate(began):
-        (folder / segment.segment_name(i, unix_s)).write_bytes(b"x")
-    retention.delete_old([folder], keep_s=2000.0 if step_s > 1.0 else 350.0, segment_s=100.0)
+        (folder / segment.format_segment_name(i, unix_s)).write_bytes(b"x")
+    retention.delete_old_segments([folder], keep_s=2000.0 if step_s > 1.0 else 350.0, segment_s=100.0)
     assert len(segment.list_segments(folder)) == 10
 
 
@@ -264,12 +264,12 @@ def test_the_oldest_of_all_devices_go_while_the_disk_is_too_full(tmp_path: Path,
     for at, folder in enumerate(folders):
         folder.mkdir()
         for i in range(5):
-            (folder / segment.segment_name(i, 1.7e9 + 100.0 * i + at)).write_bytes(b"x")
+            (folder / segment.format_segment_name(i, 1.7e9 + 100.0 * i + at)).write_bytes(b"x")
     left = lambda: [len(segment.list_segments(folder)) for folder in folders]  # noqa: E731
     monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.1 * sum(left()))
-    assert retention.delete_until_free(tmp_path, folders, share=0.75) == ""
+    assert retention.delete_until_free(tmp_path, folders, max_used_share=0.75) == ""
     assert left() == [3, 4]
-    assert "no older segment is left" in retention.delete_until_free(tmp_path, folders, share=0.2)
+    assert "no older segment is left" in retention.delete_until_free(tmp_path, folders, max_used_share=0.2)
     assert left() == [2, 2]
 
 
@@ -277,9 +277,9 @@ def test_a_disk_that_others_have_filled_stops_the_recording(tmp_path: Path, monk
     monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.95)
     keeper = Recorder(Storage(folder=tmp_path), [SAMPLES])
     keeper.start()
-    keeper.samples("bench", rows(0, 10), 0)
+    keeper.queue_samples("bench", rows(0, 10), 0)
     wait_for(lambda: "95 % full" in keeper.state)
-    keeper.samples("bench", rows(10, 10), 0)  # waits until there is room
+    keeper.queue_samples("bench", rows(10, 10), 0)  # waits until there is room
     monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.5)
     wait_for(lambda: keeper.state == "ok")
     keeper.close(PATIENCE_S)
@@ -309,29 +309,29 @@ def now_rows(first: int, n: int, wall_ns: int) -> SampleBlock:
 
 def lived(tmp_path: Path, tick_step: float | None = 1.0) -> DeviceWorker:
     """A station that has taken 60 s, recorded them, and died without a word."""
-    keeper = Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())])
+    keeper = Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())])
     keeper.start()
     before = station(tmp_path, keeper)
     mono_ns = time.monotonic_ns()
     for first in range(0, 6000, 50):
         before._push(rows(first, 50, start_ns=mono_ns - 6000 * 10_000_000))
-        before.work(first / 100.0)
-    before.work(100.0, drain=True)
-    keeper.set_state("bench", msgspec.structs.replace(before.restore.state(), tick_step=tick_step))
+        before.process_new_samples(first / 100.0)
+    before.process_new_samples(100.0, drain=True)
+    keeper.set_estimate_state("bench", msgspec.structs.replace(before.restore.state_to_record(), tick_step=tick_step))
     wait_for(lambda: sum(len(piece.samples) for piece in written(tmp_path / "bench")) == 6000)
     before._push(rows(6000, 1, start_ns=mono_ns - 6000 * 10_000_000))  # with what is known at last
-    before.work(101.0, drain=True)
+    before.process_new_samples(101.0, drain=True)
     keeper.close(PATIENCE_S)
     return before
 
 
 def test_the_window_after_a_restart_is_the_one_before(tmp_path: Path) -> None:
     before = lived(tmp_path)
-    keeper = Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())])
+    keeper = Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())])
     after = station(tmp_path, keeper)
-    after.restore.resume(keeper.tail("bench"))
+    after.restore.resume_from(keeper.find_recording_tail("bench"))
     assert not after._can_take()  # new samples wait
-    after.rebuild()
+    after.rebuild_window()
     assert after._can_take()
     old, new = before.pipeline.estimator.get(), after.pipeline.estimator.get()
     assert new.curve.n == old.curve.n == 3000
@@ -350,23 +350,23 @@ def test_the_window_after_a_restart_is_the_one_before(tmp_path: Path) -> None:
 
 
 def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path: Path) -> None:
-    keeper = Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())])
+    keeper = Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())])
     keeper.start()
     before = station(tmp_path, keeper)
     mono_ns = time.monotonic_ns()
     for first in range(0, 6000, 50):
         before._push(rows(first, 50, start_ns=mono_ns - 6000 * 10_000_000))
-        before.work(first / 100.0)
+        before.process_new_samples(first / 100.0)
         if first == 5000:
             before.pipeline.estimator.restart(2, 1000)
             before.pipeline.since_ns[2] = before.timeline._newest_ns - 9_995_000_000
-            before.publish_status({}, 0)
+            before.slew_and_publish_status({}, 0)
             all_written(keeper)
     wait_for(lambda: sum(len(piece.samples) for piece in written(tmp_path / "bench")) == 6000)
     keeper.close(PATIENCE_S)
-    after = station(tmp_path, Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())]))
-    after.restore.resume(after._recorder.tail("bench"))
-    after.rebuild()
+    after = station(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())]))
+    after.restore.resume_from(after._recorder.find_recording_tail("bench"))
+    after.rebuild_window()
     old, new = before.pipeline.estimator.get(), after.pipeline.estimator.get()
     assert old.curve.terms[0, 2] < old.curve.terms[0, 0]
     np.testing.assert_array_equal(new.curve.terms, old.curve.terms)
@@ -377,11 +377,11 @@ def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path:
 def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: Path, tick_step) -> None:
     begun_s = time.monotonic()
     lived(tmp_path, tick_step)
-    keeper = Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())])
+    keeper = Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())])
     after = station(tmp_path, keeper)
     after.start()
     try:
-        after.rebuild()
+        after.rebuild_window()
         if tick_step is None:
             rebuilt_s = time.monotonic()
             wait_for(lambda: time.monotonic() > rebuilt_s + 1.0)  # longer than the lines that come at once would take
@@ -393,7 +393,7 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
             assert counts.lost == 40
         else:
             assert counts.lost <= RATE * (time.monotonic() - begun_s)
-        wait_for(lambda: after.work(time.monotonic()) or after.pipeline.estimator.samples >= 6059)
+        wait_for(lambda: after.process_new_samples(time.monotonic()) or after.pipeline.estimator.samples >= 6059)
         assert after.pipeline.estimator.samples_in_window == 3000
     finally:
         after.stop()
@@ -410,13 +410,13 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
     ids=["another mounting", "longer ago than the window", "the clock was set back"],
 )
 def test_what_the_samples_cannot_go_on_from_begins_anew(tmp_path, axes, older_s: float, reason) -> None:
-    keeper = Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())])
+    keeper = Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())])
     keeper.start()
-    keeper.samples("bench", rows(0, 3000, start_ns=time.time_ns() - int((older_s + 30.0) * 1e9)), 0)
+    keeper.queue_samples("bench", rows(0, 3000, start_ns=time.time_ns() - int((older_s + 30.0) * 1e9)), 0)
     keeper.close(PATIENCE_S)
-    after = station(tmp_path, Recorder(Storage(folder=tmp_path), [origin("bench", axes)]), axes=axes)
-    after.restore.resume(after._recorder.tail("bench"))
-    after.rebuild()
+    after = station(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", axes)]), axes=axes)
+    after.restore.resume_from(after._recorder.find_recording_tail("bench"))
+    after.rebuild_window()
     assert after.pipeline.estimator is None
     assert after._can_take() is False or after.ring.room == after.ring.capacity
     texts = [event.text for event in after.timeline._events]
@@ -425,11 +425,11 @@ def test_what_the_samples_cannot_go_on_from_begins_anew(tmp_path, axes, older_s:
 
 def test_files_that_are_no_segments_are_passed_over(tmp_path: Path) -> None:
     lived(tmp_path)
-    (tmp_path / "bench" / segment.segment_name(900, 1.8e9)).write_bytes(b"no stream at all")
-    (tmp_path / "bench" / segment.segment_name(901, 1.8e9)).write_bytes(b"")
-    after = station(tmp_path, Recorder(Storage(folder=tmp_path), [origin("bench", AxisMap())]))
-    after.restore.resume(after._recorder.tail("bench"))
-    after.rebuild()
+    (tmp_path / "bench" / segment.format_segment_name(900, 1.8e9)).write_bytes(b"no stream at all")
+    (tmp_path / "bench" / segment.format_segment_name(901, 1.8e9)).write_bytes(b"")
+    after = station(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())]))
+    after.restore.resume_from(after._recorder.find_recording_tail("bench"))
+    after.rebuild_window()
     assert after.pipeline.estimator.samples_in_window == 3000
 
 
@@ -448,10 +448,10 @@ def test_two_recorders_on_one_folder_lose_nothing_and_keep_nothing_twice(tmp_pat
     """Both receive the same samples; the times of the second are 3 ms late."""
     first, second = (Recorder(Storage.model_construct(folder=tmp_path, segment_s=10.0), [SAMPLES]) for _ in range(2))
     for one in (first, second):
-        one.set_state("bench", DaemonState(RATE))
+        one.set_estimate_state("bench", DaemonState(RATE))
     first.start()
     wait_for((tmp_path / "recording.lock").exists)
-    first.samples("bench", rows(0, 20), 0)
+    first.queue_samples("bench", rows(0, 20), 0)
     wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
     second.start()
     wait_for(lambda: "in use" in second.state)
@@ -461,14 +461,14 @@ def test_two_recorders_on_one_folder_lose_nothing_and_keep_nothing_twice(tmp_pat
     )
     given = 20
     for at in range(20, 4000, 20):
-        first.samples("bench", rows(at, 20), 0)
-        second.samples("bench", rows(at, 20), 3_000_000)
+        first.queue_samples("bench", rows(at, 20), 0)
+        second.queue_samples("bench", rows(at, 20), 3_000_000)
         given = at + 20
     first.close()
     first_has, _ = rows_of_all(tmp_path / "bench")
     assert first_has.tolist() == list(range(given))
     for at in range(given, given + 2000, 20):
-        second.samples("bench", rows(at, 20), 3_000_000)
+        second.queue_samples("bench", rows(at, 20), 3_000_000)
     wait_for(lambda: second.state == "ok")
     second.close()
     ticks, lost = rows_of_all(tmp_path / "bench")
@@ -484,14 +484,14 @@ def test_a_second_recorder_without_counts_goes_on_by_time_and_says_what_is_missi
         return make_block(one.t_ns.copy(), one.values.copy(), one.temperature_c.copy())
 
     first, second = (Recorder(Storage(folder=tmp_path), [SAMPLES]) for _ in range(2))
-    first.set_state("bench", DaemonState(RATE))
+    first.set_estimate_state("bench", DaemonState(RATE))
     first.start()
-    first.samples("bench", uncounted(0, 100), 0)
+    first.queue_samples("bench", uncounted(0, 100), 0)
     wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
     second.start()
     wait_for(lambda: "in use" in second.state)
-    second.samples("bench", uncounted(50, 50), 0)  # these are in the recording
-    second.samples("bench", uncounted(105, 50), 0)
+    second.queue_samples("bench", uncounted(50, 50), 0)  # these are in the recording
+    second.queue_samples("bench", uncounted(105, 50), 0)
     first.close()
     wait_for(lambda: second.state == "ok")
     second.close()
@@ -505,17 +505,17 @@ def test_a_second_recorder_deletes_nothing(tmp_path: Path, monkeypatch) -> None:
     monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.1)
     first = Recorder(Storage(folder=tmp_path), [SAMPLES])
     first.start()
-    first.samples("bench", rows(0, 100), 0)
+    first.queue_samples("bench", rows(0, 100), 0)
     wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
     for i in range(2, 8):
-        (tmp_path / "bench" / segment.segment_name(i, 1.0e9)).write_bytes(b"old")
+        (tmp_path / "bench" / segment.format_segment_name(i, 1.0e9)).write_bytes(b"old")
     (tmp_path / "bench" / "00000099_x.arrows.part").write_bytes(b"of the first")
     monkeypatch.setattr(retention, "used_disk_share", lambda _: 0.99)
     monkeypatch.setattr(first, "_delete_old", lambda: None)
     before = sorted(path.name for path in tmp_path.rglob("*"))
     second = Recorder(Storage.model_construct(folder=tmp_path, keep_s=10.0, segment_s=10.0), [SAMPLES])
     second.start()
-    second.samples("bench", rows(0, 100), 0)
+    second.queue_samples("bench", rows(0, 100), 0)
     wait_for(lambda: "in use" in second.state)
     rounds = second._lock_failed_s
     wait_for(lambda: second._lock_failed_s != rounds)
@@ -529,11 +529,11 @@ def test_raw_bytes_of_two_recorders_are_kept_once(tmp_path: Path) -> None:
     given = [Chunk(bytes([i]), START_NS + i, address=i) for i in range(100)]
     first, second = (Recorder(Storage(folder=tmp_path), [of]) for _ in range(2))
     first.start()
-    first.chunks("bench", given[:60], 0)
+    first.queue_chunks("bench", given[:60], 0)
     wait_for(lambda: bool(segment.list_segments(tmp_path / "bench" / "raw")))
     second.start()
     wait_for(lambda: "in use" in second.state)
-    second.chunks("bench", given[30:], 0)
+    second.queue_chunks("bench", given[30:], 0)
     first.close()
     wait_for(lambda: second.state == "ok")
     second.close()
@@ -577,7 +577,7 @@ def test_a_file_that_is_changed_while_it_is_written_is_noticed_and_another_begun
     folder = tmp_path / "store" / "bench"
     keeper = Recorder(Storage(folder=tmp_path / "store"), [SAMPLES])
     keeper.start()
-    keeper.samples("bench", rows(0, 100), 0)
+    keeper.queue_samples("bench", rows(0, 100), 0)
     wait_for(lambda: bool(segment.list_segments(folder)))
     (path,) = segment.list_segments(folder)
     tamper(path)
@@ -585,7 +585,7 @@ def test_a_file_that_is_changed_while_it_is_written_is_noticed_and_another_begun
     assert f"{path} was " in keeper.state
     assert "with 100 rows in it; a new file is begun" in keeper.state
     assert [one.kind for one in keeper.take_events()] == ["recording_stopped", "recording_back"]
-    keeper.samples("bench", rows(100, 100), 0)
+    keeper.queue_samples("bench", rows(100, 100), 0)
     wait_for(lambda: any(one != path and one.stat().st_size > 9000 for one in segment.list_segments(folder)))
     keeper.close()
     newest = segment.list_segments(folder)[-1]
@@ -609,8 +609,8 @@ def test_the_folder_of_one_device_can_go_while_another_is_recorded(tmp_path: Pat
     keeper = Recorder(Storage(folder=tmp_path), [SAMPLES, SegmentMetadata("other", "samples")])
     keeper.start()
     for at in range(0, 300, 100):
-        keeper.samples("bench", rows(at, 100), 0)
-        keeper.samples("other", rows(at, 100), 0)
+        keeper.queue_samples("bench", rows(at, 100), 0)
+        keeper.queue_samples("other", rows(at, 100), 0)
         if at == 0:
             wait_for(lambda: len(list(tmp_path.rglob("*.arrows"))) == 2)
             shutil.rmtree(tmp_path / "bench")
@@ -624,10 +624,10 @@ def test_the_folder_of_one_device_can_go_while_another_is_recorded(tmp_path: Pat
 def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kind: str) -> None:
     keeper = Recorder(Storage(folder=tmp_path), [SAMPLES])
     keeper.start()
-    keeper.samples("bench", rows(0, 100), 0)
+    keeper.queue_samples("bench", rows(0, 100), 0)
     wait_for(lambda: bool(segment.list_segments(tmp_path / "bench")))
     keeper.close()
-    for name in (segment.segment_name(1, 1.0e9), segment.segment_name(7, 1.7e9)):
+    for name in (segment.format_segment_name(1, 1.0e9), segment.format_segment_name(7, 1.7e9)):
         path = tmp_path / "bench" / name
         match kind:
             case "fifo":
@@ -637,13 +637,13 @@ def test_what_is_no_file_in_place_of_segments_is_passed_over(tmp_path: Path, kin
             case _:
                 path.symlink_to(path.name)
     again = Recorder(Storage.model_construct(folder=tmp_path, keep_s=1.0, segment_s=1.0), [SAMPLES])
-    tail = again.tail("bench")
+    tail = again.find_recording_tail("bench")
     assert tail is not None
     assert tail.newest.samples.ticks[-1] == 99
     assert len(list(tail.pieces(10.0))) == 1
     again.start()
-    again.samples("bench", rows(100, 100), 0)
-    wait_for(lambda: segment.segment_number(segment.list_segments(tmp_path / "bench")[-1]) == 8)
+    again.queue_samples("bench", rows(100, 100), 0)
+    wait_for(lambda: segment.parse_segment_number(segment.list_segments(tmp_path / "bench")[-1]) == 8)
     again.close()
     assert again.state == "ok"
 
@@ -652,7 +652,7 @@ def test_something_else_in_place_of_the_folder_is_said_until_it_is_gone(tmp_path
     os.mkfifo(tmp_path / "store")
     keeper = Recorder(Storage(folder=tmp_path / "store"), [SAMPLES])
     keeper.start()
-    keeper.samples("bench", rows(0, 100), 0)
+    keeper.queue_samples("bench", rows(0, 100), 0)
     said = f"{tmp_path / 'store'}: is a FIFO, not a folder; recording stopped, trying again"
     wait_for(lambda: keeper.state == said)
     (tmp_path / "store").unlink()
@@ -668,7 +668,7 @@ def test_a_folder_that_cannot_be_used_costs_only_what_has_no_room_in_memory(tmp_
     keeper.start()
     wait_for(lambda: "is a file, not a folder" in keeper.state)
     for at in range(0, 1000, 100):
-        keeper.samples("bench", rows(at, 100), 0)
+        keeper.queue_samples("bench", rows(at, 100), 0)
     (tmp_path / "store").unlink()
     wait_for(lambda: keeper.state.startswith("ok"))
     keeper.close()

@@ -22,7 +22,7 @@ def fed(one: Compensator, values: np.ndarray, rows: int = 100) -> np.ndarray:
     out = []
     for start in range(0, len(values), rows):
         out.append(one.compensate(values[start : start + rows]))
-        one.identify()
+        one.identify_due_models()
     return np.concatenate(out)
 
 
@@ -85,7 +85,11 @@ def test_a_step_of_the_bias_is_taken_in_the_end_and_forgets_what_was_before():
     np.testing.assert_allclose(one.bias, [0.02 + DEGREE, 0.02, 0.02], atol=2e-4)
     became = [int(i.outcome[0]) for i in one.take_intervals()]
     assert became.count(STEPPED) == 1
-    assert np.isfinite(one.identification_data(0)[0]).sum() < 400 < np.isfinite(one.identification_data(1)[0]).sum()
+    assert (
+        np.isfinite(one.identification_means_and_variance(0)[0]).sum()
+        < 400
+        < np.isfinite(one.identification_means_and_variance(1)[0]).sum()
+    )
 
 
 def test_what_turns_from_the_start_is_never_a_bias():
@@ -119,7 +123,7 @@ def test_gaps_outliers_and_missing_values():
         values[rng.integers(300, size=5)] *= 1e4
         values[rng.integers(300, size=20), rng.integers(6, size=20)] = np.nan
         out = one.compensate(values, lost=int(rng.choice([0, 0, 1, 30, 5000, 10**8])))
-        one.identify()
+        one.identify_due_models()
         np.testing.assert_array_equal(np.isfinite(out), np.isfinite(values))
     np.testing.assert_allclose(one.bias, 0.02, atol=1e-3)
 
@@ -143,12 +147,12 @@ def test_models_are_identified_as_rest_goes_on_and_memory_stays():
     for k in range(30):
         one.compensate(still(10.0, k))
         asked.append(bool(one.axes_due))
-        one.identify()
+        one.identify_due_models()
         assert not one.axes_due
     assert asked.count(True) == 4  # 60, 90, 135, 203 intervals, as far as they end
     assert all(isinstance(model, ArmaModel) for model in one.models)
-    assert one.identification_data(0)[0].size <= HISTORY_INTERVALS
-    assert one.error == pytest.approx(SIGMA / np.sqrt(100.0 * 60.0), rel=0.9)
+    assert one.identification_means_and_variance(0)[0].size <= HISTORY_INTERVALS
+    assert one.bias_standard_error == pytest.approx(SIGMA / np.sqrt(100.0 * 60.0), rel=0.9)
 
 
 @pytest.mark.long

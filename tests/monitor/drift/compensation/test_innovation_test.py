@@ -26,7 +26,7 @@ def test_twice_the_noise_is_told_once_and_again_when_it_comes_back():
     assert one.mean_square > LIMIT
     assert alarms(1.0, 400) == 0
     assert alarms(2.0, 400) == 1
-    one.reset()
+    one.forget_innovations()
     assert alarms(1.0, INTERVALS - 1) == 0
 
 

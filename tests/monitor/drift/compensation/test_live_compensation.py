@@ -24,10 +24,10 @@ def test_blocks_keep_what_is_not_a_rate():
     assert (second.lost, len(second)) == (100, 1000)
     assert (first.temperature_c == 21.0).all()
     np.testing.assert_array_equal(first.ticks, np.arange(3000))
-    looks = live.take()
+    looks = live.take_updates()
     assert [look.t_ns for look in looks[:3]] == [990_000_000, 1_990_000_000, 2_990_000_000]
     assert looks[-1].t_ns == 39_990_000_000
-    assert not live.take()
+    assert not live.take_updates()
     np.testing.assert_allclose(looks[-1].expected, 0.01, atol=3e-4)
 
 
@@ -47,7 +47,7 @@ def test_noise_that_grows_is_an_event_with_its_times():
     one = events[0]
     assert 200.0 < one.t_ns / 1e9 < 350.0
     assert one.since_ns is not None
-    assert "times as large as they should be" in one.text
+    assert "times as large as expected" in one.text
     assert one.values["innovation"]["mean_square"] == pytest.approx(one.sigma**2)
 
 

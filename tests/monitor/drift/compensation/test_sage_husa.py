@@ -35,7 +35,7 @@ def test_without_adaptation_it_is_the_textbook_filter():
         x, p = x + gain * (z - h @ x), p - np.outer(gain, h @ p)
         x, p = a @ x, a @ p @ a.T + MODEL.variance * np.outer(b, b) + np.diag([0.0, 0.0, row["level_variance"]])
         total, became = sage_husa.update_with_interval(row, z, np.nan, 1e-12)
-        sage_husa.predict(row)
+        sage_husa.predict_next_interval(row)
         assert became == sage_husa.USED
         assert total == pytest.approx(s)
     np.testing.assert_allclose(row["state"], x, rtol=1e-9)
@@ -49,7 +49,7 @@ def test_noise_that_doubles_is_noticed_and_only_by_the_one_that_adapts():
         z = 3.0 + 2.0 * rng.standard_normal()
         for row in (one, other):
             sage_husa.update_with_interval(row, z, 4.0 * rng.chisquare(3) / 3.0, 1e-12)
-            sage_husa.predict(row)
+            sage_husa.predict_next_interval(row)
     assert one["white_variance"] == pytest.approx(4.0, rel=0.25)
     assert other["white_variance"] == 1.0
 
@@ -59,12 +59,12 @@ def test_an_outlier_is_left_out_and_a_step_taken_after_it_has_stayed():
     row["rest_count"] = 40.0
     for k in range(60):
         became = sage_husa.update_with_interval(row, 3.0 + (100.0 if k == 5 else 0.0), 1.0, 1e-12)[1]
-        sage_husa.predict(row)
+        sage_husa.predict_next_interval(row)
         assert became == (sage_husa.REJECTED if 5 <= k <= 11 else sage_husa.USED), k
     told = []
     for _ in range(120):
         told.append(sage_husa.update_with_interval(row, 103.0, 1.0, 1e-12)[1])
-        sage_husa.predict(row)
+        sage_husa.predict_next_interval(row)
     assert told.index(sage_husa.STEPPED) == 92  # as long as the level before had been confirmed: 40 + 60 − 7 intervals
     assert told[93:] == [sage_husa.USED] * 27
     assert sage_husa.expected_bias(row)[0] == pytest.approx(103.0, abs=1.0)
@@ -74,7 +74,7 @@ def test_what_wanders_far_off_is_no_step():
     row = adopted(True)
     for k in range(400):
         _, became = sage_husa.update_with_interval(row, 3.0 + 100.0 + 20.0 * k, 1.0, 1e-12)
-        sage_husa.predict(row)
+        sage_husa.predict_next_interval(row)
         assert became == sage_husa.REJECTED
 
 
@@ -110,7 +110,7 @@ def test_covariances_stay_positive_whatever_comes(course, model):
             value = {"used": z, "outlier": 1e6 * z, "same": model.mean}[kind]
             total, _ = sage_husa.update_with_interval(row, value, scatter, 1e-30)
             assert total > 0.0
-        sage_husa.predict(row)
+        sage_husa.predict_next_interval(row)
         p = row["covariance"]
         assert all(np.isfinite(row[name]).all() for name in row.dtype.names)
         np.testing.assert_allclose(p, p.T, atol=1e-9 * np.trace(p))

@@ -53,7 +53,7 @@ def test_bias_is_expected_from_temperature():
     assert last.interval_s == INTERVAL_S
     assert last.axes["gz"].slope == pytest.approx(COEFFICIENT, rel=0.2)
     assert abs(last.axes["az"].slope) < 1e-5
-    inside = [look.axes["gz"].one_step.side(look.axes["gz"].bias) == 0 for look in looks[20:]]
+    inside = [look.axes["gz"].one_step.side_of(look.axes["gz"].bias) == 0 for look in looks[20:]]
     assert np.mean(inside) > 0.85
     assert live.take_events() == []
 

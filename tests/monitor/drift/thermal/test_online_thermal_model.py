@@ -29,13 +29,13 @@ class Run:
             self.looks.append(self.following.update(float(bias), 1e-7, float(temperature_c)))
             while not self.slow and self.following.step():
                 pass
-            self.found += [*self.following.take(), None][:1]
+            self.found += [*self.following.take_unexplained_changes(), None][:1]
         return self
 
 
 def shares(looks, biases):
     """Inside their one-step intervals."""
-    return np.mean([one.one_step.side(bias) == 0 for one, bias in zip(looks, biases, strict=True)])
+    return np.mean([one.one_step.side_of(bias) == 0 for one, bias in zip(looks, biases, strict=True)])
 
 
 @pytest.mark.long
@@ -61,7 +61,7 @@ def test_an_interval_is_expected_before_it_is_known():
     other[-1] += 1.0
     one, two = (Run().give(biases, means.temperature_c).looks[-1] for biases in (means.bias, other))
     assert (one.one_step, one.multi_step) == (two.one_step, two.multi_step)
-    assert two.one_step.side(other[-1]) == 1
+    assert two.one_step.side_of(other[-1]) == 1
 
 
 @pytest.mark.long
@@ -92,7 +92,7 @@ def test_a_step_that_temperature_explains_is_none():
 def test_a_new_offset_is_learned_and_nothing_is_told():
     means = hourly(5, 2, 0.05)
     run = Run().give(means.bias[:50], means.temperature_c[:50])
-    run.following.offset_is_new()
+    run.following.learn_new_offset()
     run.give(means.bias[50:] + 1e-3, means.temperature_c[50:])
     assert [one.text for one in run.looks[50 : 50 + OFFSET_INTERVALS]] == [NEW_OFFSET] * OFFSET_INTERVALS
     after = run.looks[50 + OFFSET_INTERVALS :]
@@ -104,7 +104,7 @@ def test_a_new_offset_is_learned_and_nothing_is_told():
 def test_before_there_is_a_model_a_new_offset_begins_the_record_anew():
     means = hourly(6, 2, 0.05)
     run = Run().give(means.bias[:8], means.temperature_c[:8])
-    run.following.offset_is_new()
+    run.following.learn_new_offset()
     run.give(means.bias[8:22] + 1e-3, means.temperature_c[8:22])
     assert [one.one_step is None for one in run.looks[8:]] == [True] * 12 + [False] * 2
 
@@ -113,7 +113,7 @@ def test_a_choice_is_made_in_pieces_and_holds_nothing_up():
     means = hourly(7, 2, 0.05)
     run = Run(slow=True).give(means.bias[:40], means.temperature_c[:40])
     assert run.following.choosing
-    assert run.looks[-1].text == "the model is being chosen"
+    assert run.looks[-1].text == "the model is being selected"
     pieces = 0
     while run.following.step():
         pieces += 1
@@ -152,7 +152,7 @@ def test_what_is_missing_is_passed_over():
 def test_temperature_that_hardly_moves_says_so():
     rng = np.random.default_rng(10)
     run = Run().give(1e-6 * rng.standard_normal(30), 25.0 + 0.01 * rng.standard_normal(30))
-    assert "temperature hardly moved" in run.looks[-1].text
+    assert "temperature hardly changed" in run.looks[-1].text
     assert run.looks[-1].one_step is None
 
 

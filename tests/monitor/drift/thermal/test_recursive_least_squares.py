@@ -33,13 +33,13 @@ def test_interval_by_interval_is_the_whole_at_once(shape, phi):
     bias[[30, 31, 45]] = np.nan
     means = replace(means, bias=bias)
     model = of(means, shape, phi)
-    one, whole = RecursiveThermalFit(model, means.first(20)), RecursiveThermalFit(model, means)
+    one, whole = RecursiveThermalFit(model, means.first_intervals(20)), RecursiveThermalFit(model, means)
     for k in range(20, 72):
         one.update(float(means.temperature_c[k]), float(means.bias[k]))
     for name in ("coefficients", "initial_state", "sigma", "lowest_c", "highest_c"):
         np.testing.assert_allclose(getattr(one.model, name), getattr(whole.model, name), rtol=1e-7, err_msg=name)
     np.testing.assert_allclose(one.model.covariance, whole.model.covariance, rtol=1e-4, atol=1e-25)
-    for mine, theirs in zip(one.predict(27.0), whole.predict(27.0), strict=True):
+    for mine, theirs in zip(one.predict_multi_and_one_step(27.0), whole.predict_multi_and_one_step(27.0), strict=True):
         np.testing.assert_allclose(astuple(mine), astuple(theirs), rtol=1e-7)
 
 
@@ -58,11 +58,11 @@ def test_it_begins_with_what_was_fitted(seed):
 def test_what_it_expects_is_what_the_model_predicts(to_c):
     """With Student's factor, as the scatter is known from 71 intervals less what was fitted."""
     means = hourly(4, 1, 0.05)
-    recursion = RecursiveThermalFit(replace(fit_thermal_model(means).model, phi=0.3), means.first(71))
+    recursion = RecursiveThermalFit(replace(fit_thermal_model(means).model, phi=0.3), means.first_intervals(71))
     warmth = np.append(means.temperature_c[:71], to_c)
     measured = np.append(means.bias[:71], np.nan)
     wide = student.ppf(0.975, recursion.degrees_of_freedom) / Z95
-    for found, known in zip(recursion.predict(to_c), (None, measured), strict=True):
+    for found, known in zip(recursion.predict_multi_and_one_step(to_c), (None, measured), strict=True):
         want = predict(recursion.model, warmth, known, began=True)
         assert found.bias == pytest.approx(want.bias[-1], rel=1e-9)
         assert found.hi - found.bias == pytest.approx(wide * (want.hi[-1] - want.bias[-1]), rel=1e-6)
@@ -76,5 +76,7 @@ def test_without_temperature_it_goes_on_as_if_that_had_stayed():
     last = float(means.temperature_c[-1])
     held.update(np.nan, 1.0)
     told.update(last, np.nan)
-    assert held.predict(np.nan)[0].bias == pytest.approx(told.predict(last)[0].bias)
+    assert held.predict_multi_and_one_step(np.nan)[0].bias == pytest.approx(
+        told.predict_multi_and_one_step(last)[0].bias
+    )
     assert held.degrees_of_freedom == RecursiveThermalFit(model, means).degrees_of_freedom

@@ -40,14 +40,14 @@ def test_outside_now_or_twice_before_is_not_clear():
     suspicion = ResidualAlarm()
     for bias, clear in [(5.0, False), (0.0, True), (-5.0, False), (0.0, True), (5.0, False), (0.0, False)]:
         suspicion.update(bias, MULTI, ONE)
-        assert suspicion.clear is clear
-    suspicion.forget()
-    assert suspicion.clear
+        assert suspicion.is_within_prediction is clear
+    suspicion.forget_residuals()
+    assert suspicion.is_within_prediction
 
 
 def test_far_outside_is_no_chance():
     suspicion = ResidualAlarm()
-    assert not suspicion.far
+    assert not suspicion.is_unfit_for_update
     for bias, far in [(4.9, False), (5.1, True), (-3.1, True), (1.0, False)]:
         suspicion.update(bias, MULTI, ONE)  # half a width of 2 about 1
-        assert suspicion.far is far
+        assert suspicion.is_unfit_for_update is far

@@ -32,17 +32,17 @@ def test_noise_is_not_said_to_depend_on_temperature(shape: str, noise: str) -> N
         assert find_dependence(means) is None
         loop = find_hysteresis(means)
         assert (loop is None) == (shape == "heating")
-        assert loop is None or not loop.significant
+        assert loop is None or not loop.hysteresis_is_significant
 
 
 @pytest.mark.parametrize("law", ["loop", "lag", "play"])
 @pytest.mark.parametrize("shape", SHAPES[:-1])
 def test_hysteresis_has_its_size(shape: str, law: str) -> None:
     curve = chamber_means(shape, drift("white", COUNT, np.random.default_rng(4)), "cubic", 200.0).bias
-    assert not find_hysteresis(chamber_means(shape, curve)).significant  # type: ignore[union-attr]
+    assert not find_hysteresis(chamber_means(shape, curve)).hysteresis_is_significant  # type: ignore[union-attr]
     found = find_hysteresis(chamber_means(shape, curve, law, 100.0))
     assert found is not None
-    assert found.significant
+    assert found.hysteresis_is_significant
     assert found.size == pytest.approx(100.0, rel=0.12)
 
 
@@ -51,7 +51,7 @@ def test_a_steady_drift_is_neither_temperature_nor_hysteresis() -> None:
     assert find_dependence(means) is None
     loop = find_hysteresis(means)
     assert loop is not None
-    assert not loop.significant
+    assert not loop.hysteresis_is_significant
 
 
 def test_a_loop_alone_is_temperature_too() -> None:

@@ -19,7 +19,7 @@ DAY = 24  # h, to fit; two more to judge
 def errors(seed, lag_h, noise):
     """Multi-step error over that of a cubic on the two days that chose nothing; the share of means in the interval."""
     means = hourly(seed, lag_h, noise)
-    found = fit_thermal_model(means.first(DAY))
+    found = fit_thermal_model(means.first_intervals(DAY))
     model = predict(found.model, means.temperature_c, began=True)
     cubic = np.polynomial.Polynomial.fit(means.temperature_c[:DAY], means.bias[:DAY], 3)(means.temperature_c)
     apart, of_cubic = ((means.bias - one)[DAY:] for one in (model.bias, cubic))
@@ -32,18 +32,18 @@ def errors(seed, lag_h, noise):
     ("lag_h", "noise", "most"), [(1, 0.05, 0.65), (2, 0.05, 0.45), (4, 0.05, 0.3), (4, 0.02, 0.15)]
 )
 def test_late_heat_is_followed(lag_h, noise, most):
-    """The paper has 0.654 of a cubic's error; medians of 200 seeds stand in docs/thermal.md."""
+    """The paper has 0.654 of a cubic's error; medians of 200 seeds are in docs/thermal-measurements.md."""
     ratios, inside, found = zip(*(errors(seed, lag_h, noise) for seed in range(6)), strict=True)
     assert np.median(ratios) < most
     assert np.mean(inside) > 0.9
     for one in found:
-        assert one.model.shape.memory >= 1
+        assert one.model.shape.difference_equation_order >= 1
         assert max(one.model.shape.constants_s) == pytest.approx(3600.0 * lag_h, rel=0.7)
-        assert one.model.slope == pytest.approx(COEFFICIENT, rel=0.3)
+        assert one.model.mean_slope == pytest.approx(COEFFICIENT, rel=0.3)
     for seed in range(6):
         # one day is one cycle of the temperature, in which correlated noise explains the loop as well
         two_days, three_days = (
-            fit_thermal_model(hourly(seed, lag_h, noise).first(days * DAY)).hysteresis for days in (2, 3)
+            fit_thermal_model(hourly(seed, lag_h, noise).first_intervals(days * DAY)).hysteresis for days in (2, 3)
         )
         assert two_days > 0.0
         assert two_days == pytest.approx(three_days, rel=0.25)
@@ -64,7 +64,7 @@ def test_one_step_estimates_know_the_bias_before():
         means = hourly(seed, 2, 0.01)
         step = 0.04 * np.ptp(means.bias)
         moved = replace(means, bias=means.bias + step * np.random.default_rng(seed).standard_normal(72).cumsum())
-        model = fit_thermal_model(moved.first(48)).model
+        model = fit_thermal_model(moved.first_intervals(48)).model
         one = predict(model, moved.temperature_c, moved.bias, began=True)
         ratios.append(np.std((moved.bias - one.bias)[48:]) / step)
         inside.append(np.mean(((one.lo < moved.bias) & (moved.bias < one.hi))[48:]))
@@ -80,7 +80,7 @@ def test_missing_intervals_leave_their_place():
     holes = replace(means, bias=bias, temperature_c=warmth)
     whole, found = fit_thermal_model(means).model, fit_thermal_model(holes).model
     assert found.shape.name == whole.shape.name
-    np.testing.assert_allclose(found.slope, whole.slope, rtol=0.1)
+    np.testing.assert_allclose(found.mean_slope, whole.mean_slope, rtol=0.1)
     assert np.isfinite(predict(found, warmth).bias).all()
 
 
@@ -89,7 +89,7 @@ def test_units_do_not_matter():
     large = replace(means, bias=1e6 * means.bias)
     one, other = fit_thermal_model(means).model, fit_thermal_model(large).model
     assert one.shape == other.shape
-    assert other.slope == pytest.approx(1e6 * one.slope, rel=1e-6)
+    assert other.mean_slope == pytest.approx(1e6 * one.mean_slope, rel=1e-6)
 
 
 def test_another_start_of_the_sensor_is_an_offset():
@@ -110,8 +110,8 @@ def test_beyond_the_temperatures_of_the_fit_nothing_runs_away():
     model = fit_thermal_model(IntervalMeans(60.0, bias, np.full(60, 1e-6), t)).model
     assert model.shape.powers >= 3
     beyond = predict(model, np.array([30.0, 35.0, 40.0]))
-    np.testing.assert_allclose(np.diff(beyond.bias), 5.0 * model.slope, rtol=1e-9)
-    assert np.all(np.diff(beyond.hi - beyond.lo) > 5.0 * model.slope)
+    np.testing.assert_allclose(np.diff(beyond.bias), 5.0 * model.mean_slope, rtol=1e-9)
+    assert np.all(np.diff(beyond.hi - beyond.lo) > 5.0 * model.mean_slope)
 
 
 def test_one_way_says_nothing_of_lateness():
@@ -121,9 +121,9 @@ def test_one_way_says_nothing_of_lateness():
     found = fit_thermal_model(
         IntervalMeans(60.0, 1e-5 * warmth + 2e-6 * rng.standard_normal(60), np.full(60, 2e-6), warmth)
     )
-    assert not found.both_ways
+    assert not found.temperature_rose_and_fell
     assert found.hysteresis is None
-    assert not found.model.shape.memory
+    assert not found.model.shape.difference_equation_order
 
 
 def test_hysteresis_is_as_wide_as_it_was_made():
@@ -146,11 +146,11 @@ def test_a_bias_that_temperature_does_not_move_is_a_constant():
 @pytest.mark.parametrize(
     ("means", "says"),
     [
-        (hourly(1, 1, 0.05).first(11), "11 intervals of 3600 s"),
-        (replace(hourly(1, 1, 0.05), temperature_c=np.full(72, 25.0)), "temperature hardly moved"),
+        (hourly(1, 1, 0.05).first_intervals(11), "11 intervals of 3600 s"),
+        (replace(hourly(1, 1, 0.05), temperature_c=np.full(72, 25.0)), "temperature hardly changed"),
         (
             replace(hourly(1, 1, 0.05), temperature_c=25.0 + 0.1 * np.random.default_rng(2).standard_normal(72)),
-            "temperature hardly moved",
+            "temperature hardly changed",
         ),
         (replace(hourly(1, 1, 0.05), bias=np.zeros(72)), "the same in all intervals"),
         (replace(hourly(1, 1, 0.05), bias=np.full(72, np.nan)), "0 intervals"),

@@ -8,9 +8,9 @@ from scipy.signal import lfilter
 
 from monitor.drift.thermal.thermal_response import (
     ThermalModelForm,
+    compute_lag_roots,
     difference_equation,
     first_order_lag,
-    lag_roots,
     least_squares,
     regressors,
 )
@@ -47,7 +47,7 @@ def test_what_was_left_behind_dies_away_with_the_roots():
     shape = ThermalModelForm(0, (2.0, 9.0))
     columns = regressors(shape, T, 1.0, began=True)
     assert columns.shape == (200, 5)
-    np.testing.assert_allclose(columns[1, -2:], lag_roots(shape, 1.0))
+    np.testing.assert_allclose(columns[1, -2:], compute_lag_roots(shape, 1.0))
 
 
 def test_sizes_do_not_depend_on_units():

@@ -12,10 +12,15 @@ from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 
 from drivers.errors import ConfigError, NotReady
-from monitor.common.config_files import CONFIG_FOLDER
+from monitor.common.shipped_file_paths import CONFIG_FOLDER
 from monitor.noise.model import NoiseModel
 from monitor.publishing import exporters
-from monitor.publishing.exporters.kalman import MARKOV_PEAK_AT, MARKOV_PEAK_RATIO, process_noise, transition
+from monitor.publishing.exporters.kalman import (
+    MARKOV_PEAK_AT,
+    MARKOV_PEAK_RATIO,
+    bias_state_transition_matrix,
+    process_noise_matrix,
+)
 
 MODEL = """
 sample_rate = 200.0
@@ -211,13 +216,13 @@ def test_discrete_noise_is_the_integral_of_the_continuous(dt: float) -> None:
     g = np.diag([n**2, k**2, 2 * sigma**2 / time])
     whole = expm(np.block([[-f, g], [np.zeros((3, 3)), f.T]]) * dt)
     phi = whole[3:, 3:].T
-    np.testing.assert_allclose(transition(dt, time), phi, rtol=1e-10, atol=1e-15)
-    np.testing.assert_allclose(process_noise(dt, n, k, sigma, time), phi @ whole[:3, 3:], rtol=1e-8, atol=1e-20)
+    np.testing.assert_allclose(bias_state_transition_matrix(dt, time), phi, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(process_noise_matrix(dt, n, k, sigma, time), phi @ whole[:3, 3:], rtol=1e-8, atol=1e-20)
 
 
 @pytest.mark.parametrize("x", [0.0999, 0.1001])
 def test_series_and_closed_form_meet(x: float) -> None:
-    own = process_noise(x, 0.0, 0.0, 1.0, 1.0)[0, 0]
+    own = process_noise_matrix(x, 0.0, 0.0, 1.0, 1.0)[0, 0]
     assert own == pytest.approx(2.0 * (x - 2 * (1 - math.exp(-x)) + (1 - math.exp(-2 * x)) / 2), rel=1e-10)
 
 

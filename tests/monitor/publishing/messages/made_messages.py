@@ -6,11 +6,11 @@ import numpy as np
 
 from drivers.sample import Event
 from monitor.common.health import Health
-from monitor.drift.thermal.live_thermal import ThermalUpdate
-from monitor.drift.thermal.online_thermal_model import AxisThermalUpdate
+from monitor.drift.thermal.live_thermal import ThermalIntervalResult
+from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
 from monitor.drift.thermal.recursive_least_squares import PredictionInterval
 from monitor.drift.thermal.temperature_dependence import TemperatureDependence
-from monitor.drift.thermal.temperature_share import TemperatureShare
+from monitor.drift.thermal.temperature_removal import TemperatureRemoval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.allan.hadamard import HadamardCurve
@@ -34,7 +34,7 @@ from monitor.publishing.messages.results import (
     CoefficientsMessage,
     EventMessage,
     GapMessage,
-    ResetMessage,
+    ResetReply,
     SlowStatistics,
     StatusMessage,
     ThermalMessage,
@@ -80,12 +80,12 @@ def gap() -> ModelGap:
     return ModelGap(10**18, 100.0, 60.0, 360_000, 1500, TAU_S, {"gx": axis("gx"), "gz": axis("gz")}, {"gz": False})
 
 
-def thermal() -> ThermalUpdate:
-    gz = AxisThermalUpdate(
+def thermal() -> ThermalIntervalResult:
+    gz = PredictedAxisInterval(
         3e-4, 1e-6, PredictionInterval(2e-4, 1e-4, 3e-4), PredictionInterval(2.2e-4, 1.8e-4, 2.6e-4), "linear", 2e-5, ""
     )
-    az = AxisThermalUpdate(9.81, np.nan, None, None, "", np.nan, "the temperature hardly moved")
-    return ThermalUpdate(0, 600.0, 25.5, {"gz": gz, "az": az})
+    az = PredictedAxisInterval(9.81, np.nan, None, None, "", np.nan, "the temperature hardly moved")
+    return ThermalIntervalResult(0, 600.0, 25.5, {"gz": gz, "az": az})
 
 
 def slow_curves() -> tuple[TotalCurve, HadamardCurve]:
@@ -136,8 +136,8 @@ def dynamic() -> DynamicAllan:
     )  # fmt: skip
 
 
-def without_temperature() -> TemperatureShare:
-    return TemperatureShare(
+def without_temperature() -> TemperatureRemoval:
+    return TemperatureRemoval(
         {"gz": "cubic"}, coefficients(), coefficients(0.5), (False,) * 6,
         {"gz": TemperatureDependence(0.75, 1e-6, "cubic", True, 60.0)},
     )  # fmt: skip
@@ -182,7 +182,7 @@ def messages() -> dict[str, Message | AnalysisMessage | FailedAnalysisMessage]:
         "event_plain": EventMessage.of(device, UNIX_S, 7, Event("link_back", 0, "back")),
         "status": StatusMessage.of(device, UNIX_S, 0, health()),
         "status_before_the_first_sample": StatusMessage.of(device, None, 0, waiting),
-        "reset": ResetMessage.of(device, UNIX_S, 7, "the window is empty"),
+        "reset": ResetReply.of(device, UNIX_S, 7, "the window is empty"),
         "history": HistoryMessage.reply(past(), query, UNIX_S, 7),
         "history_of_one_coefficient": HistoryMessage.reply(
             past(), HistoryQuery(what=("coefficients",), axes=("gz",), symbols=("B", "N")), UNIX_S, 7

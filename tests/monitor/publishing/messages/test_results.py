@@ -21,8 +21,8 @@ from monitor.publishing.messages.results import (
     CoefficientsMessage,
     EventMessage,
     GapMessage,
-    ReconcileMessage,
-    ResetMessage,
+    ReconcileReply,
+    ResetReply,
     SlowStatistics,
     StatusMessage,
     ThermalMessage,
@@ -57,8 +57,8 @@ ALL = {
     topics.THERMAL: ThermalMessage.of("bench-1", UNIX_S, 360_000, made.thermal_look()).encode(),
     topics.EVENT: EventMessage.of("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back")).encode(),
     topics.STATUS: StatusMessage.of("bench-1", UNIX_S, 0, made.health()).encode(),
-    topics.RESET: ResetMessage.of("bench-1", UNIX_S, 360_000, "the window is empty").encode(),
-    topics.RECONCILE: ReconcileMessage(device="bench-1", t=UNIX_S, samples=360_000).encode_report(
+    topics.RESET: ResetReply.of("bench-1", UNIX_S, 360_000, "the window is empty").encode(),
+    topics.RECONCILE: ReconcileReply(device="bench-1", t=UNIX_S, samples=360_000).encode_report(
         {"schema": "x", "verdict": "agrees"}, 0, None
     ),
 }
@@ -128,7 +128,7 @@ def test_thermal() -> None:
             "one_step": None,
             "model": None,
             "slope": None,
-            "text": "temperature hardly moved",
+            "text": "temperature hardly changed",
         },
     }
 
@@ -159,7 +159,7 @@ def test_where_a_model_knows_nothing_it_says_null() -> None:
 
 def test_the_reports_own_words_are_kept_and_the_head_is_ours() -> None:
     result = {"schema": "x", "samples": 5, "verdict": "explained", "axes": {"gz": {"steps": []}}}
-    found = parsed(ReconcileMessage(device="a", t=UNIX_S, samples=360_000).encode_report(result, 3, "/reports/a"))
+    found = parsed(ReconcileReply(device="a", t=UNIX_S, samples=360_000).encode_report(result, 3, "/reports/a"))
     assert (found["schema"], found["samples"]) == ("imu-monitor/reconcile/1", 360_000)
     assert (found["verdict"], found["axes"], found["exit"], found["folder"]) == (
         "explained", {"gz": {"steps": []}}, 3, "/reports/a"

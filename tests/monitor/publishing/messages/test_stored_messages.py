@@ -6,7 +6,7 @@ import pytest
 
 from monitor.publishing.messages import analysis, message
 from monitor.publishing.messages.history import MAX_HISTORY_BYTES
-from monitor.publishing.messages.results import ReconcileMessage
+from monitor.publishing.messages.results import ReconcileReply
 from tests.monitor.publishing.messages.made_messages import EXAMPLES, UNIX_S, messages
 
 MESSAGES = messages()
@@ -29,7 +29,7 @@ def test_a_message_that_is_read_and_written_again_is_the_same(name: str) -> None
 
 def test_a_reconcile_reply_has_the_keys_of_the_report() -> None:
     report = {"schema": "x", "verdict": "agrees", "axes": {"gz": {}}}
-    head = ReconcileMessage(device="bench-1", t=UNIX_S, samples=7)
+    head = ReconcileReply(device="bench-1", t=UNIX_S, samples=7)
     assert head.encode_report(report, 0, "/reports/a") == stored("reconcile")
 
 

@@ -12,7 +12,7 @@ from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic
 from monitor.estimation.fit.coefficients import Status
 from monitor.publishing.plots import allan_figure, analysis_plot, dynamic_figure, style
 from monitor.publishing.plots.allan_figure import OtherDeviation
-from monitor.publishing.plots.analysis_plot import DrawnAnalysis
+from monitor.publishing.plots.analysis_plot import AnalysisPlotData
 from monitor.publishing.plots.dynamic_figure import ChangeMark
 from tests.monitor.publishing import made
 
@@ -54,7 +54,7 @@ def lettered(axes) -> dict[str, list[tuple[float, float]]]:
 def test_both_kinds_side_by_side_in_all_colours(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     path = tmp_path / "plot.png"
-    analysis_plot.save_analysis_plot(DrawnAnalysis(made.analysis()), path, title="bench-1")
+    analysis_plot.save_analysis_plot(AnalysisPlotData(made.analysis()), path, title="bench-1")
     image = pixels(path)
     assert image.shape[1] == round(2 * analysis_plot.INCHES[0] * style.STYLE["figure.dpi"])
     for half in (image[:, : image.shape[1] // 2], image[:, image.shape[1] // 2 :]):
@@ -66,7 +66,7 @@ def test_a_gyroscope_alone_fills_the_picture(tmp_path: Path) -> None:
     estimate = made.estimate()
     estimate.curve.avar[:, [0, 1, 3, 4, 5]] = np.nan
     path = tmp_path / "plot.png"
-    analysis_plot.save_analysis_plot(DrawnAnalysis(made.analysis(estimate)), path)
+    analysis_plot.save_analysis_plot(AnalysisPlotData(made.analysis(estimate)), path)
     image = pixels(path)
     assert image.shape[1] == round(analysis_plot.INCHES[0] * style.STYLE["figure.dpi"])
     curves = image[: image.shape[0] // 2]
@@ -154,7 +154,7 @@ def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing
     path = tmp_path / "plot.png"
     estimate = made.estimate()
     estimate.curve.avar[:, 3:] = np.nan
-    drawn = DrawnAnalysis(made.analysis(estimate), dynamic=changing, marks=[ChangeMark(300.0, "gz")])
+    drawn = AnalysisPlotData(made.analysis(estimate), dynamic=changing, marks=[ChangeMark(300.0, "gz")])
     analysis_plot.save_analysis_plot(drawn, path, "bench-1")
     image = pixels(path)
     below = dynamic_figure.height_inches(changing, "gyro") * style.STYLE["figure.dpi"]
@@ -202,11 +202,11 @@ def test_one_single_step_can_be_drawn() -> None:
 def test_without_matplotlib_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ConfigError, match=r"pip install \"imu-monitor\[plot\]\""):
-        analysis_plot.save_analysis_plot(DrawnAnalysis(made.analysis()), tmp_path / "plot.png")
+        analysis_plot.save_analysis_plot(AnalysisPlotData(made.analysis()), tmp_path / "plot.png")
 
 
 @pytest.mark.long
 def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib")
     with pytest.raises(ConfigError, match="cannot write the plot"):
-        analysis_plot.save_analysis_plot(DrawnAnalysis(made.analysis()), tmp_path / "absent" / "plot.png")
+        analysis_plot.save_analysis_plot(AnalysisPlotData(made.analysis()), tmp_path / "absent" / "plot.png")

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from monitor.publishing.plots.diagnostic_figure import (
+    compared_diagnostic_svg,
     detail_view,
-    diagnostic_svg,
     gap_chart_svg,
     interval_chart_svg,
-    range_along,
+    range_on_x_axis,
     select_view,
     to_field_units,
     value_limits,
@@ -25,7 +25,7 @@ pytest.importorskip("matplotlib")
 
 SVG = "{http://www.w3.org/2000/svg}"
 START = samples.look("gz", n_true=samples.MORE_N, line=True)
-PSD, ALLAN, LEVEL, DISTRIBUTION = START.views
+PSD, ALLAN, LEVEL, DISTRIBUTION = START.plots
 PEAK = Location(frequency=(17.1, 17.5))
 
 
@@ -33,7 +33,7 @@ def drawing(
     *views: PlotData, where: Location | None = None, width: float = 4.0, height: float = 2.5
 ) -> ElementTree.Element:
     return ElementTree.fromstring(
-        diagnostic_svg([(f"panel {i}", view) for i, view in enumerate(views)], "gz", width, height, where)
+        compared_diagnostic_svg([(f"panel {i}", view) for i, view in enumerate(views)], "gz", width, height, where)
     )
 
 
@@ -84,7 +84,7 @@ def test_a_range_is_marked_and_named_where_the_diagnostic_resolves_it() -> None:
 
 
 def test_names_are_escaped_and_equal_data_give_equal_bytes() -> None:
-    first, second = (diagnostic_svg([("a <b> & $x$", PSD)], "gz", 4.0, 2.5) for _ in range(2))
+    first, second = (compared_diagnostic_svg([("a <b> & $x$", PSD)], "gz", 4.0, 2.5) for _ in range(2))
     assert first == second
     assert "a <b> & $x$" in texts(ElementTree.fromstring(first))
 
@@ -130,24 +130,24 @@ def test_a_narrow_range_has_a_detail_plot_and_a_wide_one_has_not() -> None:
 
 def test_each_range_lies_along_the_views_that_resolve_it() -> None:
     where = Location(frequency=(1, 2), tau=(3, 4), time=(5, 6), temperature=(7, 8), value=(9, 10))
-    assert [range_along(view, where) for view in START.views] == [(1, 2), (3, 4), (5, 6), None]
-    assert range_along(replace(LEVEL, x_name="temperature", x_unit="°C"), where) == (7, 8)
-    assert range_along(replace(LEVEL, x_name="lag"), where) == (3, 4)
-    assert range_along(replace(DISTRIBUTION, x_unit="rad/s"), where) == (9, 10)
+    assert [range_on_x_axis(view, where) for view in START.plots] == [(1, 2), (3, 4), (5, 6), None]
+    assert range_on_x_axis(replace(LEVEL, x_name="temperature", x_unit="°C"), where) == (7, 8)
+    assert range_on_x_axis(replace(LEVEL, x_name="lag"), where) == (3, 4)
+    assert range_on_x_axis(replace(DISTRIBUTION, x_unit="rad/s"), where) == (9, 10)
 
 
 def test_a_diagnostic_without_plot_uses_the_one_along_its_range() -> None:
-    assert select_view(START.views, "allan", Location()) is ALLAN
-    assert select_view(START.views, "lines", PEAK) is PSD
-    assert select_view(START.views, "other_axes", Location(source="ax")) is None
+    assert select_view(START.plots, "allan", Location()) is ALLAN
+    assert select_view(START.plots, "lines", PEAK) is PSD
+    assert select_view(START.plots, "other_axes", Location(source="ax")) is None
 
 
 def test_a_gap_chart_names_every_diagnostic_and_its_threshold() -> None:
     after = samples.look("gz", n_true=samples.MORE_N, line=True, known_line=True)
-    chart = ElementTree.fromstring(gap_chart_svg(START.scores, after.scores))
+    chart = ElementTree.fromstring(gap_chart_svg(START.gaps, after.gaps))
     assert {"spectrum", "Allan deviation", "level", "distribution", "other axes"} <= set(texts(chart))
     assert {"gap over threshold", "○ before   ● after", "1"} <= set(texts(chart))
-    assert "○ before   ● after" not in texts(ElementTree.fromstring(gap_chart_svg(START.scores)))
+    assert "○ before   ● after" not in texts(ElementTree.fromstring(gap_chart_svg(START.gaps)))
 
 
 def test_an_interval_chart_has_long_names_shortened_and_leaves_out_what_has_no_interval() -> None:

@@ -16,7 +16,7 @@ from monitor.estimation.analysis import Analysis
 from monitor.estimation.fit.coefficients import SYMBOLS
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
-from monitor.publishing.plots.analysis_plot import DrawnAnalysis
+from monitor.publishing.plots.analysis_plot import AnalysisPlotData
 from monitor.publishing.plots.dynamic_figure import ChangeMark
 from monitor.publishing.reports import analysis_report
 from tests.monitor.publishing import made
@@ -77,7 +77,7 @@ class Page(HTMLParser):
 @pytest.mark.long
 def test_numbers_stand_with_unit_interval_or_word() -> None:
     result = analysis()
-    page = Page(analysis_report.render_page(DrawnAnalysis(result), "bench-1"))
+    page = Page(analysis_report.render_page(AnalysisPlotData(result), "bench-1"))
     value, lo, hi = (part[1, 2] * np.degrees(1) * 60 for part in vars_of(result))
     cells = [" ".join(cell.split()) for cell in page.cells]
     assert f"{value:.3f} °/√h {lo:.3f} … {hi:.3f}" in cells
@@ -94,7 +94,7 @@ def vars_of(result: Analysis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_what_is_not_known_is_said_in_words() -> None:
     few = made.analysis(seconds=200.0)
     few.estimate.curve.avar[:, 3:] = np.nan
-    text = analysis_report.render_page(DrawnAnalysis(few))
+    text = analysis_report.render_page(AnalysisPlotData(few))
     assert text.count("(too few data)") == 3  # R, on three axes
     assert "— <small>(too few data)</small>" in " ".join(text.split())
     assert "<h2>Notes</h2>" not in text
@@ -120,7 +120,7 @@ def test_the_facts_of_the_recording_are_on_the_page() -> None:
 @pytest.mark.long
 def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, long: DynamicAllan) -> None:
     path = tmp_path / "report.html"
-    drawn = DrawnAnalysis(analysis(), dynamic=long, marks=[ChangeMark(1500.0, "gz")])
+    drawn = AnalysisPlotData(analysis(), dynamic=long, marks=[ChangeMark(1500.0, "gz")])
     analysis_report.write_html_report(drawn, path, "a <b> & c")
     text = path.read_text("utf-8")
     assert path.stat().st_size < 1_000_000
@@ -145,7 +145,7 @@ def test_the_page_is_complete_in_itself_and_below_a_megabyte(tmp_path: Path, lon
 def test_a_recording_without_accelerometers_has_one_column() -> None:
     result = analysis()
     result.estimate.curve.avar[:, 3:] = np.nan
-    text = analysis_report.render_page(DrawnAnalysis(result))
+    text = analysis_report.render_page(AnalysisPlotData(result))
     assert text.count("<svg") == 1
     assert "Accelerometers" not in text
 
@@ -154,7 +154,7 @@ def test_a_recording_without_accelerometers_has_one_column() -> None:
 def test_the_same_analysis_gives_the_same_page() -> None:
     result = analysis()
     result.estimate.curve.avar[:, 3:] = np.nan
-    first, second = (analysis_report.render_page(DrawnAnalysis(result), "x") for _ in range(2))
+    first, second = (analysis_report.render_page(AnalysisPlotData(result), "x") for _ in range(2))
     assert first == second
 
 
@@ -162,10 +162,10 @@ def test_the_same_analysis_gives_the_same_page() -> None:
 def test_without_its_libraries_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ConfigError, match=r"pip install \"imu-monitor\[plot\]\""):
-        analysis_report.render_page(DrawnAnalysis(analysis()))
+        analysis_report.render_page(AnalysisPlotData(analysis()))
 
 
 @pytest.mark.long
 def test_a_folder_that_is_not_there_is_a_wrong_request(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot write the report"):
-        analysis_report.write_html_report(DrawnAnalysis(analysis()), tmp_path / "absent" / "report.html")
+        analysis_report.write_html_report(AnalysisPlotData(analysis()), tmp_path / "absent" / "report.html")

@@ -8,7 +8,7 @@ import pytest
 
 from drivers.errors import ConfigError
 from monitor.publishing.reports.comparison_page import render_page
-from monitor.reconcile.several_recordings.comparison import Comparison, compare
+from monitor.reconcile.several_recordings.comparison import Comparison, compare_results
 from tests.monitor.publishing.reports.test_reconcile_page import Text
 from tests.monitor.reconcile.runs_made import LENS, line, run, step, with_axes
 
@@ -18,10 +18,10 @@ pytest.importorskip("jinja2")
 def made() -> Comparison:
     own = step("bias_step", time=350.0, height=1e-3)
     first = with_axes(run("cold <1>", line(1.5e-4)), run("cold <1>", axis="gx"))
-    return compare(
+    return compare_results(
         [first, run("warm", line(1.52e-4), own), run("c", line(1.3e-4), seconds=60.0, left=[replace(LENS, gap=9.0)])],
         fitted_to="cold <1>",
-        silent={"short": "200 samples; too few"},
+        without_result={"short": "200 samples; too few"},
     )
 
 
@@ -80,7 +80,7 @@ def test_what_was_left_out_and_what_the_model_was_is_told() -> None:
 
 
 def test_recordings_that_agree_make_a_short_page() -> None:
-    words = joined(Text(render_page(compare([run("a"), run("b")]))).words)
+    words = joined(Text(render_page(compare_results([run("a"), run("b")]))).words)
     assert "2 recordings were compared with the model. None differs by more than chance." in words
     assert "No effect was found in every recording." in words
     assert "No effect was found in some recordings only." in words

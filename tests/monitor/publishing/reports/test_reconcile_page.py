@@ -91,13 +91,13 @@ def test_every_lens_stands_before_and_after_each_step() -> None:
     assert ["spectrum", "17.1 … 17.5 Hz", "41.2", "4.60", "2.60", "1.90"] in rows
     assert ["Allan deviation", "τ = 0.01 … 0.64 s", "8.70", "0.70", "2.40", "1.60"] in rows
     text = page("explained")
-    assert text.count(">before</text>") == text.count(">after</text>") == 2 * len(made.axes["gz"].start.views)
+    assert text.count(">before</text>") == text.count(">after</text>") == 2 * len(made.axes["gz"].start.plots)
 
 
 def test_what_agrees_is_short_and_shows_its_lenses() -> None:
     made = samples.agrees()
     text = page("agrees")
-    assert text.count("<svg ") == sum(len(result.start.views) for result in made.axes.values())
+    assert text.count("<svg ") == sum(len(result.start.plots) for result in made.axes.values())
     assert "Step" not in text
     assert "Left over" not in text
     lenses = {row[0]: row[1:] for row in Text(text).rows[7:]}

@@ -50,7 +50,7 @@ def test_the_curves_after_each_step_stand_on_the_timeline(explained: dict[str, l
 def test_a_curve_stands_in_the_decades_of_its_box(explained: dict[str, list[object]]) -> None:
     (dots,) = explained["/gz/allan/before/points Points2D:positions"]
     at = np.array(dots)
-    view = samples.explained().axes["gz"].start.views[1]
+    view = samples.explained().axes["gz"].start.plots[1]
     x = (np.log10(view.x) + 2.0) / 5.0 * WIDTH  # from 0.01 s to 1000 s
     assert at[:, 0] == pytest.approx(x, abs=1e-4)
     sigma = np.log10(view.measured * np.degrees(3600.0))
@@ -69,8 +69,8 @@ def test_the_gap_of_each_lens_has_a_course_over_its_threshold(explained: dict[st
 
 def test_of_many_lenses_those_with_the_largest_gaps_have_a_course(tmp_path: Path) -> None:
     made = samples.unexplained()
-    more = tuple(replace(made.axes["ax"].start.scores[0], lens=f"lens_{i}", gap=0.1 * i) for i in range(30))
-    start = replace(made.axes["ax"].start, scores=more)
+    more = tuple(replace(made.axes["ax"].start.gaps[0], lens=f"lens_{i}", gap=0.1 * i) for i in range(30))
+    start = replace(made.axes["ax"].start, gaps=more)
     reconcile_rrd.write_rrd(replace(made, axes={"ax": replace(made.axes["ax"], start=start)}), tmp_path / "a.rrd")
     shown = {name.split()[0] for name in cells(tmp_path / "a.rrd") if name.startswith("/ax/gap/lens")}
     assert shown == {f"/ax/gap/lens_{i}" for i in range(24, 30)}
@@ -98,7 +98,7 @@ def test_what_is_left_over_is_framed_and_told(tmp_path: Path) -> None:
     reconcile_rrd.write_rrd(samples.unexplained(), path)
     found = cells(path)
     ((frame,),) = found["/ax/psd/before/place LineStrips2D:strips"]
-    view = samples.unexplained().axes["ax"].start.views[0]
+    view = samples.unexplained().axes["ax"].start.plots[0]
     left, right = np.floor(np.log10(view.x[0])), np.ceil(np.log10(view.x[-1]))
     ends = (np.log10([6.0, 11.0]) - left) / (right - left) * WIDTH
     assert sorted({x for x, _ in frame}) == pytest.approx(ends.tolist(), abs=1e-4)

@@ -5,17 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from monitor.noise.effect import parameter_units
+from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.effects import EFFECTS, AngleRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.reconcile.result import Location, ParameterInterval, Reconciliation, ReconciliationStep, RunnerUp
+from monitor.reconcile.result import AddedOrResizedEffect, Location, ParameterInterval, Reconciliation, RunnerUp
 from tests.monitor.reconcile import samples
 
 NO_MODEL = NoiseModel({})
 
 
-def one(effect: str, axis: str = "gz", kind: str = "added", **parameters: ParameterInterval) -> ReconciliationStep:
+def one(effect: str, axis: str = "gz", kind: str = "added", **parameters: ParameterInterval) -> AddedOrResizedEffect:
     step = samples.explained().axes["gz"].steps[0]
     return replace(step, effect=effect, parameters=parameters, kind=kind)
 
@@ -27,7 +27,7 @@ def short(effect: str, axis: str = "gz", **parameters: ParameterInterval) -> lis
 @pytest.mark.parametrize("axis", ["gz", "az"])
 @pytest.mark.parametrize("effect", list(EFFECTS))
 def test_every_parameter_of_every_effect_has_a_unit_of_the_field(effect: str, axis: str) -> None:
-    known = {name: pair[axis == "az"] for name, pair in parameter_units(EFFECTS[effect]).items()}
+    known = {name: pair[axis == "az"] for name, pair in gyro_and_accel_units(EFFECTS[effect]).items()}
     given = {
         name: ParameterInterval("ax") if si == "axis" else ParameterInterval(2.0, 1.9, 2.1)
         for name, si in known.items()

@@ -8,10 +8,10 @@ from monitor.publishing.rerun.allan_chart import (
     HEIGHT,
     WIDTH,
     Scale,
-    band,
-    decades,
+    band_strokes,
+    decade_range,
     finite_sections,
-    grid,
+    grid_lines,
     interval_strokes,
 )
 from monitor.publishing.rerun.decimation import ROWS_PER_FLUSH, ROWS_PER_S, average_buckets, decimate_extremes
@@ -33,14 +33,14 @@ def test_white_noise_falls_by_half_a_decade_a_decade():
 
 
 def test_the_scale_holds_its_data_and_no_decade_more():
-    assert decades([np.array([0.01, 655.0])]) == (-2, 3)
-    assert decades([np.array([10.0, 1000.0])]) == (1, 3)
-    assert decades([np.array([np.nan, 3.0, -1.0])]) == (0, 2)
-    assert decades([np.array([np.nan])]) == (0, 2)
+    assert decade_range([np.array([0.01, 655.0])]) == (-2, 3)
+    assert decade_range([np.array([10.0, 1000.0])]) == (1, 3)
+    assert decade_range([np.array([np.nan, 3.0, -1.0])]) == (0, 2)
+    assert decade_range([np.array([np.nan])]) == (0, 2)
 
 
 def test_every_decade_has_a_labelled_tick():
-    drawn = grid(Scale((-2, 3), (-1, 2)))
+    drawn = grid_lines(Scale((-2, 3), (-1, 2)))
     labels = [label for _, _, label in drawn.ticks]
     assert labels == ["0.01", "0.1", "1", "10", "100", "1000", "0.1", "1", "10", "100"]
     assert len(drawn.minor) == 8 * (5 + 3)
@@ -55,7 +55,7 @@ def test_a_missing_point_breaks_a_line():
 def test_a_band_fills_between_its_edges_and_stays_in_the_box():
     low = np.array([[0.0, 5.0], [8.0, HEIGHT + 30.0]])
     high = np.array([[0.0, 4.0], [8.0, 2.0]])
-    strokes = band(low, high)
+    strokes = band_strokes(low, high)
     assert strokes.shape == (FILL_STEPS, 2, 2)
     assert (strokes[:, 0, 1] >= strokes[:, 1, 1]).all()
     assert strokes[..., 1].max() == HEIGHT

@@ -12,7 +12,7 @@ from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.publishing.messages.results import AllanMessage, CoefficientsMessage, EventMessage, StatusMessage
 from monitor.publishing.remote_devices import DeviceStates
-from monitor.publishing.rerun.fleet import FleetView, detail_key
+from monitor.publishing.rerun.fleet import FleetView, full_device_key
 from monitor.publishing.rerun.panel_text import fleet_text
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.zenoh.publisher import ZenohPublisher
@@ -30,10 +30,10 @@ from tests.monitor.publishing.rerun.test_view import read
 
 
 def test_the_keys_of_devices_in_detail() -> None:
-    assert detail_key("nose", "**") == "nose"
-    assert detail_key("imu/nose", "imu/**") == "imu/nose"
-    assert detail_key("nose", "fleet/*/**") == "fleet/nose"
-    assert detail_key("nose", "imu/nose") == "imu/nose"
+    assert full_device_key("nose", "**") == "nose"
+    assert full_device_key("imu/nose", "imu/**") == "imu/nose"
+    assert full_device_key("nose", "fleet/*/**") == "fleet/nose"
+    assert full_device_key("nose", "imu/nose") == "imu/nose"
 
 
 def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -48,11 +48,13 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
         contextlib.closing(viewer),
     ):
         fleet = FleetView(arriving, viewer, ["imu/nose"])
-        take, draw = fleet.take, fleet.draw
+        take, draw = fleet.process_message, fleet.draw_device_table
         taken: set[str] = set()
         drawn: list[float] = []
-        monkeypatch.setattr(fleet, "take", lambda one: take(one) or taken.add(one.key))
-        monkeypatch.setattr(fleet, "draw", lambda wall_s, now_s: draw(wall_s, now_s) or drawn.append(now_s))
+        monkeypatch.setattr(fleet, "process_message", lambda one: take(one) or taken.add(one.key))
+        monkeypatch.setattr(
+            fleet, "draw_device_table", lambda wall_s, now_s: draw(wall_s, now_s) or drawn.append(now_s)
+        )
         looking = threading.Thread(target=fleet.run, args=(stop, told.append))
         out.start()
         arriving.start()
@@ -97,12 +99,14 @@ def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.
     drawn: list[float] = []
     monkeypatch.setattr(viewer, "put", lambda _device, unix_s, _health: drawn.append(unix_s))
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
-    fleet.take(Message("imu/a/status", StatusMessage.of("a", None, 0, made.health(state="waiting")).encode()))
+    fleet.process_message(
+        Message("imu/a/status", StatusMessage.of("a", None, 0, made.health(state="waiting")).encode())
+    )
     (known,) = fleet.board.devices(time.monotonic())
     assert known.status is not None
     assert known.status.state == "waiting"
     assert drawn == []
-    fleet.take(Message("imu/a/status", StatusMessage.of("a", 5.0, 0, made.health()).encode()))
+    fleet.process_message(Message("imu/a/status", StatusMessage.of("a", 5.0, 0, made.health()).encode()))
     assert drawn == [5.0]
     assert fleet.malformed == fleet.board.malformed == 0
 
@@ -110,14 +114,14 @@ def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.
 def test_hostile_messages_change_nothing_and_are_counted() -> None:
     viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
-    fleet.take(Message("imu/a/coefficients", CoefficientsMessage.of("a", 1.0, 0, made.estimate()).encode()))
+    fleet.process_message(Message("imu/a/coefficients", CoefficientsMessage.of("a", 1.0, 0, made.estimate()).encode()))
     for key, payload in {
         "imu/a/samples": b"\x81" * 10_000,
         "imu/a/allan": b'{"schema":"imu-monitor/allan/1","tau":[1]}',
         "imu/a/event": b"[" * 60_000,
         "other": b"",
     }.items():
-        fleet.take(Message(key, payload))
+        fleet.process_message(Message(key, payload))
     assert (fleet.malformed, fleet.board.malformed) == (2, 1)
     assert [one.key for one in fleet.board.devices(time.monotonic())] == ["imu/a"]
 

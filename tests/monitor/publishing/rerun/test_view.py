@@ -272,7 +272,7 @@ def test_the_page_takes_the_next_free_port_and_leaves_nothing_behind(monkeypatch
         port = int(view.url.rsplit("%3A", 1)[1].split("%2F")[0])
         assert sinks.is_rerun(port)
         view.close()
-    assert not sinks.listens(port)
+    assert not sinks.is_listening(port)
 
 
 @pytest.mark.long
@@ -292,7 +292,7 @@ def test_a_killed_daemon_takes_its_viewer_along() -> None:
             wait_for(lambda: sinks.is_rerun(port))
         finally:
             daemon.kill()
-    wait_for(lambda: not sinks.listens(port))
+    wait_for(lambda: not sinks.is_listening(port))
 
 
 def test_a_port_that_another_program_holds_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

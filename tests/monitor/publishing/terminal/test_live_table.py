@@ -251,7 +251,7 @@ def test_axes_whose_slow_part_is_temperature_are_marked() -> None:
     console = Console(width=160, file=io.StringIO(), record=True)
     console.print(analysis_table(made.estimate(seconds=1000.0), ("gy",)))
     text = console.export_text()
-    assert "; † its slow part is temperature\n" in text
+    assert "; † slow variance due to temperature\n" in text
     assert row(text, "gy").startswith("gy †")
     assert "†" not in row(text, "gz")
     console.print(analysis_table(made.estimate(seconds=1000.0)))

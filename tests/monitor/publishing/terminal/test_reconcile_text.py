@@ -8,7 +8,7 @@ from rich.console import Console
 
 from monitor.publishing.terminal.reconcile_text import print_comparison, print_report
 from monitor.reconcile.result import Reconciliation
-from monitor.reconcile.several_recordings.comparison import Comparison, compare
+from monitor.reconcile.several_recordings.comparison import Comparison, compare_results
 from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import line, run, step, with_axes
 
@@ -68,7 +68,7 @@ def told_runs(c: Comparison, width: int = 140) -> list[str]:
 
 def runs() -> Comparison:
     both = with_axes(run("warm", line(), step("bias_step", time=350.0, height=1e-3)), run("warm", axis="gx"))
-    return compare([run("cold", line(3e-4)), both], None, {"short": "200 samples"})
+    return compare_results([run("cold", line(3e-4)), both], None, {"short": "200 samples"})
 
 
 def test_several_recordings_stand_beside_each_other() -> None:

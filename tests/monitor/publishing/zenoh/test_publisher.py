@@ -126,9 +126,9 @@ def answering(out: ZenohPublisher, known: str = "reset") -> threading.Thread:
     def answer() -> None:
         command: Command = out.commands.get(timeout=PATIENCE_S)
         if command.verb == known:
-            command.answer(json.dumps({"of": command.device}).encode())
+            command.reply_result(json.dumps({"of": command.device}).encode())
         else:
-            command.refuse(f'unknown command "{command.verb}"')
+            command.reply_refusal(f'unknown command "{command.verb}"')
 
     thread = threading.Thread(target=answer)
     thread.start()
@@ -184,7 +184,7 @@ def test_commands_that_nobody_takes_are_refused_not_kept_without_end(endpoint: s
         wait_for(come)
         assert all("busy" in json.loads(bytes(reply.err.payload))["error"] for reply in refused)
         while not out.commands.empty():
-            out.commands.get_nowait().refuse("the test is over")
+            out.commands.get_nowait().reply_refusal("the test is over")
 
 
 def _try(handler: Any) -> Any:

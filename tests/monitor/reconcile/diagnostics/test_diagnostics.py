@@ -10,8 +10,8 @@ from monitor.reconcile.diagnostics import diagnostics
 from monitor.reconcile.diagnostics.diagnostics import (
     _regressor_gain,
     find_line_peaks,
-    power_gain,
-    step_gains,
+    free_variance_gain_nats,
+    level_step_gains,
 )
 from monitor.reconcile.likelihood.whitening import noise_deviation_over_time
 from monitor.reconcile.preparation.cosine_bins import cosine_transform
@@ -28,16 +28,16 @@ def drawn(seed=0, size=n):
 
 def least_squares(view, columns):
     """½ (|w|² − min |w − X b|²) of the whitened coefficients."""
-    x = np.stack([column * view.weight for column in columns], axis=1)
-    left = view.whitened - x @ np.linalg.lstsq(x, view.whitened, rcond=None)[0]
-    return 0.5 * float(view.whitened @ view.whitened - left @ left)
+    x = np.stack([column * view.weights for column in columns], axis=1)
+    left = view.coefficients - x @ np.linalg.lstsq(x, view.coefficients, rcond=None)[0]
+    return 0.5 * float(view.coefficients @ view.coefficients - left @ left)
 
 
 @pytest.mark.parametrize("model", [(WHITE,), MODEL], ids=["white", "with a walk"])
 def test_gain_of_a_step_at_each_time_is_that_of_least_squares(model):
     y = drawn() + 3e-3 * (np.arange(n) >= 1700)
     view = seen(axis(y), model)
-    gains, times_s = step_gains(view)
+    gains, times_s = level_step_gains(view)
     for at in (0, 1, 700, int(np.argmax(gains)), gains.size - 2, gains.size - 1):
         step = cosine_transform(np.where(np.arange(n) >= round(times_s[at] * RATE_HZ), 1.0, 0.0))
         assert gains[at] == pytest.approx(least_squares(view, [step]), rel=1e-6, abs=1e-9)
@@ -64,8 +64,10 @@ def test_gain_of_power_is_that_of_a_variance_of_its_own():
             return 0.5 * float(np.sum(log_v + w**2 * np.exp(-log_v)))
 
         best = loss(0.0) - minimize_scalar(loss).fun
-        assert power_gain(np.mean(w**2, keepdims=True), np.array([count]))[0] == pytest.approx(best, abs=1e-6)
-    assert np.isfinite(power_gain(np.zeros(1), np.ones(1))).all()
+        assert free_variance_gain_nats(np.mean(w**2, keepdims=True), np.array([count]))[0] == pytest.approx(
+            best, abs=1e-6
+        )
+    assert np.isfinite(free_variance_gain_nats(np.zeros(1), np.ones(1))).all()
 
 
 def test_peaks_of_the_periodogram_are_those_of_scipy():
@@ -84,7 +86,7 @@ def test_peaks_of_the_periodogram_are_those_of_scipy():
 
 def test_autocorrelation_is_the_sum_of_products():
     view = seen(axis(drawn(4) + correlated(n, np.random.default_rng(5), 4e-4, 0.03)), MODEL)
-    products = [view.white[:-lag] @ view.white[lag:] / n for lag in range(1, diagnostics.MAX_LAG_SAMPLES + 1)]
+    products = [view.series[:-lag] @ view.series[lag:] / n for lag in range(1, diagnostics.MAX_LAG_SAMPLES + 1)]
     found = diagnostics.diagnose_autocorrelation(view)
     best = int(np.argmax(np.square(products)))
     assert found.gain == pytest.approx(0.5 * n * products[best] ** 2)
@@ -94,8 +96,8 @@ def test_autocorrelation_is_the_sum_of_products():
 def test_power_over_frequency_is_at_least_that_of_every_bin():
     view = seen(axis(drawn(6)), MODEL)
     bins = view.axis.bins
-    each = power_gain(bins.sums(view.whitened**2) / bins.count, bins.count)
-    whole = power_gain(np.array([np.mean(view.whitened**2)]), np.array([n - 1.0]))[0]
+    each = free_variance_gain_nats(bins.sums(view.coefficients**2) / bins.count, bins.count)
+    whole = free_variance_gain_nats(np.array([np.mean(view.coefficients**2)]), np.array([n - 1.0]))[0]
     found = diagnostics.diagnose_psd(view)
     assert found.gain >= each.max() - 1e-9
     wider = diagnostics.diagnose_psd(seen(axis(1.2 * drawn(6)), MODEL))
@@ -108,8 +110,8 @@ def test_a_true_model_makes_an_axis_white():
     squares, fast = [], []
     for seed in range(20):
         view = seen(axis(drawn(seed)), MODEL)
-        squares.append(view.whitened**2)
-        fast.append(view.fast**2)
+        squares.append(view.coefficients**2)
+        fast.append(view.flat_series**2)
     at = np.mean(squares, axis=0)
     for group in np.array_split(at, 12):  # 400 coefficients of 20 runs: scatter 1.6 %
         assert group.mean() == pytest.approx(1.0, abs=0.06)
@@ -120,8 +122,8 @@ def test_fast_series_is_white_whatever_the_spectrum_is():
     size = 40_000
     y = drawn(7, size) + correlated(size, np.random.default_rng(8), 3e-3, 0.05)
     view = seen(axis(y), (WHITE,))
-    assert np.mean(view.white**2) > 2.0
-    assert np.mean(view.fast**2) == pytest.approx(1.0, abs=0.05)
+    assert np.mean(view.series**2) > 2.0
+    assert np.mean(view.flat_series**2) == pytest.approx(1.0, abs=0.05)
     assert diagnostics.diagnose_tails(view).gain < 5.0
     assert diagnostics.diagnose_variance(view).gain < 15.0
 
@@ -141,14 +143,14 @@ def test_noise_steps_of_a_model_are_in_its_course():
 
 def test_what_a_model_has_is_no_finding():
     y = 5e-4 * np.rint(white(n, np.random.default_rng(10)) / 5e-4)
-    assert diagnostics.diagnose_values(seen(axis(y), (WHITE,))).gain > 1000.0
+    assert diagnostics.diagnose_quantization_clipping_repeats(seen(axis(y), (WHITE,))).gain > 1000.0
     model = (WHITE, Resolution(step=5e-4))
-    assert diagnostics.diagnose_values(seen(axis(y, model), model)).gain < 1.0
+    assert diagnostics.diagnose_quantization_clipping_repeats(seen(axis(y, model), model)).gain < 1.0
 
 
 def test_ends_of_the_range_have_their_value_as_place():
     y = np.clip(white(n, np.random.default_rng(11)), -1.5e-3, 1.5e-3)
-    found = diagnostics.diagnose_values(seen(axis(y), (WHITE,)))
+    found = diagnostics.diagnose_quantization_clipping_repeats(seen(axis(y), (WHITE,)))
     assert found.gain > 100.0
     lo, hi = found.where.value
     assert lo <= 1.5e-3 * (1 + 1e-9)

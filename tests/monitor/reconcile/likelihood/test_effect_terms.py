@@ -8,10 +8,10 @@ from monitor.noise.effects import EFFECTS, CrossAxis, Sinusoidal, TemperatureBia
 from monitor.reconcile.likelihood.effect_terms import (
     DETERMINISTIC_SIZE_PARAMETERS,
     NOISE_SIZE_PARAMETERS,
-    regressors,
     size,
+    unit_regressors,
     unit_spectrum,
-    with_factors,
+    with_regressor_factors,
     with_size,
 )
 from tests.contracts.effect_examples import effect
@@ -48,9 +48,9 @@ def test_a_spectrum_grows_with_the_square_of_the_size(kind):
 @pytest.mark.parametrize("kind", COURSES, ids=lambda kind: kind.name)
 def test_columns_times_factors_are_the_series(kind):
     one = effect(kind.name)
-    made = regressors(one, n, RATE_HZ, warmth(n))
+    made = unit_regressors(one, n, RATE_HZ, warmth(n))
     factors = np.array([0.8, -1.7])[: len(made)]
-    fitted = with_factors(one, factors)
+    fitted = with_regressor_factors(one, factors)
     want = drawn(fitted)
     summed = sum(factor * column for factor, column in zip(factors, made, strict=True))
     if kind.name == "rate_ramp":  # a ramp's R is a size without a sign
@@ -62,18 +62,18 @@ def test_columns_times_factors_are_the_series(kind):
 
 def test_phase_of_a_line_is_in_its_two_columns():
     line = Sinusoidal(amplitude=0.4, frequency=7.3, phase=2.2)
-    made = np.stack(regressors(line, n, RATE_HZ, None))
+    made = np.stack(unit_regressors(line, n, RATE_HZ, None))
     factors, *_ = np.linalg.lstsq(made.T, drawn(line), rcond=None)
-    back = with_factors(line, factors)
+    back = with_regressor_factors(line, factors)
     assert back.amplitude == pytest.approx(0.4)
     assert back.phase == pytest.approx(2.2)
 
 
 def test_a_curve_over_temperature_has_two_columns_and_a_line_one():
     straight = TemperatureBias(coefficient=0.3, reference=25.0)
-    assert len(regressors(straight, n, RATE_HZ, warmth(n))) == 1
+    assert len(unit_regressors(straight, n, RATE_HZ, warmth(n))) == 1
     bent = TemperatureBias(coefficient=0.3, reference=25.0, quadratic=-0.04)
-    one, two = regressors(bent, n, RATE_HZ, warmth(n))
+    one, two = unit_regressors(bent, n, RATE_HZ, warmth(n))
     np.testing.assert_allclose(one, warmth(n) - 25.0, atol=1e-12)
     np.testing.assert_allclose(two, (warmth(n) - 25.0) ** 2, atol=1e-12)
 
@@ -86,4 +86,4 @@ def test_size_keeps_its_sign_where_it_has_one():
 
 def test_a_leak_has_no_series_of_its_own():
     with pytest.raises(TypeError, match="another axis"):
-        regressors(CrossAxis(source="gx", coefficient=0.1), n, RATE_HZ, None)
+        unit_regressors(CrossAxis(source="gx", coefficient=0.1), n, RATE_HZ, None)

@@ -16,10 +16,10 @@ from monitor.noise.effects import (
 from monitor.reconcile.likelihood.hypothesis import (
     _with_shape,
     fit_with_fewest_changes,
-    fit_with_given_sizes,
+    fit_with_fixed_noise,
     refine_shape,
-    shape_bounds,
-    size_bounds,
+    shape_interval,
+    size_interval,
 )
 from tests.monitor.reconcile.axes import RATE_HZ, WALK, WHITE, K, N, axis, correlated, time_s, walk, white
 
@@ -33,13 +33,13 @@ def drawn(seed, more=0.0):
 
 
 def test_a_true_model_is_believed():
-    freed = 0
+    refitted_size_count = 0
     for seed in range(20):
         one = axis(drawn(seed))
         state = fit_with_fewest_changes(one, (), MODEL)
-        freed += state.freed
-        assert fit_with_given_sizes(one, MODEL).fit.log_likelihood <= state.fit.log_likelihood + 1e-6
-    assert freed <= 1  # another size that gains this much: once in some hundred
+        refitted_size_count += state.refitted_size_count
+        assert fit_with_fixed_noise(one, MODEL).fit.log_likelihood <= state.fit.log_likelihood + 1e-6
+    assert refitted_size_count <= 1  # another size that gains this much: once in some hundred
 
 
 @pytest.mark.parametrize(("wrong", "at"), [((1.1, 1.0), 0), ((0.93, 1.0), 0), ((1.0, 4.0), 1), ((1.0, 0.2), 1)])
@@ -47,17 +47,17 @@ def test_a_wrong_size_is_another_size_and_the_right_one_stays(wrong, at):
     one = axis(drawn(1))
     given = (AngleRandomWalk(N=wrong[0] * N), RateRandomWalk(K=wrong[1] * 3e-5))
     state = fit_with_fewest_changes(one, (), given)
-    assert state.fit.noises == (at,)
-    assert state.freed == 1
+    assert state.fit.fitted_noise == (at,)
+    assert state.refitted_size_count == 1
     assert state.effects[1 - at] == given[1 - at]
     found = (state.effects[0].N / N, state.effects[1].K / 3e-5)[at]
     assert found == pytest.approx(1.0, abs=0.4 if at else 0.02)
-    assert state.score > fit_with_given_sizes(one, given).score
+    assert state.score > fit_with_fixed_noise(one, given).score
 
 
 def test_both_wrong_sizes_are_found():
     state = fit_with_fewest_changes(axis(drawn(2)), (), (AngleRandomWalk(N=1.3 * N), RateRandomWalk(K=2e-4)))
-    assert state.freed == 2
+    assert state.refitted_size_count == 2
     assert pytest.approx(N, rel=0.03) == state.effects[0].N
     assert pytest.approx(3e-5, rel=0.5) == state.effects[1].K
 
@@ -65,11 +65,11 @@ def test_both_wrong_sizes_are_found():
 def test_what_was_found_is_always_fitted():
     y = drawn(3) + 5e-5 * time_s(n)
     state = fit_with_fewest_changes(axis(y), (RateRamp(R=1.0),), MODEL)
-    assert state.freed == 0
-    assert pytest.approx(5e-5, abs=5 * state.fit.error(2)) == state.effects[2].R
+    assert state.refitted_size_count == 0
+    assert pytest.approx(5e-5, abs=5 * state.fit.size_error(2)) == state.effects[2].R
     alone = fit_with_fewest_changes(axis(drawn(3)), (AngleRandomWalk(N=7.0), RateRandomWalk(K=3.0)), ())
     assert pytest.approx(N, rel=0.03) == alone.effects[0].N
-    assert alone.freed == 0  # nothing was given
+    assert alone.refitted_size_count == 0  # nothing was given
 
 
 def test_a_shape_is_at_the_top_of_its_profile():
@@ -94,7 +94,7 @@ def test_an_interval_of_a_shape_ends_where_its_profile_has_fallen():
         one, (WHITE, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5)), 1, ["correlation_time"]
     )
     state = fit_with_fewest_changes(one, effects, ())
-    found = shape_bounds(state.fit, 1, "correlation_time")
+    found = shape_interval(state.fit, 1, "correlation_time")
     assert found.lo < found.value < found.hi
     assert found.lo < 0.5 < found.hi
     for end in (found.lo, found.hi):
@@ -114,7 +114,7 @@ def test_intervals_of_a_line_hold_its_frequency():
             one, (WHITE, Sinusoidal(amplitude=1e-4, frequency=17.3, phase=0.0)), 1, ["frequency"], 1.0001
         )
         state = fit_with_fewest_changes(one, effects, ())
-        found = shape_bounds(state.fit, 1, "frequency")
+        found = shape_interval(state.fit, 1, "frequency")
         inside.append(found.lo < 17.3 < found.hi)
         error = np.sqrt(6.0 / n) / (np.pi * n / RATE_HZ) * N * RATE_HZ**0.5 / 3e-4
         assert found.hi - found.lo == pytest.approx(2 * 1.96 * error, rel=0.15)
@@ -126,7 +126,7 @@ def test_intervals_of_sizes():
     for seed in range(40):
         y = drawn(seed, np.where(time_s(n) < 80.0, 0.0, -3e-4))
         state = fit_with_fewest_changes(axis(y), (*MODEL, BiasStep(time=80.0, height=1.0)), ())
-        white_noise, _, step = (size_bounds(state.fit, at) for at in range(3))
+        white_noise, _, step = (size_interval(state.fit, at) for at in range(3))
         inside += [white_noise.lo < N < white_noise.hi, step.lo < -3e-4 < step.hi]
         assert white_noise.lo * white_noise.hi == pytest.approx(white_noise.value**2)
     assert np.mean(inside) > 0.87  # of 80, less than 0.88 once in 150
@@ -134,12 +134,12 @@ def test_intervals_of_sizes():
 
 def test_a_size_that_is_held_or_zero_has_no_interval():
     one = axis(white(n, np.random.default_rng(0)))
-    held = size_bounds(fit_with_given_sizes(one, (WHITE, WALK)).fit, 0)
+    held = size_interval(fit_with_fixed_noise(one, (WHITE, WALK)).fit, 0)
     assert (held.value, held.lo, held.hi) == (N, None, None)
     for seed in range(8):  # K is at its bound in about half of the cases
         state = fit_with_fewest_changes(axis(white(n, np.random.default_rng(seed))), (WHITE, RateRandomWalk(K=K)), ())
         if state.effects[1].K == 0.0:
-            assert size_bounds(state.fit, 1).lo is None
+            assert size_interval(state.fit, 1).lo is None
             break
     else:
         pytest.fail("no fit was at the bound")

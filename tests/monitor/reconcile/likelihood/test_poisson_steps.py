@@ -7,8 +7,12 @@ import pytest
 from scipy.special import logsumexp
 
 from monitor.reconcile.likelihood import poisson_steps
-from monitor.reconcile.likelihood.hidden_state import BackgroundNoise, kalman_log_likelihood, state_space_noise
-from monitor.reconcile.likelihood.poisson_steps import compare_steps_with_random_walk
+from monitor.reconcile.likelihood.event_process_comparison import (
+    BackgroundNoise,
+    kalman_log_likelihood,
+    state_space_noise,
+)
+from monitor.reconcile.likelihood.poisson_steps import compare_poisson_with_random_walk
 from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, walk, white
 
 RATE, HEIGHT = 0.05, 2.0  # of the short series, beside white noise of density one
@@ -76,8 +80,10 @@ def test_tells_jumps_from_a_walk(rest):
     for seed in range(2):
         rng = np.random.default_rng(seed)
         around = white(HOUR, rng) + walk(HOUR, rest.walk**0.5, rng)
-        assert compare_steps_with_random_walk(around + jumps(HOUR, 0.005, 2e-4, rng), TAU0_S, rest, 1.4e-5).gain > 10.0
-        assert abs(compare_steps_with_random_walk(around + walk(HOUR, 1.4e-5, rng), TAU0_S, rest, 1.4e-5).gain) < 3.0
+        assert (
+            compare_poisson_with_random_walk(around + jumps(HOUR, 0.005, 2e-4, rng), TAU0_S, rest, 1.4e-5).gain > 10.0
+        )
+        assert abs(compare_poisson_with_random_walk(around + walk(HOUR, 1.4e-5, rng), TAU0_S, rest, 1.4e-5).gain) < 3.0
 
 
 @pytest.mark.long
@@ -85,7 +91,7 @@ def test_parameters_lie_in_their_intervals_and_jumps_are_counted():
     inside, counted = [], []
     for seed in range(8):
         rng = np.random.default_rng(seed)
-        found = compare_steps_with_random_walk(
+        found = compare_poisson_with_random_walk(
             white(HOUR, rng) + jumps(HOUR, 0.01, 3e-4, rng), TAU0_S, BackgroundNoise(N * N), 2e-5
         )
         for name, true in (("rate", 0.01), ("height", 3e-4)):
@@ -99,6 +105,6 @@ def test_parameters_lie_in_their_intervals_and_jumps_are_counted():
 def test_known_walk_is_not_counted_twice():
     rng = np.random.default_rng(4)
     y = white(HOUR, rng) + walk(HOUR, 1e-5, rng) + jumps(HOUR, 0.005, 4e-4, rng)
-    found = compare_steps_with_random_walk(y, TAU0_S, BackgroundNoise(N * N, walk=1e-10), 3e-5)
+    found = compare_poisson_with_random_walk(y, TAU0_S, BackgroundNoise(N * N, walk=1e-10), 3e-5)
     assert found.gain > 10.0
     assert found.parameters["height"].lo < 4e-4 < found.parameters["height"].hi

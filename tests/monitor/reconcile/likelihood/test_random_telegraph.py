@@ -8,8 +8,8 @@ from scipy.special import logsumexp
 from scipy.stats import norm
 
 from monitor.reconcile.likelihood import random_telegraph
-from monitor.reconcile.likelihood.hidden_state import BackgroundNoise, block_means, state_space_noise
-from monitor.reconcile.likelihood.random_telegraph import compare_telegraph_with_correlated
+from monitor.reconcile.likelihood.event_process_comparison import BackgroundNoise, block_means, state_space_noise
+from monitor.reconcile.likelihood.random_telegraph import compare_telegraph_with_correlated_noise
 from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, two_levels, walk, wandering, white
 
 A, DWELL = 3.0, 20.0  # of the short series, beside white noise of density one
@@ -101,7 +101,9 @@ def test_unknown_level_is_an_average_over_levels():
 
 
 def contest(y, rest=None, sigma=2e-4, time_s=10.0):
-    return compare_telegraph_with_correlated(y, TAU0_S, BackgroundNoise(N * N) if rest is None else rest, sigma, time_s)
+    return compare_telegraph_with_correlated_noise(
+        y, TAU0_S, BackgroundNoise(N * N) if rest is None else rest, sigma, time_s
+    )
 
 
 @pytest.mark.parametrize("time_s", [3.0, 10.0, 60.0])

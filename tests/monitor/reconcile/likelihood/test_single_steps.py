@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from monitor.reconcile.likelihood import single_steps
-from monitor.reconcile.likelihood.hidden_state import BackgroundNoise, block_means, state_space_noise
-from monitor.reconcile.likelihood.single_steps import compare_steps_with_single_steps
+from monitor.reconcile.likelihood.event_process_comparison import BackgroundNoise, block_means, state_space_noise
+from monitor.reconcile.likelihood.single_steps import compare_poisson_with_single_steps
 from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, white
 
 REST = BackgroundNoise(1.0, walk=0.01, correlated=((1.0, 30.0),))
@@ -58,13 +58,13 @@ def test_finds_times():
     means, block_s = block_means(y, TAU0_S, 5.0)
     noise = state_space_noise(BackgroundNoise(N * N), block_s, means.size * block_s)
     assert single_steps._fit_single_steps(means, noise, 5).times * block_s == pytest.approx(times, abs=3.0)
-    found = compare_steps_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5)
+    found = compare_poisson_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5)
     assert found.single_steps == 3
     assert found.gain < 2.0
 
 
 def test_nothing_is_no_step():
-    contest = compare_steps_with_single_steps(
+    contest = compare_poisson_with_single_steps(
         white(HOUR, np.random.default_rng(1)), TAU0_S, BackgroundNoise(N * N), 2e-6
     )
     assert contest.single_steps == 0
@@ -73,19 +73,19 @@ def test_nothing_is_no_step():
 
 def test_no_more_than_are_asked_for():
     y = stepped((500.0, 1500.0, 2500.0), (4e-4, 4e-4, 4e-4), np.random.default_rng(2))
-    assert compare_steps_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5, most=2).single_steps == 2
+    assert compare_poisson_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5, most=2).single_steps == 2
 
 
 def test_one_step_is_no_process():
     for seed in range(3):
         y = stepped((1234.5,), (3e-4,), np.random.default_rng(seed))
-        assert compare_steps_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 5e-6).gain < 2.0
+        assert compare_poisson_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 5e-6).gain < 2.0
 
 
 def test_many_steps_are_a_process():
     rng = np.random.default_rng(0)
     y = white(HOUR, rng) + jumps(HOUR, 0.005, 4e-4, rng)
-    assert compare_steps_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 2.8e-5).gain > 20.0
+    assert compare_poisson_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 2.8e-5).gain > 20.0
 
 
 def test_steps_stay_apart_in_neighbouring_blocks():

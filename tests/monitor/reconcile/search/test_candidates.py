@@ -104,7 +104,7 @@ def test_a_line():
     view = seen(one, MODEL)
     t = time_s(n)
     best = minimize_scalar(
-        lambda f: -abs(np.exp(-2j * np.pi * f * t) @ view.white), bounds=(17.303, 17.306), method="bounded"
+        lambda f: -abs(np.exp(-2j * np.pi * f * t) @ view.series), bounds=(17.303, 17.306), method="bounded"
     )
     assert _line_frequency(view, 17.303) == pytest.approx(best.x, abs=1e-5)
     assert asked(candidates.propose_sinusoids, axis(noise(5))) == {}

@@ -18,8 +18,8 @@ from monitor.noise.effects import (
 )
 from monitor.reconcile.diagnostics.diagnostics import find_line_peaks
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
-from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes, fit_with_given_sizes
-from monitor.reconcile.search.axis_preparation import repair_again
+from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes, fit_with_fixed_noise
+from monitor.reconcile.search.axis_repair import repair_axis_again
 from monitor.reconcile.search.cross_validation import cross_validate
 from tests.monitor.reconcile.axes import (
     WALK,
@@ -48,7 +48,7 @@ def noise(seed=0):
 
 
 def proven(one, effect, lens, model=MODEL):
-    before, after = fit_with_given_sizes(one, model), fit_with_fewest_changes(one, (effect,), model)
+    before, after = fit_with_fixed_noise(one, model), fit_with_fewest_changes(one, (effect,), model)
     return cross_validate(before, after, after.effects[-1], lens, NULL, np.random.default_rng(0))
 
 
@@ -94,7 +94,7 @@ def test_what_one_half_contradicts_is_not_kept(name):
     hidden, effect, lens = BY_CHANCE[name]
     hidden = hidden * HALF if lens == "psd" else hidden
     one = axes({"gx": OTHER, "gz": noise() + hidden}, {"gx": (), "gz": MODEL}, warmth(n))["gz"]
-    before, after = fit_with_given_sizes(one, MODEL), fit_with_fewest_changes(one, (effect,), MODEL)
+    before, after = fit_with_fixed_noise(one, MODEL), fit_with_fewest_changes(one, (effect,), MODEL)
     # on the data that chose it, it is worth its name
     assert after.fit.log_likelihood - before.fit.log_likelihood > 20.0
     found = cross_validate(before, after, effect, lens, NULL, np.random.default_rng(0))
@@ -105,7 +105,7 @@ def test_a_line_picked_on_the_data_has_nothing_to_show_elsewhere():
     """The strongest line of pure noise gains its dozen nats; halves of that decide nothing, and the reason says so."""
     one = axis(noise(4))
     view = seen(one, MODEL)
-    gain, f_hz = find_line_peaks(view.white, one.rate_hz, 1)[0]
+    gain, f_hz = find_line_peaks(view.series, one.rate_hz, 1)[0]
     assert gain > 7.0
     found = proven(one, Sinusoidal(amplitude=1.0, frequency=f_hz, phase=0.0), "lines")
     assert found.reason or not found.kept
@@ -114,9 +114,9 @@ def test_a_line_picked_on_the_data_has_nothing_to_show_elsewhere():
 
 def test_another_size_of_a_known_noise():
     one = axis(1.2 * noise(5))
-    before = fit_with_given_sizes(one, MODEL)
+    before = fit_with_fixed_noise(one, MODEL)
     after = fit_with_fewest_changes(one, (), MODEL)
-    assert after.freed >= 1
+    assert after.refitted_size_count >= 1
     found = cross_validate(before, after, None, "psd", NULL, np.random.default_rng(0))
     assert found.kept
     assert found.after < 0.2 * found.before
@@ -152,7 +152,7 @@ def test_single_samples_are_looked_at_in_each_half(kind):
         y = 6e-4 * np.rint(y / 6e-4)
         effect, lens = Resolution(step=6e-4), "values"
     plain = axis(y, MODEL)
-    one = repair_again(plain, (*MODEL, effect), rng)
+    one = repair_axis_again(plain, (*MODEL, effect), rng)
     before = fit_with_fewest_changes(plain, (), MODEL)
     after = fit_with_fewest_changes(one, (effect,), MODEL)
     found = cross_validate(before, after, effect, lens, NULL, rng)

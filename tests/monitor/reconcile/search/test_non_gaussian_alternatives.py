@@ -50,13 +50,13 @@ def test_a_telegraph_is_no_correlated_noise(seed):
     state = found_as_noise(noise(rng) + two_levels(rng, 6e-4, 10.0))
     twin = fit_telegraph_alternative(state, 2)
     assert twin.gain > 5.0
-    effect = twin.found[-1]
+    effect = twin.added[-1]
     assert isinstance(effect, RandomTelegraph)
-    assert not any(isinstance(one, ExponentiallyCorrelated) for one in twin.found)
+    assert not any(isinstance(one, ExponentiallyCorrelated) for one in twin.added)
     assert effect.amplitude == pytest.approx(6e-4, rel=0.1)
     assert effect.dwell_time == pytest.approx(10.0, rel=0.5)
-    assert 40 < twin.events < 90  # 60 are expected
-    bounds = twin.bounds["amplitude"]
+    assert 40 < twin.event_count < 90  # 60 are expected
+    bounds = twin.intervals["amplitude"]
     assert bounds.lo < effect.amplitude < bounds.hi
 
 
@@ -80,15 +80,15 @@ def test_poisson_steps_are_no_random_walk(seed):
     y = noise(rng) + jumps(rng, 0.05, 5e-4)
     one = axis(y)
     state = fit_with_fewest_changes(one, (), MODEL)
-    assert 1 in state.fit.noises  # a stronger walk stands in for the steps
+    assert 1 in state.fit.fitted_noise  # a stronger walk stands in for the steps
     twin = fit_poisson_alternative(state)
     assert twin.gain > 5.0
-    effect = twin.found[-1]
+    effect = twin.added[-1]
     assert isinstance(effect, PoissonSteps)
-    assert WALK not in twin.found  # the model has it, and keeps its size
+    assert WALK not in twin.added  # the model has it, and keeps its size
     assert effect.rate == pytest.approx(0.05, rel=0.7)
     assert effect.height == pytest.approx(5e-4, rel=0.5)
-    assert 12 < twin.events < 60  # 30 are expected, some too small to see
+    assert 12 < twin.event_count < 60  # 30 are expected, some too small to see
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -109,7 +109,7 @@ def test_a_random_walk_that_the_model_has_not():
     stepped = axis(white(n, rng) + jumps(rng, 0.05, 5e-4))
     twin = fit_poisson_alternative(fit_with_fewest_changes(stepped, (RateRandomWalk(K=1e-5),), (WHITE,)))
     assert twin.gain > 5.0
-    assert not any(isinstance(effect, RateRandomWalk) for effect in twin.found)
+    assert not any(isinstance(effect, RateRandomWalk) for effect in twin.added)
 
 
 def test_the_noise_around_has_the_spectrum_of_its_effects():

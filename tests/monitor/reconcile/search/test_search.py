@@ -11,8 +11,8 @@ from monitor.noise.effects import (
     RateRandomWalk,
     Sinusoidal,
 )
-from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes, fit_with_given_sizes
-from monitor.reconcile.search.search import Search, drop_unneeded_effects, search_axis
+from monitor.reconcile.likelihood.hypothesis import fit_with_fewest_changes, fit_with_fixed_noise
+from monitor.reconcile.search.search import AxisSearchResult, drop_unneeded_effects, search_axis
 from monitor.reconcile.search.trials import trial_groups
 from tests.monitor.reconcile.axes import (
     RATE_HZ,
@@ -43,20 +43,20 @@ def noise(seed=0):
     return white(n, rng) + walk(n, rng)
 
 
-def looked(y, model=MODEL, temperature_c=None) -> Search:
+def looked(y, model=MODEL, temperature_c=None) -> AxisSearchResult:
     return search_axis(axis(y, model, temperature_c), model, STRICT, np.random.default_rng(0))
 
 
 def names(found):
     """Of what was added."""
-    return [effect.name for effect in found.state.effects[found.state.given :]]
+    return [effect.name for effect in found.hypothesis.effects[found.hypothesis.given_count :]]
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_a_true_model_is_left_alone(seed):
     found = looked(noise(seed))
     assert found.rounds == ()
-    assert found.state.effects == MODEL
+    assert found.hypothesis.effects == MODEL
 
 
 RNG = np.random.default_rng(1)
@@ -81,8 +81,8 @@ def test_what_was_hidden_is_named(name):
     assert any(one.gain > STRICT[lens].threshold for lens, one in first.findings.items())
     assert not any(one.gain > STRICT[lens].threshold for lens, one in found.findings.items())
     assert first.trials[0].name == name
-    assert first.trials[0].value > 0.0
-    assert found.state.effects[:2] == MODEL  # what is right stays as it is
+    assert first.trials[0].score > 0.0
+    assert found.hypothesis.effects[:2] == MODEL  # what is right stays as it is
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -96,7 +96,7 @@ def test_a_slow_telegraph_is_no_random_walk_and_no_poisson_steps(seed):
 def test_noise_that_becomes_another_is_a_step_of_it():
     found = looked(white(n, np.random.default_rng(3)) * np.where(T < 150.0, 1.0, 1.5), (WHITE,))
     assert names(found) == ["noise_step"]
-    step = found.state.effects[-1]
+    step = found.hypothesis.effects[-1]
     assert isinstance(step, NoiseStep)
     assert step.time == pytest.approx(150.0, abs=2.0)
     assert step.ratio == pytest.approx(1.5, rel=0.05)
@@ -105,10 +105,10 @@ def test_noise_that_becomes_another_is_a_step_of_it():
 def test_values_that_are_not_as_the_model_says():
     coarse = looked(4e-4 * np.rint(noise(4) / 4e-4))
     assert names(coarse) == ["resolution"]
-    assert coarse.state.effects[-1].step == pytest.approx(4e-4)
+    assert coarse.hypothesis.effects[-1].step == pytest.approx(4e-4)
     clipped = looked(np.clip(noise(4), -2.2 * SIGMA, 2.2 * SIGMA))
     assert names(clipped) == ["saturation"]
-    assert clipped.state.effects[-1].limit == pytest.approx(2.2 * SIGMA)
+    assert clipped.hypothesis.effects[-1].limit == pytest.approx(2.2 * SIGMA)
 
 
 def test_two_effects_are_two_rounds():
@@ -116,10 +116,10 @@ def test_two_effects_are_two_rounds():
     found = looked(y)
     assert sorted(names(found)) == ["outliers", "sinusoidal"]
     assert len(found.rounds) == 2
-    line = next(effect for effect in found.state.effects if isinstance(effect, Sinusoidal))
+    line = next(effect for effect in found.hypothesis.effects if isinstance(effect, Sinusoidal))
     assert line.frequency == pytest.approx(17.3, abs=1e-3)
     assert line.amplitude == pytest.approx(2e-4, rel=0.2)
-    far = next(effect for effect in found.state.effects if isinstance(effect, Outliers))
+    far = next(effect for effect in found.hypothesis.effects if isinstance(effect, Outliers))
     assert far.fraction == pytest.approx(1e-3, rel=0.6)
     assert far.scale == pytest.approx(1.5e-2, rel=0.4)
 
@@ -129,10 +129,10 @@ def test_another_size_is_no_name():
     assert names(found) == []
     assert len(found.rounds) >= 1
     assert found.rounds[0].trials[0].effect is None
-    assert pytest.approx(1.15 * N, rel=0.02) == found.state.effects[0].N
+    assert pytest.approx(1.15 * N, rel=0.02) == found.hypothesis.effects[0].N
     bigger_walk = looked(noise(7) + walk(n, np.random.default_rng(8), 5e-5))
     assert names(bigger_walk) == []
-    size = bigger_walk.state.effects[1].K
+    size = bigger_walk.hypothesis.effects[1].K
     assert size == pytest.approx(5e-5, rel=0.5)
 
 
@@ -149,7 +149,7 @@ def test_what_nobody_knows_has_no_name():
 def test_the_same_generator_gives_the_same_search():
     y = noise(11) + HIDDEN["outliers"]
     one, other = looked(y), looked(y)
-    assert one.state.effects == other.state.effects
+    assert one.hypothesis.effects == other.hypothesis.effects
     assert one.findings == other.findings
     assert [r.trials for r in one.rounds] == [r.trials for r in other.rounds]
 
@@ -169,7 +169,7 @@ def test_candidates_on_a_true_model_are_not_worth_their_price():
     wrong = 0
     for seed in range(6):
         one = axis(noise(20 + seed), MODEL)
-        trials = [each for kind in trial_groups(fit_with_given_sizes(one, MODEL), seen(one, MODEL)) for each in kind]
+        trials = [each for kind in trial_groups(fit_with_fixed_noise(one, MODEL), seen(one, MODEL)) for each in kind]
         assert trials
-        wrong += max(each.value for each in trials) > 0.0
+        wrong += max(each.score for each in trials) > 0.0
     assert wrong <= 1

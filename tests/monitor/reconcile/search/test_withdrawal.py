@@ -13,7 +13,7 @@ from monitor.noise.effects import (
 from monitor.reconcile.diagnostics.diagnostics import Finding
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
 from monitor.reconcile.result import Location
-from monitor.reconcile.search.withdrawal import supported_effects
+from monitor.reconcile.search.withdrawal import keep_supported_effects
 
 QUIET = {lens: Finding(1.0, Location(frequency=(1.0, 2.0))) for lens in ("psd", "lines", "spectrogram")}
 QUIET |= {lens: Finding(1.0, Location()) for lens in ("level", "other_axes", "tails", "variance")}
@@ -25,7 +25,7 @@ def lines(*f_hz):
 
 
 def kept(found, seen=QUIET, closing=None):
-    return [type(effect) for effect in supported_effects(found, closing or {}, seen, NULL)]
+    return [type(effect) for effect in keep_supported_effects(found, closing or {}, seen, NULL)]
 
 
 def test_lines_apart_from_each_other_stand():

@@ -6,25 +6,25 @@ from typing import Any
 import pytest
 
 from monitor.reconcile.likelihood.effect_terms import ONE_TIME_EFFECTS
-from monitor.reconcile.result import Location, ParameterInterval, Reconciliation, ReconciliationStep, Score
-from monitor.reconcile.several_recordings.absence import Absence, StrongestObservation, explain_absence
+from monitor.reconcile.result import AddedOrResizedEffect, DiagnosticGap, Location, ParameterInterval, Reconciliation
+from monitor.reconcile.several_recordings.absence import Absence, ClearestOccurrence, explain_absence
 from monitor.reconcile.several_recordings.comparison import NamedResult
 from tests.monitor.reconcile.runs_made import LENS, line, run, step
 
 
-def shown(one: ReconciliationStep, gap: float = 30.0, seconds: float = 600.0) -> StrongestObservation:
-    return StrongestObservation(one, run("one", one).result.axes["gz"], gap, seconds)
+def shown(one: AddedOrResizedEffect, gap: float = 30.0, seconds: float = 600.0) -> ClearestOccurrence:
+    return ClearestOccurrence(one, run("one", one).result.axes["gz"], gap, seconds)
 
 
-def said(one: StrongestObservation, other: NamedResult) -> Absence:
+def said(one: ClearestOccurrence, other: NamedResult) -> Absence:
     return Absence(other.name, *explain_absence(one, other.result))
 
 
-def seen_through(score: Score, seconds: float = 600.0) -> Reconciliation:
+def seen_through(score: DiagnosticGap, seconds: float = 600.0) -> Reconciliation:
     """An axis that agrees, with one lens."""
     agreeing = run("two", seconds=seconds).result
     gz = agreeing.axes["gz"]
-    seen = replace(gz.end, scores=(score,))
+    seen = replace(gz.end, gaps=(score,))
     return replace(agreeing, axes={"gz": replace(gz, start=seen, end=seen)})
 
 
@@ -87,8 +87,8 @@ def test_a_leak_needs_its_source() -> None:
     ("swing", "meaning"), [((20.0, 30.0), "contradiction"), ((24.0, 25.0), "too_faint"), (None, "too_faint")]
 )
 def test_a_temperature_effect_needs_temperature_that_changes(swing: tuple[float, float] | None, meaning: str) -> None:
-    warm = Score("temperature", Location(temperature=(20.0, 30.0)), 30.0, 2.0, 4.0)
-    one = replace(step("temperature_bias", coefficient=1e-3, reference=ParameterInterval(25.0)), found=warm)
+    warm = DiagnosticGap("temperature", Location(temperature=(20.0, 30.0)), 30.0, 2.0, 4.0)
+    one = replace(step("temperature_bias", coefficient=1e-3, reference=ParameterInterval(25.0)), before=warm)
     other = seen_through(replace(warm, where=Location(temperature=swing), gap=1.0))
     assert explain_absence(shown(one), other)[0] == meaning
 

@@ -6,13 +6,13 @@ import pytest
 
 from monitor.noise.effects import AngleRandomWalk, BandwidthLimit, BiasStep, Sinusoidal, TemperatureBias
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.several_recordings.comparison import AxisRuns, MatchedEffect, NamedResult, compare
+from monitor.reconcile.several_recordings.comparison import AxisComparison, MatchedEffect, NamedResult, compare_results
 from tests.monitor.reconcile import samples
 from tests.monitor.reconcile.runs_made import LENS, around, known_lines, line, run, step, with_axes
 
 
-def gz(*runs: NamedResult) -> AxisRuns:
-    return compare(runs).axes["gz"]
+def gz(*runs: NamedResult) -> AxisComparison:
+    return compare_results(runs).axes["gz"]
 
 
 def only(found: tuple[MatchedEffect, ...]) -> MatchedEffect:
@@ -21,7 +21,7 @@ def only(found: tuple[MatchedEffect, ...]) -> MatchedEffect:
 
 
 def test_a_line_of_every_recording_is_common_and_pooled() -> None:
-    c = compare([run("a", line(1.50e-4)), run("b", line(1.52e-4)), run("c", line(1.48e-4, 17.302))])
+    c = compare_results([run("a", line(1.50e-4)), run("b", line(1.52e-4)), run("c", line(1.48e-4, 17.302))])
     seen = only(c.axes["gz"].common)
     assert c.axes["gz"].single == ()
     assert list(seen.steps) == ["a", "b", "c"]
@@ -83,14 +83,14 @@ def test_names_that_differ_are_two() -> None:
 
 def test_an_axis_of_one_recording_has_nothing_in_common() -> None:
     both = with_axes(run("a", line()), run("a", line(), axis="gx"))
-    c = compare([both, run("b", line())])
+    c = compare_results([both, run("b", line())])
     assert list(c.axes) == ["gx", "gz"]
     assert only(c.axes["gx"].single).absent == ()
     assert only(c.axes["gz"].common).effect == "sinusoidal"
 
 
 def test_common_is_what_all_recordings_with_the_axis_show() -> None:
-    c = compare([run("a", line()), run("b", line()), run("c", axis="gx")])
+    c = compare_results([run("a", line()), run("b", line()), run("c", axis="gx")])
     assert only(c.axes["gz"].common).steps.keys() == {"a", "b"}
 
 
@@ -98,7 +98,7 @@ def test_the_model_has_the_common_effects_and_no_other() -> None:
     own = step("bias_step", time=350.0, height=1e-3)
     more = step("angle_random_walk", kind="retuned", N=around(1.8e-4, 1e-6))
     most = step("angle_random_walk", kind="retuned", N=around(1.84e-4, 1e-6))
-    c = compare([run("a", line(1.50e-4), more), run("b", line(1.51e-4), most, own)])
+    c = compare_results([run("a", line(1.50e-4), more), run("b", line(1.51e-4), most, own)])
     effects = c.model.effects["gz"]
     assert [effect.name for effect in effects] == [
         "angle_random_walk", "bias_instability", "rate_random_walk", "sinusoidal",
@@ -123,14 +123,14 @@ def test_of_several_lines_in_the_model_the_retuned_one_is_replaced() -> None:
         axes = {"gz": replace(one.result.axes["gz"], steps=(retuned,), verdict="explained")}
         model = replace(one.result.model, effects=effects)
         runs.append(replace(one, result=replace(one.result, axes=axes, model=model, verdict="explained")))
-    c = compare(runs)
+    c = compare_results(runs)
     lines = [effect for effect in c.model.effects["gz"] if isinstance(effect, Sinusoidal)]
     assert [(one.frequency, round(one.amplitude, 6)) for one in lines] == [(10.0, 1e-4), (17.3, 2e-4)]
 
 
 def test_what_has_no_interval_stays_as_the_first_recording_has_it() -> None:
     low_pass = step("bandwidth_limit", cutoff=around(20.0, 0.1), order=ParameterInterval(2))
-    c = compare([run("a", low_pass), run("b", low_pass)])
+    c = compare_results([run("a", low_pass), run("b", low_pass)])
     found = c.model.effects["gz"][-1]
     assert found == BandwidthLimit(cutoff=20.0, order=2)
     assert only(c.axes["gz"].common).consistent is True  # by its cutoff, as it has no size
@@ -143,7 +143,7 @@ def test_a_curved_temperature_effect_is_pooled_at_one_reference() -> None:
     second = step(
         "temperature_bias", coefficient=around(4e-4, 4e-6), quadratic=curve, reference=ParameterInterval(30.0)
     )
-    c = compare([run("a", first), run("b", second)])
+    c = compare_results([run("a", first), run("b", second)])
     seen = only(c.axes["gz"].common)
     assert seen.consistent is True
     found = c.model.effects["gz"][-1]
@@ -161,7 +161,7 @@ def test_a_retuned_term_is_a_contradiction_only_if_its_size_is_another() -> None
 
 def test_a_clock_is_one_for_all_axes() -> None:
     slow = step("sample_rate_error", ratio=around(1.01, 1e-4))
-    c = compare([run("a", slow, axis="gx"), run("b", slow, axis="gz")])
+    c = compare_results([run("a", slow, axis="gx"), run("b", slow, axis="gz")])
     assert only(c.axes["gx"].common).steps.keys() == {"a", "b"}
     assert c.axes["gz"].common == c.axes["gz"].single == ()
     assert [(axis, effect.name) for axis, effect in c.model if effect.name == slow.effect] == [("gx", slow.effect)]
@@ -169,7 +169,7 @@ def test_a_clock_is_one_for_all_axes() -> None:
 
 def test_the_verdict_is_that_of_all() -> None:
     left = replace(LENS, gap=9.0)
-    assert compare([run("a"), run("b")]).verdict == "agrees"
-    assert compare([run("a"), run("b", line())]).verdict == "explained"
-    assert compare([run("a"), run("b", left=[left])]).verdict == "unexplained"
-    assert compare([run("a", line()), run("b", left=[left])]).verdict == "partly_explained"
+    assert compare_results([run("a"), run("b")]).verdict == "agrees"
+    assert compare_results([run("a"), run("b", line())]).verdict == "explained"
+    assert compare_results([run("a"), run("b", left=[left])]).verdict == "unexplained"
+    assert compare_results([run("a", line()), run("b", left=[left])]).verdict == "partly_explained"

@@ -5,14 +5,14 @@ from dataclasses import replace
 from typing import Any
 
 from monitor.reconcile.result import ParameterInterval
-from monitor.reconcile.several_recordings.comparison import Comparison, compare
+from monitor.reconcile.several_recordings.comparison import Comparison, compare_results
 from monitor.reconcile.several_recordings.comparison_report import encode_comparison
 from tests.monitor.reconcile.runs_made import line, run, step
 
 
 def made() -> Comparison:
     leak = step("cross_axis", source=ParameterInterval("gx"), coefficient=ParameterInterval(0.1))
-    return compare([run("a", line()), run("b", line(), leak)], None, {"c": "too short"})
+    return compare_results([run("a", line()), run("b", line(), leak)], None, {"c": "too short"})
 
 
 def written(c: Comparison) -> dict[str, Any]:
@@ -48,7 +48,7 @@ def test_what_is_not_known_is_null_or_absent() -> None:
 
 def test_what_is_no_number_is_null() -> None:
     wrong = replace(line(), confidence=float("nan"))
-    (single,) = written(compare([run("a", wrong), run("b")]))["axes"]["gz"]["single"]
+    (single,) = written(compare_results([run("a", wrong), run("b")]))["axes"]["gz"]["single"]
     assert single["each"]["a"]["confidence"] is None
 
 

@@ -9,9 +9,9 @@ from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.several_recordings.effect_matching import (
     IDENTIFYING_PARAMETERS,
-    distance,
-    effect_of,
+    find_effect_of_step,
     identifying_parameter,
+    identifying_parameter_distance,
     identifying_parameter_name,
 )
 from tests.monitor.reconcile.runs_made import around, line, step
@@ -49,20 +49,22 @@ def test_a_place_is_a_parameter_of_its_effect(effect: str) -> None:
 def test_places_drift_with_their_sensors(
     effect: str, a: ParameterInterval | None, b: ParameterInterval | None, same: bool
 ) -> None:
-    assert (distance(effect, a, b) is not None) is same
-    assert (distance(effect, b, a) is not None) is same
+    assert (identifying_parameter_distance(effect, a, b) is not None) is same
+    assert (identifying_parameter_distance(effect, b, a) is not None) is same
 
 
 def test_nearer_places_are_nearer() -> None:
-    near, far = (distance("sinusoidal", around(17.3, 1e-3), around(f, 1e-3)) for f in (17.31, 17.35))
+    near, far = (
+        identifying_parameter_distance("sinusoidal", around(17.3, 1e-3), around(f, 1e-3)) for f in (17.31, 17.35)
+    )
     assert near is not None
     assert far is not None
     assert 0.0 < near < far
 
 
 def test_a_step_is_found_in_the_model_by_its_parameters() -> None:
-    assert effect_of(LINES, "gz", line(1.01, 30.1)) is LINES.effects["gz"][2]
-    assert effect_of(LINES, "gz", line(1.9, 16.9)) is LINES.effects["gz"][1]
+    assert find_effect_of_step(LINES, "gz", line(1.01, 30.1)) is LINES.effects["gz"][2]
+    assert find_effect_of_step(LINES, "gz", line(1.9, 16.9)) is LINES.effects["gz"][1]
 
 
 def test_the_place_of_a_retuned_line_is_that_in_the_model() -> None:

@@ -8,7 +8,7 @@ from scipy import stats
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.several_recordings.pooled_parameters import (
     MIN_AGREEMENT_PROBABILITY,
-    agreement,
+    agreement_probability,
     distance_in_sigma,
     pool_parameter,
 )
@@ -66,12 +66,12 @@ def test_nothing_is_made_of_what_has_no_interval() -> None:
     assert pool_parameter([ParameterInterval(2.0), ParameterInterval(2.0)]).p is None
     one = pool_parameter([ParameterInterval(5.0), normal(1.0, 0.1), ParameterInterval(7.0, 6.0, np.inf)])
     assert (one.bounds, one.p) == (normal(1.0, 0.1), None)
-    assert agreement([one]) is None
+    assert agreement_probability([one]) is None
 
 
 def test_several_parameters_are_judged_together() -> None:
     parameters = [pool_parameter([normal(0.0, 1.0), normal(d, 1.0)]) for d in (1.0, 2.0)]
-    assert agreement(parameters) == pytest.approx(stats.chi2(2).sf(0.5 + 2.0))
+    assert agreement_probability(parameters) == pytest.approx(stats.chi2(2).sf(0.5 + 2.0))
 
 
 def test_deviations_are_counted_on_the_scale_of_the_interval() -> None:

@@ -1,0 +1,210 @@
+"""Quantities: kinds of numbers from users and files, each with its unit and supported range.
+
+Numbers enter the program through command-line options, keys of configuration and model files, and recordings. Each of
+these entry points checks its numbers against one of the quantities below. The code behind them therefore never meets a
+value that overflows, divides by zero or asks for more memory than exists. The ranges are wider than those of any known
+sensor or use. They are narrow enough that products, squares and quotients of the numbers stay finite.
+
+A field of a settings model names its quantity in its type: ``Annotated[float, RATE_HZ]``. pydantic then checks the
+number with ``NumberRange.check``.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import isfinite
+from typing import TYPE_CHECKING, Any, Final, TypeVar
+
+from drivers.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pydantic import GetCoreSchemaHandler
+    from pydantic_core import CoreSchema
+
+Number = TypeVar("Number", int, float)
+
+HOUR_S: Final = 3600
+"""Seconds per hour."""
+DAY_S: Final = 86_400
+"""Seconds per day."""
+PREFIXED_UNITS: Final = ("Hz", "bit/s", "byte/s", "byte")
+"""Units that are written with the prefixes k, M, G, T."""
+PREFIXES: Final = ((1e12, "T"), (1e9, "G"), (1e6, "M"), (1e3, "k"))
+"""Factors and names of the prefixes, largest first."""
+MAX_WRITTEN_INTEGER: Final = 1 << 64
+"""Largest integer that is written in a message. A larger one is described, since it may have thousands of digits."""
+MAX_QUOTED_CHARACTERS: Final = 60
+"""Maximum number of characters of a wrong value that a message quotes."""
+
+
+@dataclass(frozen=True, slots=True)
+class NumberRange:
+    """Kind of number with its unit and supported range. Both ends are included.
+
+    >>> RATE_HZ.check(200.0)
+    200.0
+    >>> RATE_HZ.check(1e300)
+    Traceback (most recent call last):
+    drivers.errors.ConfigError: 1e+300 Hz is outside the supported range 0.001 Hz to 1 MHz
+    """
+
+    unit: str  # "" for a number without a unit
+    low: float
+    high: float
+    zero: bool = False  # True if 0 is supported as well, with a special meaning
+    signed: bool = False  # True if the range applies to the absolute value
+
+    def check(self, value: Number) -> Number:
+        """Return the value if it is in the supported range.
+
+        Raises
+        ------
+        ConfigError
+            The value is not a number or is outside the supported range. The text names value, unit and range.
+        """
+        if self.supports(value):
+            return value
+        raise ConfigError(f"{_number_text(value, self.unit)} is outside the supported range {self.format_range()}")
+
+    def supports(self, value: float) -> bool:
+        """Return True if the value is in the supported range. Return False for NaN."""
+        size = abs(value) if self.signed else value
+        return self.low <= size <= self.high or (self.zero and value == 0)
+
+    def format_range(self) -> str:
+        """Return the supported range with its unit.
+
+        >>> DURATION_S.format_range(), SILENCE_S.format_range()
+        ('1 µs to 36525 d', '1 ms to 36525 d, or 0')
+        """
+        sign = "±" if self.signed else ""
+        ends = f"{sign}{self.low:g} to {sign}{self.high:g} {self.unit}".rstrip()
+        if self.unit in PREFIXED_UNITS or self.unit == "s":
+            ends = f"{_number_text(self.low, self.unit)} to {_number_text(self.high, self.unit)}"
+        return f"{ends}, or 0" if self.zero else ends
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: "GetCoreSchemaHandler") -> "CoreSchema":
+        """Return the schema of pydantic for a field with the type ``Annotated[float, self]``."""
+        from pydantic_core import ValidationError, core_schema
+
+        kind = "a whole number" if source is int else "a number"
+
+        def check(value: Any, convert: Callable[[Any], Any]) -> Any:
+            try:
+                number = convert(value)
+            except ValidationError:
+                raise ConfigError(f"expected {kind} from {self.format_range()}, got {format_value(value)}") from None
+            return self.check(number)
+
+        return core_schema.no_info_wrap_validator_function(check, handler(source))
+
+
+# --- time and rates
+
+RATE_HZ: Final = NumberRange("Hz", 1e-3, 1e6)
+"""Sample rate: from a sample in a quarter of an hour to far above the fastest vibration sensors (about 30 kHz)."""
+EFFECT_FREQUENCY_HZ: Final = NumberRange("Hz", 1e-12, 1e6, zero=True)
+"""Frequency of a spectral line or of random events in a noise model; 0: none."""
+UPDATE_RATE_HZ: Final = NumberRange("Hz", 1e-6, 1e6)
+"""Rate at which results are published."""
+DURATION_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S)
+"""Duration: from one period of the highest sample rate to a century."""
+AVERAGING_TIME_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S)
+"""Averaging time τ of the Allan variance."""
+DELAY_S: Final = NumberRange("s", 1e-6, 36_525.0 * DAY_S, zero=True)
+"""Time after a start; 0 is the start itself."""
+SILENCE_S: Final = NumberRange("s", 1e-3, 36_525.0 * DAY_S, zero=True)
+"""Time without data after which the program reacts; 0: never."""
+RUN_TIME_S: Final = NumberRange("s", 0.1, 36_525.0 * DAY_S)
+"""Time after which a command ends by itself."""
+JITTER_S: Final = NumberRange("s", 0.0, 0.5)
+READ_TIMEOUT_S: Final = NumberRange("s", 1e-4, 0.1)
+"""Time that a read of a serial port may wait. A port without ``cancel_read`` is closed after at most this time."""
+TICK_S: Final = NumberRange("s", 1e-12, DAY_S)
+"""Length of one count of a device clock."""
+
+# --- transmission
+
+BIT_RATE: Final = NumberRange("bit/s", 1, 1_000_000_000)
+BYTE_RATE: Final = NumberRange("byte/s", 1.0, 1e9)
+PORT: Final = NumberRange("", 0, 65_535)
+"""TCP port."""
+SIZE_BYTES: Final = NumberRange("byte", 1e6, 1e15)
+"""Memory limit."""
+
+# --- counts and factors
+
+FRACTION: Final = NumberRange("", 0.0, 1.0)
+POSITIVE_SHARE: Final = NumberRange("", 1e-6, 1.0)
+PERCENT: Final = NumberRange("%", 1.0, 100.0)
+SEED: Final = NumberRange("", 0, (1 << 63) - 1)
+SAMPLE_COUNT: Final = NumberRange("samples", 1, 10_000_000_000)
+"""Length of a simulated recording."""
+COUNTER_MODULUS: Final = NumberRange("counts", 2, 1 << 62)
+"""Number of counts after which a device counter starts again at 0."""
+COUNTER_STEP: Final = NumberRange("counts", 1e-9, 1 << 62)
+"""Counts of a device counter from one sample to the next."""
+SOURCE_ADDRESS: Final = NumberRange("", 0, 255)
+"""Source address of SAE J1939."""
+HEADER_LINES: Final = NumberRange("lines", 0, 1_000_000)
+ALARMS_PER_DAY: Final = NumberRange("a day", 1e-6, 1e4, zero=True)
+"""Rate of false alarms; 0: detection is off."""
+REPLAY_SPEED: Final = NumberRange("times", 1e-3, 1e6)
+"""Speed of a replay relative to real time."""
+SIMULATION_SPEED: Final = NumberRange("times", 1e-3, 1e4)
+RATE_RATIO: Final = NumberRange("", 1e-3, 1e3)
+"""True sample rate divided by the stated one."""
+CLOCK_RATIO: Final = NumberRange("", 0.5, 2.0)
+INFLATION: Final = NumberRange("", 1.0, 1e6)
+SCALE: Final = NumberRange("", 1e-15, 1e15, signed=True)
+"""Factor from the numbers of a device to a unit."""
+NOISE_RATIO: Final = NumberRange("times", 1e-6, 1e6)
+"""Ratio of two amounts of noise."""
+
+# --- what a sensor measures
+
+FULL_SCALE: Final = NumberRange("", 1e-3, 1e6)
+"""Full scale of a sensor, in g or °/s."""
+COEFFICIENT: Final = NumberRange("", 1e-30, 1e30)
+"""Noise coefficient in an SI unit. The range is far beyond every sensor, and squares and quotients stay finite."""
+PARAMETER: Final = NumberRange("", 1e-30, 1e30, zero=True, signed=True)
+"""Parameter of a noise model in SI units."""
+FIT_NUMBER: Final = NumberRange("", 0.0, 1e30, signed=True)
+"""Number of a fitted model that was written to a file."""
+TEMPERATURE_C: Final = NumberRange("°C", -273.15, 2_000.0)
+
+
+def format_value(value: object) -> str:
+    """Return a value as TOML writes it. A list or table is named, and a long text is cut.
+
+    >>> format_value(True), format_value("x"), format_value([1, 2])
+    ('true', '"x"', 'a list')
+    """
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, str):
+        ellipsis = "…" if len(value) > MAX_QUOTED_CHARACTERS else ""
+        return f'"{value[:MAX_QUOTED_CHARACTERS]}{ellipsis}"'
+    if isinstance(value, list | tuple | dict):
+        return "a table" if isinstance(value, dict) else "a list"
+    if isinstance(value, int) and abs(value) > MAX_WRITTEN_INTEGER:
+        return "an integer of more than 64 bits"
+    return str(value)[:MAX_QUOTED_CHARACTERS]
+
+
+def _number_text(value: float, unit: str) -> str:
+    """Return a number with its unit.
+
+    >>> _number_text(2e6, "Hz"), _number_text(0.25, "s"), _number_text(172_800.0, "s"), _number_text(10**400, "")
+    ('2 MHz', '250 ms', '2 d', 'an integer of more than 64 bits')
+    """
+    if isinstance(value, int) and abs(value) > MAX_WRITTEN_INTEGER:
+        return "an integer of more than 64 bits"
+    if unit in PREFIXED_UNITS and isfinite(value) and value < 1e15:
+        for factor, prefix in PREFIXES:
+            if value >= factor:
+                return f"{value / factor:g} {prefix}{unit}"
+    if unit == "s" and 0.0 < value < 1e12:
+        for factor, name in ((DAY_S, "d"), (1.0, "s"), (1e-3, "ms"), (1e-6, "µs")):
+            if value >= factor:
+                return f"{value / factor:g} {name}"
+    return f"{value:g} {unit}".rstrip()

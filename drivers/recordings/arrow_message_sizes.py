@@ -1,0 +1,215 @@
+"""Sizes of the messages of an Arrow IPC stream, read before data are unpacked.
+
+A record batch states its number of rows, and a compressed buffer its unpacked size. pyarrow allocates the stated sizes
+and does not accept a limit. ``iter_batch_sizes`` therefore parses the metadata of each message. It reads the framing,
+the fields of the flatbuffer that state sizes, and the first eight bytes of each compressed buffer.
+
+Sources: the Arrow columnar format, "Encapsulated message format" and "Compression",
+https://arrow.apache.org/docs/format; format/Message.fbs and Schema.fbs for the numbers of the fields; the FlatBuffers
+internals for tables and vectors.
+"""
+
+import os
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import IO, Any, Final
+
+CONTINUATION: Final = 0xFFFFFFFF
+MAX_METADATA_BYTES: Final = 64_000_000
+"""Maximum size of the metadata of one message. A schema of 10 000 columns needs about 2 MB."""
+SCHEMA: Final = 1  # values of MessageHeader
+DICTIONARY_BATCH: Final = 2
+RECORD_BATCH: Final = 3
+MESSAGE_HEADER_TYPE: Final = 1  # fields of Message
+MESSAGE_HEADER: Final = 2
+MESSAGE_BODY_LENGTH: Final = 3
+BATCH_LENGTH: Final = 0  # fields of RecordBatch
+BATCH_BUFFERS: Final = 2
+BATCH_COMPRESSION: Final = 3
+DICTIONARY_DATA: Final = 1  # field of DictionaryBatch
+BUFFER: Final = struct.Struct("<qq")  # offset in the body, length
+
+
+@dataclass(frozen=True, slots=True)
+class StatedBatchSize:
+    """Stated size of one record batch or dictionary."""
+
+    rows: int
+    body_bytes: int  # in the file
+    buffers: tuple[int, ...]  # unpacked size of each buffer in bytes
+    dictionary: bool  # True for a dictionary
+
+
+def iter_batch_sizes(file: IO[bytes], start: int = 0) -> Iterator[StatedBatchSize]:
+    """Yield the stated sizes of the batches of a stream up to the end, a truncation or damaged metadata.
+
+    Parameters
+    ----------
+    file
+        Binary file that can seek.
+    start
+        Offset of the stream in the file, in bytes.
+
+    Yields
+    ------
+    StatedBatchSize
+        Size of each record batch and dictionary, in the order of the file.
+    """
+    end = file.seek(0, os.SEEK_END)
+    at = start
+    while at + 8 <= end:
+        file.seek(at)
+        mark, size = struct.unpack("<II", file.read(8))
+        at += 8
+        if mark != CONTINUATION:  # streams written before Arrow 0.15 lack the mark
+            size, at = mark, at - 4
+        if not 0 < size <= MAX_METADATA_BYTES or at + size > end:
+            return
+        file.seek(at)
+        metadata = file.read(size)
+        body = at + size
+        try:
+            message = _Table.root(metadata)
+            kind = message.read_number(MESSAGE_HEADER_TYPE, "B")
+            body_bytes = message.read_number(MESSAGE_BODY_LENGTH, "q")
+            if body_bytes < 0:
+                return
+            if kind in (RECORD_BATCH, DICTIONARY_BATCH):
+                batch = message.read_table(MESSAGE_HEADER)
+                batch = batch.read_table(DICTIONARY_DATA) if kind == DICTIONARY_BATCH else batch
+                yield _read_batch_size(file, batch, body, body_bytes, kind == DICTIONARY_BATCH)
+            elif kind != SCHEMA:
+                return
+        except (struct.error, LookupError):
+            return
+        at = body + body_bytes
+
+
+def check_buffer_sizes(size: StatedBatchSize, counts: Sequence[int | None], slack_bytes: int) -> str:
+    """Check that no buffer of a numeric column is larger after unpacking than the rows of the batch need.
+
+    Parameters
+    ----------
+    size
+        Stated size of the batch.
+    counts
+        Number of buffers of each column in the order of the schema. The number is negative if the column is not read,
+        and None if it is unknown. All buffers after an unknown number are checked.
+    slack_bytes
+        Size allowed in addition to eight bytes per row.
+
+    Returns
+    -------
+    str
+        Description of the error, "" if there is none.
+    """
+    most = 8 * size.rows + slack_bytes
+    at = 0
+    for count in counts:
+        n = len(size.buffers) - at if count is None else abs(count)
+        used = count is None or count > 0
+        large = max(size.buffers[at : at + n], default=0) if used else 0
+        if large > most:
+            return f"a buffer of {size.rows} rows unpacks to {large} bytes, expected at most {most}"
+        at += n
+        if count is None:
+            break
+    return ""
+
+
+def count_buffers(pa: Any, type_: Any) -> int | None:
+    """Return the number of buffers of a column.
+
+    Parameters
+    ----------
+    pa
+        The module pyarrow.
+    type_
+        pyarrow type of the column.
+
+    Returns
+    -------
+    int or None
+        None if the type is nested or has views, and the number therefore varies.
+    """
+    types = pa.types
+    if types.is_null(type_):
+        return 0
+    if types.is_nested(type_) or types.is_run_end_encoded(type_) or isinstance(type_, pa.BaseExtensionType):
+        return None
+    if types.is_string_view(type_) or types.is_binary_view(type_):
+        return None
+    variable = (types.is_string, types.is_large_string, types.is_binary, types.is_large_binary)
+    return 3 if any(is_type(type_) for is_type in variable) else 2
+
+
+def _read_batch_size(file: IO[bytes], batch: "_Table", body: int, body_bytes: int, dictionary: bool) -> StatedBatchSize:
+    """Return the stated size of a batch whose body begins at the offset ``body`` of the file."""
+    rows = batch.read_number(BATCH_LENGTH, "q")
+    packed = batch.has_field(BATCH_COMPRESSION)
+    sizes = []
+    for offset, length in batch.read_structs(BATCH_BUFFERS, BUFFER):
+        unpacked = length
+        if packed and length >= 8 and 0 <= offset <= body_bytes - 8:
+            file.seek(body + offset)
+            (stated,) = struct.unpack("<q", file.read(8))
+            unpacked = length if stated == -1 else stated  # -1: stored without compression
+        sizes.append(max(unpacked, 0))
+    return StatedBatchSize(max(rows, 0), body_bytes, tuple(sizes), dictionary)
+
+
+@dataclass(frozen=True, slots=True)
+class _Table:
+    """Table of a flatbuffer. The methods raise struct.error or LookupError for offsets outside of the buffer."""
+
+    data: bytes
+    at: int
+
+    @classmethod
+    def root(cls, data: bytes) -> "_Table":
+        """Return the root table of a flatbuffer."""
+        return cls(data, struct.unpack_from("<I", data)[0])
+
+    def has_field(self, field: int) -> bool:
+        """Return True if the table contains a field."""
+        return self._field(field) != 0
+
+    def read_number(self, field: int, number_format: str) -> int:
+        """Return a number; 0 if the field is absent. ``number_format`` is a format of the module struct."""
+        at = self._field(field)
+        return int(_unpack_number(f"<{number_format}", self.data, at)) if at else 0
+
+    def read_table(self, field: int) -> "_Table":
+        """Return a table that this table refers to."""
+        at = self._field(field)
+        if not at:
+            raise LookupError(field)
+        return _Table(self.data, at + _unpack_number("<I", self.data, at))
+
+    def read_structs(self, field: int, layout: struct.Struct) -> Iterator[tuple[Any, ...]]:
+        """Yield the unpacked structs of a vector; nothing if the field is absent."""
+        at = self._field(field)
+        if not at:
+            return iter(())
+        at += _unpack_number("<I", self.data, at)
+        count = _unpack_number("<I", self.data, at)
+        if count * layout.size > len(self.data):
+            raise LookupError(field)
+        return layout.iter_unpack(self.data[at + 4 : at + 4 + count * layout.size])
+
+    def _field(self, field: int) -> int:
+        """Return the offset of a field; 0 if the field is absent."""
+        entries = self.at - _unpack_number("<i", self.data, self.at)
+        entry = 4 + 2 * field
+        if entries < 0 or entry >= _unpack_number("<H", self.data, entries):
+            return 0
+        offset = _unpack_number("<H", self.data, entries + entry)
+        return self.at + offset if offset else 0
+
+
+def _unpack_number(number_format: str, data: bytes, at: int) -> int:
+    """Unpack one number at an offset."""
+    if at < 0:
+        raise LookupError(at)
+    return int(struct.unpack_from(number_format, data, at)[0])

@@ -1,0 +1,140 @@
+"""Configurations of zenoh sessions. By default a session is a peer that does not scout or listen.
+
+This module opens no session. The link, the publisher of the daemon and ``watch`` each open their own session.
+"""
+
+import contextlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from drivers.credential_masking import mask_secrets
+from drivers.file_access import check_regular
+
+if TYPE_CHECKING:
+    import zenoh
+
+DEFAULT_CONFIGURATION: Final[Mapping[str, Any]] = {
+    "mode": "peer",
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "listen/endpoints": [],
+    "connect/retry": {"period_init_ms": 200, "period_max_ms": 1000, "period_increase_factor": 2},
+    "transport/link/rx/max_message_size": 64_000_000,
+}
+"""Default configuration of a session. zenoh's own defaults scout and listen everywhere, and accept 1 GiB at once.
+
+A lost connection is retried at least every second. A message longer than 64 MB is dropped while it arrives, and the
+connection stays open. An hour of samples at 1 kHz in one batch would fit.
+"""
+
+SECRET_FILES: Final = (
+    "transport/link/tls/listen_private_key",
+    "transport/link/tls/connect_private_key",
+    "transport/auth/usrpwd/dictionary_file",
+    "transport/auth/pubkey/private_key_file",
+)
+"""Configuration keys of files that other users must not read."""
+PUBLIC_FILES: Final = (
+    "transport/link/tls/root_ca_certificate",
+    "transport/link/tls/listen_certificate",
+    "transport/link/tls/connect_certificate",
+    "transport/auth/pubkey/public_key_file",
+    "transport/auth/pubkey/known_keys_file",
+)
+"""Configuration keys of files that other users may read."""
+
+
+def build_session_config(
+    own: Mapping[str, Any], file: str | Path | None = None, defaults: Mapping[str, Any] = DEFAULT_CONFIGURATION
+) -> "zenoh.Config":
+    """Return the configuration of a session.
+
+    Parameters
+    ----------
+    own
+        Values by configuration key, which take precedence over the file. None means not set.
+    file
+        zenoh configuration file; None for zenoh's defaults.
+    defaults
+        Values for keys that the file leaves at zenoh's default.
+
+    Raises
+    ------
+    zenoh.ZError
+        If zenoh refuses the file or a value.
+    """
+    import zenoh
+
+    unchanged = zenoh.Config()
+    if file:
+        _check_file(Path(file))
+    config = zenoh.Config.from_file(str(file)) if file else zenoh.Config()
+    for named in _named_files(config):
+        _check_file(named)
+    for key, value in defaults.items():
+        if config.get_json(key) == unchanged.get_json(key):
+            config.insert_json5(key, json.dumps(value))
+    for key, value in own.items():
+        if value is not None:
+            config.insert_json5(key, json.dumps(value))
+    return config
+
+
+def format_zenoh_error(error: Exception) -> str:
+    """Return the text of a zenoh error in one line.
+
+    Positions in zenoh's source code and quoted file contents are removed, since a line of a configuration file may
+    contain a password.
+    """
+    text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error))
+    text = re.sub(r"\s*-->\s*(\d+):(\d+)\s*\n.*\n\s*=\s*", r"line \1, column \2: ", text, flags=re.DOTALL)
+    text = re.sub(r"(invalid (?:type|value): \w+) (?:`[^`]*`|\"[^\"]*\")", r"\1", text)
+    text = re.sub(
+        r'JSON error: Message \{ msg: "(.*)", location: Some\(Location \{ (line): (\d+), (column): (\d+) \}\) \}',
+        r"\2 \3, \4 \5: \1",
+        text,
+    )
+    return mask_secrets(" ".join(text.split()))
+
+
+def is_unconnected(session: "zenoh.Session") -> bool:
+    """Return True if the session has no connection. Return False for a closed session."""
+    import zenoh
+
+    with contextlib.suppress(zenoh.ZError):
+        return not session.info.routers_zid() and not session.info.peers_zid()
+    return False
+
+
+def find_connect_endpoints(config: "zenoh.Config") -> tuple[str, ...]:
+    """Return the endpoints to which a configuration connects in the mode of the session."""
+    found = json.loads(config.get_json("connect/endpoints"))
+    if isinstance(found, dict):
+        found = found.get(json.loads(config.get_json("mode")) or "peer", [])
+    return tuple(str(endpoint) for endpoint in found)
+
+
+def find_secret_files(config: "zenoh.Config") -> tuple[Path, ...]:
+    """Return the private keys and password lists that a configuration names. Other users must not read them."""
+    return _named_files(config, SECRET_FILES)
+
+
+def _named_files(config: "zenoh.Config", keys: Sequence[str] | None = None) -> tuple[Path, ...]:
+    """Return the files that a configuration names under ``keys``, or under all keys."""
+    found = (json.loads(config.get_json(key)) for key in keys or (*SECRET_FILES, *PUBLIC_FILES))
+    return tuple(Path(named) for named in found if named)
+
+
+def _check_file(path: Path) -> None:
+    """Raise ZError if the path is not a regular file. zenoh would wait forever for a FIFO."""
+    import zenoh
+
+    try:
+        check_regular(path)
+    except FileNotFoundError:
+        return  # zenoh reports a missing file
+    except OSError as error:
+        raise zenoh.ZError(f"{path}: {error.strerror or error}") from error

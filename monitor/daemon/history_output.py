@@ -1,0 +1,120 @@
+"""Output that writes the history file of the service, and reads the file for the viewer and for zenoh queries."""
+
+import time
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+from drivers.errors import NotReady, RecordingError
+from drivers.sample import Event, Ints, SampleBlock
+from monitor.common.health import Health
+from monitor.daemon.output import Output
+from monitor.estimation.estimate import Estimate
+from monitor.history.minute_aggregation import MinuteAggregator
+from monitor.history.query import parse_query
+from monitor.history.reading import HistoryTable, read_history
+from monitor.history.sqlite_store import FILE_NAME, open_history
+from monitor.history.stored_events import StoredEvent
+from monitor.history.time_ranges import TimeRange
+from monitor.history.writer import HistoryWriter
+from monitor.publishing.messages.history import HistoryMessage
+from monitor.publishing.messages.results import event_start_s
+
+
+class HistoryOutput(Output):
+    """Output that aggregates the results per minute, and writes them with the events to the history file.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder of the history file.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.writer = HistoryWriter(folder / FILE_NAME, time.time)
+        self._received: dict[str, int] = {}  # number of samples of each device since the start
+        self._minutes: defaultdict[str, MinuteAggregator] = defaultdict(MinuteAggregator)
+
+    @property
+    def state(self) -> str:
+        """Status message of the writer."""
+        return self.writer.state
+
+    def start(self) -> None:
+        """Start the writer."""
+        self.writer.start()
+
+    def close(self) -> None:
+        """Store the incomplete minutes of all devices, and close the file."""
+        for device, minutes in self._minutes.items():
+            self.writer.put_row(device, minutes.flush())
+        self.writer.close()
+
+    def publish_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: Ints | int) -> None:
+        """Aggregate the temperature of the samples."""
+        unix_s = float((samples.t_ns + offset_ns)[-1]) / 1e9
+        self.writer.put_row(device, self._minutes[device].add_temperature(unix_s, samples.temperature_c))
+
+    def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
+        """Aggregate the coefficients and the deviations of an estimate."""
+        if isinstance(result, Estimate):
+            self.writer.put_row(device, self._minutes[device].add_estimate(unix_s, result))
+
+    def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
+        """Store an event."""
+        # SQLite does not accept NumPy scalars, so they are converted to plain numbers
+        what = {name: {side: float(one) for side, one in sides.items()} for name, sides in event.values.items()}
+        sigma, since_s = None if event.sigma is None else float(event.sigma), event_start_s(unix_s, event)
+        self.writer.put_event(device, StoredEvent(unix_s, event.kind, event.text, event.axis, what, since_s, sigma))
+
+    def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
+        """Aggregate counts and state, once the time of the first sample is known."""
+        self._received[device] = health.received
+        if unix_s is not None:
+            self.writer.put_row(device, self._minutes[device].add_health(unix_s, health))
+
+    def remove_device(self, device: str) -> None:
+        """Store the last minute of a removed device."""
+        self._received.pop(device, None)
+        if device in self._minutes:
+            self.writer.put_row(device, self._minutes.pop(device).flush())
+
+    # --- reading
+
+    def read_newest(self, device: str, span_s: float) -> HistoryTable | None:
+        """Return the results of the last ``span_s`` seconds of a device, or None if there are no results.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        span_s : float
+            Length of the time range in seconds.
+        """
+        now_s = time.time()
+        try:
+            with open_history(self.writer.path) as reader:
+                return read_history(reader, device, TimeRange(now_s - span_s, now_s))
+        except (NotReady, RecordingError):  # no results yet; the writer reports errors of the file
+            return None
+
+    def answer_query(self, device: str, parameters: str) -> bytes:
+        """Return the answer to a zenoh query for the history of a device. Each query has its own thread.
+
+        Parameters
+        ----------
+        device : str
+            Name of the device.
+        parameters : str
+            Parameters of the zenoh selector.
+
+        Raises
+        ------
+        ImuError
+            If the query is invalid, or if the history has no data to answer the query.
+        """
+        query = parse_query(parameters, time.time())
+        with open_history(self.writer.path) as reader:
+            table = read_history(reader, device, query.span, query.selects, query.step_s)
+            newest_s = reader.newest_s(device)
+        return HistoryMessage.reply(table, query, newest_s, self._received.get(device, 0)).encode()

@@ -1,0 +1,247 @@
+"""Reconciliation of the live window: answers ``command/reconcile`` with the command that also reads recordings.
+
+A request consists of a copy of the window and a zenoh query. The result is an answer to the query, and an event of the
+device. For each query, a thread writes the samples as a recording into a temporary folder and runs ``imu-monitor
+reconcile`` on it in a child process. It then passes the JSON of the child on. The child has a low priority and is
+killed after TIMEOUT_S. Nothing waits for it. A fit takes seconds to minutes, and in this process it would delay every
+sample. Each device has at most one reconciliation at a time.
+
+The query cannot choose the folder of the report, because anyone on the network may send a query. The report is kept in
+a new folder inside the device's ``reconcile_folder``, or not at all. The possible answers are a result with ``exit`` 0,
+a result with ``exit`` 3 if the data do not support an answer, and an error in one line. A result with ``exit`` 3 states
+the reason.
+"""
+
+import contextlib
+import os
+import queue
+import signal
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import msgspec
+import numpy as np
+
+from drivers.sample import AXES, Floats
+from monitor.common.program import PROGRAM
+from monitor.estimation.window_snapshot import WindowSnapshot
+from monitor.publishing.messages.results import ReconcileReply
+from monitor.publishing.zenoh.publisher import Command
+
+COMMAND: Final = (*PROGRAM, "reconcile")
+"""Command of the child process."""
+TIMEOUT_S: Final = 900.0
+"""Time after which the child process is killed."""
+NICENESS_INCREASE: Final = 10
+"""Increase of the child's niceness over the daemon's. An unprivileged process cannot lower the niceness of its
+children.
+"""
+LARGEST_NICENESS: Final = 19
+SEED: Final = 1
+"""Seed of the simulated recordings."""
+DONE: Final = 0
+"""Exit status of a successful reconciliation."""
+NO_ANSWER: Final = 3
+"""Exit status if the data do not support an answer. The result states the reason."""
+JOIN_TIMEOUT_S: Final = 3.0
+"""Longest wait for a thread when the service ends."""
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """Copy of a window that is to be reconciled."""
+
+    device: str
+    unix_s: float  # time of the newest sample
+    samples: int  # number of samples received up to the newest one
+    window: WindowSnapshot
+    temperature_c: Floats  # [n] of the samples in the window
+    model: Path | None  # model under test
+    folder: Path | None  # folder for reports; None if they are not kept
+
+
+@dataclass(frozen=True, slots=True)
+class Finished:
+    """Result of a reconciliation in one sentence."""
+
+    device: str
+    text: str
+
+
+class Reconciler:
+    """Runner of the reconciliations of all devices.
+
+    Parameters
+    ----------
+    program : sequence of str, optional
+        Command that is run, before the path of the recording and the options.
+    limit_s : float, optional
+        Time in seconds after which the command is killed.
+    """
+
+    def __init__(self, program: Sequence[str] = COMMAND, limit_s: float = TIMEOUT_S) -> None:
+        self._program = tuple(program)
+        self._limit_s = limit_s
+        self._running: dict[str, threading.Thread] = {}
+        self._children: dict[str, subprocess.Popen[bytes]] = {}
+        self._finished: queue.SimpleQueue[Finished] = queue.SimpleQueue()
+        self._closing = threading.Event()
+
+    def start(self, job: Job, command: Command) -> None:
+        """Start a reconciliation and return at once. The command is refused while another one runs for the device.
+
+        Parameters
+        ----------
+        job : Job
+            Window to reconcile.
+        command : Command
+            Query that receives the answer.
+        """
+        before = self._running.get(job.device)
+        if before is not None and before.is_alive():
+            command.reply_refusal("busy: a reconciliation of this device is already running")
+            return
+        name = f"reconcile of {job.device}"
+        thread = threading.Thread(target=self._run, args=(job, command), name=name, daemon=True)
+        self._running[job.device] = thread
+        thread.start()
+
+    def take_finished(self) -> list[Finished]:
+        """Return the results since the last call."""
+        found = []
+        with contextlib.suppress(queue.Empty):
+            while True:
+                found.append(self._finished.get_nowait())
+        return found
+
+    def close(self) -> None:
+        """Kill the running reconciliations and refuse their queries."""
+        self._closing.set()
+        for child in list(self._children.values()):
+            _kill(child)
+        for thread in self._running.values():
+            thread.join(JOIN_TIMEOUT_S)
+
+    # --- thread of one query
+
+    def _run(self, job: Job, command: Command) -> None:
+        """Reconcile a window and answer its query."""
+        try:
+            result, status, folder = self._reconcile(job)
+        except (OSError, RuntimeError) as error:
+            command.reply_refusal(str(error))
+            self._finished.put(Finished(job.device, f"reconcile failed: {error}"))
+            return
+        head = ReconcileReply(device=job.device, t=job.unix_s, samples=job.samples)
+        command.reply_result(head.encode_report(result, status, folder))
+        self._finished.put(Finished(job.device, format_result(result, status)))
+
+    def _reconcile(self, job: Job) -> tuple[dict[str, Any], int, str | None]:
+        """Return the JSON result, the exit status and the folder of the report, or None if the report is not kept.
+
+        Raises
+        ------
+        RuntimeError
+            If the command gave no result.
+        """
+        with tempfile.TemporaryDirectory(prefix="imu-monitor-") as temporary:
+            path, folder = Path(temporary) / f"{job.device}.npz", Path(temporary) / "report"
+            if job.folder is not None:
+                stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime(job.unix_s))
+                folder = job.folder / f"{job.device}-{stamp}"
+                folder.mkdir(parents=True, exist_ok=True)
+            write_window(path, job)
+            options = ["--out", str(folder), "--json", "-", "--seed", str(SEED)]
+            if job.model is not None:
+                options += ["--model", str(job.model)]
+            status, output, errors = self._run_child(job.device, [*self._program, str(path), *options])
+        if status not in (DONE, NO_ANSWER):
+            lines = errors.decode("utf-8", "replace").strip().splitlines()
+            raise RuntimeError(lines[-1] if lines else f"reconcile ended with status {status}")
+        try:
+            result = msgspec.json.decode(output, type=dict[str, Any])
+        except msgspec.DecodeError as error:
+            raise RuntimeError(f"reconcile gave no result that can be read: {error}") from error
+        return result, status, None if job.folder is None else str(folder)
+
+    def _run_child(self, device: str, arguments: list[str]) -> tuple[int, bytes, bytes]:
+        """Run the program; return its exit status, standard output and standard error."""
+        pipe = subprocess.PIPE
+        child = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=pipe, stderr=pipe, start_new_session=True)
+        self._children[device] = child
+        try:
+            with contextlib.suppress(ProcessLookupError):
+                os.setpriority(os.PRIO_PROCESS, child.pid, min(os.nice(0) + NICENESS_INCREASE, LARGEST_NICENESS))
+            if self._closing.is_set():  # the child was started while ``close`` killed the others
+                _kill(child)
+            output, errors = child.communicate(timeout=self._limit_s)
+        except subprocess.TimeoutExpired:
+            _kill(child)
+            child.communicate()
+            raise RuntimeError(f"reconcile was ended after {self._limit_s:g} s") from None
+        finally:
+            del self._children[device]
+        if self._closing.is_set():
+            raise RuntimeError("the service is stopping")
+        return child.returncode, output, errors
+
+
+def write_window(path: Path, job: Job) -> None:
+    """Write a window as a recording with its measured axes, its temperature and its rate.
+
+    Parameters
+    ----------
+    path : Path
+        File to write, in the format of ``numpy.savez``.
+    job : Job
+        Window to write.
+    """
+    values = job.window.values()
+    columns = {axis: values[:, i] for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()}
+    if not np.isnan(job.temperature_c).all():
+        columns["temperature"] = job.temperature_c
+    np.savez(path, fs=np.float64(job.window.rate_hz), **columns)  # type: ignore[arg-type]
+
+
+def format_result(result: dict[str, Any], status: int = DONE) -> str:
+    """Return the verdict and the changes of the model in one sentence.
+
+    Parameters
+    ----------
+    result : dict
+        JSON result of ``imu-monitor reconcile``.
+    status : int, optional
+        Exit status of the command.
+
+    Examples
+    --------
+    >>> format_result({"verdict": "explained", "axes": {"gz": {"steps": [
+    ...     {"kind": "added", "effect": "sinusoidal", "confidence": 0.998}]}}})
+    'reconcile: explained: gz sinusoidal added (0.998)'
+    """
+    if status == NO_ANSWER:
+        return f"reconcile: no answer: {result.get('why', 'too little data')}"
+    steps = [
+        _step_text(axis, step) for axis, found in result.get("axes", {}).items() for step in found.get("steps", ())
+    ]
+    verdict = str(result.get("verdict")).replace("_", " ")
+    return f"reconcile: {verdict}" + (f": {', '.join(steps)}" if steps else "")
+
+
+def _step_text(axis: str, step: dict[str, Any]) -> str:
+    """Return one change of the model as text."""
+    confidence = step.get("confidence")
+    sure = f" ({confidence:.3f})" if isinstance(confidence, float) else ""
+    return f"{axis} {step.get('effect')} {step.get('kind')}{sure}"
+
+
+def _kill(child: "subprocess.Popen[bytes]") -> None:
+    """Kill a child process and all processes that it started."""
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(child.pid, signal.SIGKILL)

@@ -1,0 +1,188 @@
+"""Test for a dependence of the bias on temperature, and noise coefficients after removal of this dependence.
+
+The input is the analysis of a recording and the temperature of each sample. ``temperature_dependence`` tests the bias
+of each axis for a dependence on temperature against a null hypothesis of correlated noise. If the dependence is
+significant, a model of ``thermal_fit`` is subtracted from the samples. The model is interpolated smoothly between the
+middles of the intervals, because steps and corners would add noise. The Allan deviation and the coefficients are then
+computed again. Axes without a significant dependence are not changed and not reported.
+
+A model can follow a part of a random walk by chance. A share of a few percent of K or R is therefore not significant.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from drivers.errors import NotReady
+from drivers.sample import AXES, Floats
+from monitor.drift.thermal.interval_means import compute_interval_means
+from monitor.drift.thermal.temperature_dependence import TemperatureDependence, find_dependence
+from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means_suffice, fit_thermal_model
+from monitor.drift.thermal.thermal_model import predict
+from monitor.drift.thermal.thermal_study import choose_interval_s
+from monitor.estimation.allan.batch import EachAxis
+from monitor.estimation.analysis import Analysis, fit_other_samples
+from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
+
+SLOW_LETTERS: Final = ("K", "R")
+"""Letters of the coefficients of slow variation."""
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureRemoval:
+    """Dependence of each axis on temperature, and the coefficients after its removal from the bias."""
+
+    models: Mapping[str, str]  # axis -> form of its model, for the axes with a fitted model
+    before: Coefficients
+    coefficients: Coefficients
+    k_or_r: tuple[bool, ...]  # [6] per axis, as in ``Estimate``
+    dependences: Mapping[str, TemperatureDependence] = field(default_factory=dict)  # significant dependences by axis
+
+    @property
+    def axes_of_temperature(self) -> tuple[str, ...]:
+        """Return the axes on which temperature explains most of the slow variance."""
+        return tuple(axis for axis, one in self.dependences.items() if one.explains_most)
+
+    def variance_share(self, letter: str, axis: str) -> float | None:
+        """Return the share of a coefficient's variance that temperature explains: 1 − after²/before².
+
+        If only an upper bound is known after the removal, the result is a lower bound of the share.
+
+        Parameters
+        ----------
+        letter : str
+            Letter of the coefficient, one of SYMBOLS.
+        axis : str
+            Name of the axis.
+
+        Returns
+        -------
+        float or None
+            The share, at least 0. None if the coefficient was not estimated before the removal, or is unknown after it.
+        """
+        at = SYMBOLS.index(letter), AXES.index(axis)
+        if self.before.status[at] != Status.ESTIMATED or self.coefficients.status[at] == Status.UNESTIMATED:
+            return None
+        bounded = self.coefficients.status[at] == Status.UPPER_BOUND
+        after = float((self.coefficients.hi if bounded else self.coefficients.value)[at])
+        return max(1.0 - (after / float(self.before.value[at])) ** 2, 0.0)
+
+    def has_decreased_significantly(self, letter: str, axis: str) -> bool:
+        """Return True if the upper limit of the new coefficient lies below the confidence interval of the old
+        coefficient.
+
+        Parameters
+        ----------
+        letter : str
+            Letter of the coefficient, one of SYMBOLS.
+        axis : str
+            Name of the axis.
+        """
+        at = SYMBOLS.index(letter), AXES.index(axis)
+        return self.variance_share(letter, axis) is not None and bool(self.coefficients.hi[at] < self.before.lo[at])
+
+
+def temperature_varied(temperatures_c: Floats) -> bool:
+    """Return True if temperature [n] in °C is known and varied by more than MIN_SWING_C."""
+    return (
+        bool(np.isfinite(temperatures_c).any())
+        and float(np.ptp(temperatures_c[np.isfinite(temperatures_c)])) > MIN_SWING_C
+    )
+
+
+def remove_temperature(result: Analysis, temperature_c: Floats, each: EachAxis = map) -> TemperatureRemoval | None:
+    """Return the coefficients of an analysis without the temperature part of the bias.
+
+    Parameters
+    ----------
+    result : Analysis
+        Analysis of a recording.
+    temperature_c : ndarray, shape (n,)
+        Temperature of each sample, °C.
+    each : callable
+        Replacement for ``map``, which may run in parallel.
+
+    Returns
+    -------
+    TemperatureRemoval or None
+        None if no axis depends on temperature.
+    """
+    rate_hz = result.estimate.rate_hz
+    interval_s = choose_interval_s(len(result.values) / rate_hz, rate_hz)
+    values, models, dependences = result.values, dict[str, str](), dict[str, TemperatureDependence]()
+    for at, axis in enumerate(AXES):
+        means = compute_interval_means(result.values[:, at], temperature_c, rate_hz, interval_s)
+        try:
+            check_means_suffice(means)
+        except NotReady:
+            continue
+        dependence = find_dependence(means)
+        if dependence is None:
+            continue
+        dependences[axis] = dependence
+        model = fit_thermal_model(means).model
+        if model.shape.difference_equation_order or model.shape.powers:
+            values = values.copy() if values is result.values else values
+            course = predict(model, means.temperature_c, began=True).bias
+            values[:, at] -= interpolate_smoothly(course, round(means.interval_s * rate_hz), len(values))
+            models[axis] = model.shape.name
+    if not dependences:
+        return None
+    before, k_or_r = result.estimate.coefficients, result.estimate.k_or_r
+    after = before
+    if models:
+        fit = fit_other_samples(result, values, each)
+        after, k_or_r = fit.coefficients, fit.k_or_r
+    return TemperatureRemoval(models, before, after, tuple(bool(one) for one in k_or_r), dependences)
+
+
+def interpolate_smoothly(course: Floats, length: int, n: int) -> Floats:
+    """Interpolate interval values by a smooth curve of n samples with zero mean.
+
+    The curve is a natural cubic spline through the middles of the intervals, and linear beyond them.
+
+    Parameters
+    ----------
+    course : ndarray, shape (intervals,)
+        Value of each interval, at least two.
+    length : int
+        Samples per interval.
+    n : int
+        Number of samples.
+
+    Examples
+    --------
+    >>> interpolate_smoothly(np.array([1.0, 3.0, 5.0]), 2, 6).tolist()
+    [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
+    """
+    bend = _natural_spline(course)
+    at = (np.arange(n) + 0.5) / length - 0.5  # in intervals, 0 = middle of the first interval
+    left = np.clip(at.astype(np.int64), 0, course.size - 2)
+    right = left + 1
+    t = np.clip(at, 0.0, course.size - 1.0) - left
+    made = (1.0 - t) * course[left] + t * course[right]
+    made += ((1.0 - t) ** 3 - (1.0 - t)) / 6.0 * bend[left] + (t**3 - t) / 6.0 * bend[right]
+    first = course[1] - course[0] - bend[1] / 6.0
+    last = course[-1] - course[-2] + bend[-2] / 6.0
+    made += first * np.minimum(at, 0.0) + last * np.maximum(at - (course.size - 1.0), 0.0)
+    return np.asarray(made - made.mean())
+
+
+def _natural_spline(y: Floats) -> Floats:
+    """Return the second derivatives of the natural cubic spline through y [n ≥ 2] at steps of one.
+
+    de Boor, A Practical Guide to Splines, 1978, chapter IV: the system of M is tridiagonal, (1, 4, 1) / 6.
+
+    >>> _natural_spline(np.array([0.0, 1.0, 0.0])).tolist()
+    [0.0, -3.0, 0.0]
+    """
+    bend, right = np.zeros(y.size), 6.0 * np.diff(y, 2)
+    diagonal = np.full(right.size, 4.0)
+    for i in range(1, right.size):
+        diagonal[i] -= 1.0 / diagonal[i - 1]
+        right[i] -= right[i - 1] / diagonal[i - 1]
+    for i in reversed(range(right.size)):
+        bend[i + 1] = (right[i] - bend[i + 2]) / diagonal[i]
+    return bend

@@ -1,0 +1,124 @@
+"""Allan deviation of a device over time as a heat map, shown by the viewer under ``/<device>/dynamic/<axis>``.
+
+Each axis has an image and labels: time to the right, τ upwards, coloured by the deviation relative to its median over
+time. Rerun draws an image with one unit per pixel and has no axes. Each τ is therefore several pixels high, and labels
+are points. An image is a PNG with a palette of a few kilobytes. The scene draws one when a column is complete, which
+happens less often the longer the service runs. Importing this module imports Rerun.
+"""
+
+import io
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+import rerun as rr
+from PIL import Image  # installed with rerun-sdk
+
+from drivers.sample import AXES, Floats
+from monitor.common.units import format_utc
+from monitor.publishing.plots import colours
+from monitor.publishing.rerun.allan_drawing import Log, label_points
+from monitor.publishing.rerun.allan_history import COLUMNS, AllanHistory
+
+HEIGHT: Final = 60  # approximate height of an image [pixels]; with COLUMNS the shape of a third of a tab
+COLOUR_SCALE_RATIO: Final = 2.0  # ends of the colour scale: half and twice the median
+SHADES: Final = 127  # shades on either side of the median
+NO_VALUE_INDEX: Final = 2 * SHADES + 1  # palette index of a missing deviation
+MIN_COLUMNS: Final = 4  # number of columns required for a meaningful median
+BAR_X: Final = COLUMNS + 9.0
+BAR_STEPS: Final = 24
+LABEL_MARGINS_PX: Final = (24.0, 7.0, 32.0, 13.0)  # left, above, right and below the image, for labels
+
+
+def view_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the bounds in x and y of a view for this number of τ."""
+    left, above, right, below = LABEL_MARGINS_PX
+    return (-left, COLUMNS + right), (-above, _rows(tau_count) * tau_count + below)
+
+
+def draw_heat_maps(log: Log, path: str, surface: AllanHistory) -> None:
+    """Log the images and labels of all measured axes at the current time of the stream.
+
+    Parameters
+    ----------
+    log
+        Function that logs an entity.
+    path
+        Path of the surfaces.
+    surface
+        Deviations over time.
+    """
+    whole = surface.log_ratio_to_median()
+    if len(whole) < MIN_COLUMNS:
+        return
+    for i, axis in enumerate(AXES):
+        if not np.isfinite(whole[:, :, i]).any():
+            continue
+        height = _rows(surface.tau_s.size) * surface.tau_s.size
+        log(
+            f"{path}/{axis}",
+            rr.EncodedImage(contents=encode_heat_map(whole[:, :, i]), media_type="image/png", draw_order=-20.0),
+        )
+        labels = _tau_labels(surface.tau_s, height) + _time_labels(surface, height) + _bar_labels(height)
+        log(f"{path}/{axis}/labels", label_points(labels))
+        log(f"{path}/{axis}/scale", _bar(height))
+
+
+def encode_heat_map(log_ratio: Floats) -> bytes:
+    """Return a PNG of ln(deviation / median), shape [columns, m]: COLUMNS pixels wide, the longest τ at the top."""
+    share = np.clip(np.nan_to_num(log_ratio) / np.log(COLOUR_SCALE_RATIO), -1.0, 1.0)
+    shade = np.where(np.isfinite(log_ratio), np.rint(SHADES * (1.0 + share)), NO_VALUE_INDEX).astype(np.uint8)
+    wide = shade[np.arange(COLUMNS) * len(log_ratio) // COLUMNS]
+    image = Image.fromarray(np.repeat(wide.T[::-1], _rows(log_ratio.shape[1]), axis=0), "P")
+    image.putpalette([part for colour in PALETTE for part in colour])
+    data = io.BytesIO()
+    image.save(data, "PNG")
+    return data.getvalue()
+
+
+def _palette() -> tuple[colours.Colour, ...]:
+    """Return the palette: blue below the median, dark at it, vermilion above, and the colour of missing values."""
+    below = [colours.blend(colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, colours.MINOR) for i in range(SHADES)]
+    above = [colours.blend(colours.AXIS_COLOURS["gx"], i / SHADES, colours.MINOR) for i in range(SHADES + 1)]
+    return (*below, *above, colours.BACKGROUND)
+
+
+PALETTE: Final = _palette()
+
+
+def _rows(taus: int) -> int:
+    """Return the height of one τ [pixels]."""
+    return max(1, round(HEIGHT / max(taus, 1)))
+
+
+def _tau_labels(tau_s: Floats, height: int) -> list[tuple[float, float, str]]:
+    """Return labels at the powers of ten of τ, and the label of the unit."""
+    log = np.log10(tau_s)
+    powers = range(int(np.ceil(log[0])), int(np.floor(log[-1])) + 1)
+    rows = np.interp(list(powers), log, (np.arange(log.size) + 0.5) / log.size)
+    labels = [(-11.0, height * (1.0 - float(row)), f"{10.0**power:g}") for power, row in zip(powers, rows, strict=True)]
+    return [*labels, (-11.0, -4.0, "τ, s")]
+
+
+def _time_labels(surface: AllanHistory, height: int) -> list[tuple[float, float, str]]:
+    """Return labels with the time of day in UTC of the oldest and newest column."""
+    at = ((12.0, surface.ends_s[0]), (COLUMNS - 1.0, surface.ends_s[-1]))
+    return [(x, height + 6.0, format_utc(t)[-8:]) for x, t in at]
+
+
+def _bar_labels(height: int) -> list[tuple[float, float, str]]:
+    """Return the labels of the colour scale."""
+    ends = zip(
+        (2.0, height / 2.0, height - 2.0),
+        (f"× {COLOUR_SCALE_RATIO:g}", "× 1", f"× {1 / COLOUR_SCALE_RATIO:g}"),
+        strict=True,
+    )
+    return [(BAR_X + 11.0, y, text) for y, text in ends]
+
+
+def _bar(height: int) -> rr.LineStrips2D:
+    """Return the colour scale as vertical strokes."""
+    edges = np.linspace(height, 0.0, BAR_STEPS + 1)
+    tints = [PALETTE[round(i * 2 * SHADES / (BAR_STEPS - 1))] for i in range(BAR_STEPS)]
+    strips = [np.array([[BAR_X, a], [BAR_X, b]]) for a, b in pairwise(edges)]
+    return rr.LineStrips2D(strips, colors=tints, radii=[2.0])

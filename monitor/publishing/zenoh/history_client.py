@@ -1,0 +1,89 @@
+"""Client that queries other daemons for their stored histories over zenoh, for ``imu-monitor history --connect``.
+
+Each query opens a separate session that connects only to the given endpoint. Replies that are not history messages are
+ignored. If there is no valid reply, the reason is raised as an error.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, Final
+
+from drivers.credential_masking import mask_secrets
+from drivers.errors import ConfigError, LinkUnavailable, NotReady
+from drivers.zenoh.connection_errors import explain_refusals
+from drivers.zenoh.session_config import format_zenoh_error
+from monitor.common import topics
+from monitor.history.reading import HistoryTable
+from monitor.publishing.messages.history import decode_history
+from monitor.publishing.messages.message import remove_control_characters
+from monitor.publishing.zenoh.subscriber import client_configurations
+
+PATIENCE_S: Final = 20.0
+"""Timeout of the query."""
+ERRORS: Final = {2: ConfigError, 3: NotReady}
+"""Exception for each exit status in an error reply."""
+
+
+def query_histories(
+    endpoint: str | None, device: str, parameters: str, prefix: str = "imu", file: Path | None = None
+) -> list[HistoryTable]:
+    """Return the histories of all devices that reply, sorted by device.
+
+    Parameters
+    ----------
+    endpoint
+        Endpoint of a daemon or router. By default, the first endpoint in the file, or else the default endpoint.
+    device
+        Name of the device; ``*`` for all devices.
+    parameters
+        Parameters of the selector, see ``monitor.history.query``.
+    prefix
+        Prefix of the daemon's keys.
+    file
+        Configuration file of zenoh, with certificates or a password.
+
+    Raises
+    ------
+    ConfigError
+        If the endpoint, the file or the query is not valid.
+    LinkUnavailable
+        If no daemon is reachable, accepts the connection or replies.
+    NotReady
+        If the time range contains no results.
+    """
+    import zenoh
+
+    endpoint, config = next(iter(client_configurations([endpoint] if endpoint else [], file).items()))
+    selector = f"{topics.HISTORY.key(prefix, device)}?{parameters}"
+    try:
+        with zenoh.open(config) as session:
+            replies = list(session.get(selector, timeout=PATIENCE_S))
+    except zenoh.ZError as error:
+        raise LinkUnavailable(
+            explain_refusals([endpoint], config) or f"{mask_secrets(endpoint)}: {format_zenoh_error(error)}"
+        ) from error
+    endpoint = mask_secrets(endpoint)
+    found, errors = [], [_error_of_reply(reply.err) for reply in replies if reply.ok is None]
+    for reply in replies:
+        if reply.ok is not None:
+            try:
+                found.append(decode_history(bytes(reply.ok.payload)))
+            except ValueError as error:
+                errors.append(LinkUnavailable(f"{reply.ok.key_expr}: not a history message: {error}"))
+    if not found:
+        raise (
+            errors[0]
+            if errors
+            else LinkUnavailable(f"{endpoint}: no answer for {device}; check that the daemon stores a history")
+        )
+    return sorted(found, key=lambda one: one.device)
+
+
+def _error_of_reply(error: Any) -> Exception:
+    """Convert an error reply of a daemon into an exception."""
+    try:
+        reply = json.loads(bytes(error.payload))
+        text, status = remove_control_characters(str(reply["error"])[:500]), reply.get("exit")
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return LinkUnavailable("the daemon sent an error without a readable reason")
+    return ERRORS.get(status, LinkUnavailable)(text)

@@ -1,0 +1,104 @@
+"""zenoh session that is opened in a separate thread, so that an unreachable router delays nothing.
+
+A failed attempt is repeated. Messages are received by threads from channels of zenoh, because a Python callback that is
+still registered at exit would block the process.
+"""
+
+import threading
+from collections.abc import Callable
+from functools import cache
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:
+    import zenoh
+
+REFUSAL_CHECK_S: Final = 3.0
+"""Interval between two checks of why an endpoint refuses the connection."""
+RETRY_S: Final = 1.0
+JOIN_TIMEOUT_S: Final = 2.0
+
+
+class RetriedSession:
+    """Base class of the publisher and of the sessions of the subscriber."""
+
+    close_timeout_s = 2.0
+    """Longest time that ``close`` waits for a session that is being opened [s]."""
+
+    def __init__(self, name: str) -> None:
+        self.closing = threading.Event()
+        self._session: zenoh.Session | None = None
+        self._opener = threading.Thread(target=self._keep_open, name=f"zenoh {name}", daemon=True)
+        self._receivers: list[threading.Thread] = []
+
+    def start(self) -> None:
+        """Start the thread that opens the session."""
+        self._opener.start()
+
+    def close(self) -> None:
+        """Close the session and stop the threads."""
+        self.closing.set()
+        if self._opener.is_alive():
+            self._opener.join(self.close_timeout_s)
+        self._close_session()
+
+    def _open_session(self) -> None:
+        """Open the session and declare its keys."""
+        raise NotImplementedError
+
+    def _report_failure(self, error: Exception) -> None:
+        """Store the reason why the session could not be opened."""
+        raise NotImplementedError
+
+    def _monitor_connection(self) -> None:
+        """Monitor the connection of the open session until the session is closed."""
+        raise NotImplementedError
+
+    def _keep_open(self) -> None:
+        """Open the session and monitor its connection (runs in a thread)."""
+        errors: tuple[type[Exception], ...] = (*zenoh_errors(), OSError)
+        while not self.closing.is_set():
+            try:
+                self._open_session()
+            except errors as error:
+                self._close_session()
+                self._report_failure(error)
+                self.closing.wait(RETRY_S)
+            else:
+                break
+        self._monitor_connection()
+        if self.closing.is_set():  # close() may have stopped waiting before the session was open
+            self._close_session()
+
+    def _close_session(self) -> None:
+        """Close the session, which stops the threads that receive from it."""
+        session, self._session = self._session, None
+        if session is not None:
+            session.close()  # type: ignore[no-untyped-call]
+        threads, self._receivers = self._receivers, []
+        for thread in threads:
+            thread.join(JOIN_TIMEOUT_S)
+
+    def _start_receiving(self, key: str, source: Any, process: Callable[[Any], None]) -> None:
+        """Start a thread that processes everything that a subscriber or a queryable receives."""
+        args = (source, process)
+        thread = threading.Thread(target=self._receive, args=args, name=f"zenoh {key}", daemon=True)
+        thread.start()
+        self._receivers = [*(one for one in self._receivers if one.is_alive()), thread]
+
+    def _receive(self, source: Any, process: Callable[[Any], None]) -> None:
+        """Process everything that a source receives until the session is closed (runs in a thread)."""
+        handler = source.handler  # while a thread waits on the source itself, the source cannot be undeclared
+        while not self.closing.is_set():
+            try:
+                received = handler.recv()
+            except zenoh_errors():
+                return
+            process(received)
+
+
+@cache
+def zenoh_errors() -> tuple[type[Exception], ...]:
+    """Return the exceptions of zenoh, which is imported only when needed."""
+    import zenoh
+
+    return (zenoh.ZError,)

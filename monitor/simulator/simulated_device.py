@@ -1,0 +1,159 @@
+"""Simulated device: sends the samples of a simulated sensor over a real link, in real time or faster, with faults.
+
+An ordinary link reads the samples, as for a real sensor. The device does not wait for the reader. Samples that cannot
+be sent are dropped, and the counter of the sensor shows the gap.
+"""
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+import structlog
+
+from drivers.decoders.base import Decoder
+from drivers.errors import LinkUnavailable
+from drivers.links.base import Link
+from drivers.sample import Chunk
+from monitor.settings.loading import VirtualTable
+from monitor.simulator.faults import DrawnFaults, FaultCounts, Faults
+from monitor.simulator.port import create_port
+from monitor.simulator.sensor import SimulatedSensor
+
+BURST_S: Final = 0.01
+"""Length of a burst of samples, as from a USB adapter."""
+MAX_DELAY_S: Final = 1.0
+"""Delay after which the sensor skips samples instead of catching up."""
+
+_log = structlog.get_logger("imu-monitor")
+
+
+class SimulatedDevice:
+    """Simulated device with its own thread.
+
+    Parameters
+    ----------
+    table : VirtualTable
+        Model, seed, speed, effects and faults.
+    decoder : Decoder
+        Wire format.
+    name : str, optional
+        Name of the device, for the log.
+
+    Raises
+    ------
+    ConfigError
+        If the noise model or an effect cannot be used.
+    """
+
+    def __init__(self, table: VirtualTable, decoder: Decoder, name: str = "virtual") -> None:
+        self.name = name
+        self.fault_counts = FaultCounts()  # number of samples with each fault
+        self.now_s: Callable[[], float] = time.monotonic
+        """Clock of the simulation, in seconds. Tests may replace the clock before ``start``."""
+        self._sensor = SimulatedSensor(table, decoder, name)
+        self.rate_hz = self._sensor.rate_hz * table.speed
+        """Nominal sample rate. The clock of the sensor may deviate from it."""
+        self._pace_hz = self.rate_hz * table.faults.clock
+        self._faults = Faults(table.faults, table.seed, decoder.carrier)
+        self._unplugged_samples = max(1, round(table.faults.unplugged_for * self._sensor.rate_hz))
+        self._back_at: int | None = None  # number of the sample before which the cable is connected again
+        self.port = create_port(decoder.carrier, table.silence)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="virtual imu", daemon=True)
+
+    @property
+    def link(self) -> Link:
+        """Link that reads the samples of the sensor."""
+        return self.port.link
+
+    def start(self) -> None:
+        """Connect the cable and start to send samples."""
+        self.plug()
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop to send samples, and remove the port."""
+        self._stop.set()
+        if self._thread.is_alive():
+            self._thread.join()
+        self.port.close()
+
+    def plug(self) -> None:
+        """Connect the cable."""
+        self.port.plug()
+
+    def unplug(self) -> None:
+        """Disconnect the cable."""
+        self.port.unplug()
+
+    # --- thread of the sensor
+
+    def _run(self) -> None:
+        """Send samples in bursts until the sensor is stopped."""
+        self._sensor.start_clock()
+        begun_s, made = self.now_s(), 0
+        step_s = max(BURST_S, 0.5 / self._pace_hz)  # a sensor with a low rate needs two steps per sample
+        while not self._stop.wait(step_s + self._burst_delay_s()):
+            due = int((self.now_s() - begun_s) * self._pace_hz)
+            late = due - made - int(MAX_DELAY_S * self._pace_hz)
+            if late > 0:  # a real sensor would have continued while the machine was suspended
+                made += late
+                self._sensor.skip_samples(late)
+                self._faults.draw_faults(late)
+                self.fault_counts.dropped += late
+            if due > made:
+                self._make_and_send(made, due - made)
+                made = due
+
+    def _make_and_send(self, first: int, n: int) -> None:
+        """Simulate ``n`` samples, and send the samples during which the simulated cable is connected."""
+        frames, draws = self._sensor.encode_next_samples(n), self._faults.draw_faults(n)
+        at = 0
+        while at < n:
+            if self._back_at is None:
+                pulled = np.flatnonzero(draws.pulled[at:])
+                stop = at + int(pulled[0]) if pulled.size else n
+                self._send(frames[at:stop], draws[at:stop])
+                if stop < n:
+                    self._unplug_by_fault(first + stop)
+            else:
+                stop = min(n, max(at, self._back_at - first))
+                self.fault_counts.dropped += stop - at
+                if first + stop >= self._back_at:
+                    self._plug_again()
+            at = stop
+
+    def _send(self, frames: list[list[Chunk]], draws: DrawnFaults) -> None:
+        """Apply the faults to samples, send the samples, and count the faults."""
+        faulty = [
+            (kind, self._faults.apply_fault(kind, where, chunks))
+            for kind, where, chunks in zip(draws.kind_per_sample(), draws.where.tolist(), frames, strict=True)
+        ]
+        sent = self.port.send_chunks([chunk for _, chunks in faulty for chunk in chunks])
+        for kind, chunks in faulty:
+            sent -= len(chunks)
+            self.fault_counts.count_sample(kind, all_sent=sent >= 0)
+
+    def _unplug_by_fault(self, index: int) -> None:
+        """Disconnect the cable because of a fault."""
+        self.unplug()
+        self.fault_counts.unplugged += 1
+        self._back_at = index + self._unplugged_samples
+
+    def _plug_again(self) -> None:
+        """Connect the cable again after a fault."""
+        self._back_at = None
+        try:
+            self.plug()
+        except LinkUnavailable as error:
+            _log.warning(
+                "the cable of the simulated sensor cannot be connected again", device=self.name, error=str(error)
+            )
+
+    def _burst_delay_s(self) -> float:
+        """Return the delay of the next burst, in seconds."""
+        held_s = self._faults.draw_delay_s()
+        self.fault_counts.held_s = max(self.fault_counts.held_s, held_s)
+        return held_s

@@ -1,0 +1,128 @@
+"""The live surface as Rerun gets it: the picture's pixels, and what stands in a recording."""
+
+import io
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from drivers.sample import AXES, Event
+from monitor.publishing.rerun.viewer_settings import DeviceInfo
+from tests.monitor.publishing import made
+
+pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+
+import rerun as rr
+from PIL import Image
+
+from monitor.publishing.rerun import blueprint, dynamic_heat_map
+from monitor.publishing.rerun.allan_history import COLUMNS
+from monitor.publishing.rerun.scene import Scene
+
+T0 = 1.76e9
+
+
+def pixels(png: bytes) -> np.ndarray:
+    return np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+
+
+def test_time_goes_right_and_averaging_time_goes_up() -> None:
+    relative = np.zeros((6, 15))
+    relative[0, 0] = np.log(5.0)  # oldest, shortest τ: bottom left, far above the median
+    relative[5, 14] = -np.log(5.0)  # newest, longest τ: top right
+    relative[2, 7] = np.nan
+    image = pixels(dynamic_heat_map.encode_heat_map(relative))
+    rows = round(dynamic_heat_map.HEIGHT / 15)
+    assert image.shape == (15 * rows, COLUMNS, 3)
+    palette = dynamic_heat_map.PALETTE
+    assert (image[-rows:, 0] == palette[2 * dynamic_heat_map.SHADES]).all()
+    assert (image[:rows, -1] == palette[0]).all()
+    sixth = COLUMNS // 6  # few columns are wide ones: they fill the picture
+    assert (image[7 * rows : 8 * rows, 2 * sixth + 2 : 3 * sixth - 2] == palette[dynamic_heat_map.NO_VALUE_INDEX]).all()
+    assert (image[: 7 * rows, : 5 * sixth - 2] == palette[dynamic_heat_map.SHADES]).all()
+    assert (image[:rows, 5 * sixth + 6 :] == palette[0]).all()
+
+
+def test_twice_and_half_the_median_are_the_ends_of_the_scale() -> None:
+    image = pixels(dynamic_heat_map.encode_heat_map(np.log([[2.0, 4.0], [0.5, 0.1], [1.4, 0.7]])))
+    bottom, top = image[-1, [0, COLUMNS // 2, COLUMNS - 1]], image[0, [0, COLUMNS // 2, COLUMNS - 1]]
+    assert (bottom[0] == top[0]).all()
+    assert (bottom[1] == top[1]).all()
+    red, blue = bottom[2].astype(int), top[2].astype(int)
+    assert red[0] > red[2]
+    assert blue[2] > blue[0]
+
+
+def test_a_recording_holds_surfaces_labels_and_marks(tmp_path: Path) -> None:
+    path = tmp_path / "scene.rrd"
+    stream = rr.RecordingStream("imu-monitor")
+    stream.save(path)
+    scene = Scene(stream)
+    scene.set_devices([DeviceInfo("bench-1")])
+    for i in range(12):
+        scene.draw("bench-1", "AllanPanel", [(T0 + i, made.estimate(T0 + i, seed=i))])
+    what = {"N": {"before": 1.5e-4, "after": 3.0e-4}, "floor": {"after": 1.0}}
+    event = Event("noise_changed", 0, "gz is louder", axis="gz", values=what)
+    scene.draw("bench-1", "EventsPanel", [(T0 + 9, event)])
+    stream.flush()
+    stream.disconnect()
+    cells: dict[str, list[object]] = {}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from rerun.chunk import RrdReader
+
+        for chunk in RrdReader(str(path)).stream():
+            batch = chunk.to_record_batch()
+            for name, column in zip(batch.schema.names, batch.columns, strict=True):
+                if ":" in name:  # a component; the others are times and row numbers
+                    cells.setdefault(f"{chunk.entity_path} {name}", []).extend(column.to_pylist())
+    for axis in AXES:
+        blobs = cells[f"/bench-1/dynamic/{axis} EncodedImage:blob"]
+        assert len(blobs) == 2  # after 8 s and 10 s: columns of 2 s, the first LEAST at once
+        assert pixels(bytes(np.array(blobs[-1], np.uint8).ravel())).shape[1] == COLUMNS
+    labels = cells["/bench-1/dynamic/gz/labels Points2D:labels"][-1]
+    assert {"0.01", "1", "100", "τ, s", "× 2", "08:53:22"} <= set(labels)
+    (mark,) = [c for c in cells["/bench-1/coefficients/N/gz/changed Scalars:scalars"] if c]
+    assert mark == pytest.approx([np.degrees(3.0e-4) * 60])
+    assert not any("floor" in name for name in cells)
+
+
+def test_a_device_has_a_tab_for_now_and_one_for_the_time() -> None:
+    tabs = blueprint.blueprint([DeviceInfo("bench-1")]).root_container
+    assert [page.name for page in tabs.contents] == ["Now", "Dynamic"]
+    assert tabs.active_tab == 0
+    fleet = blueprint.blueprint([DeviceInfo("nose"), DeviceInfo("tail")]).root_container
+    assert [page.name for page in fleet.contents] == ["Overview", "nose", "tail"]
+
+
+def test_the_tab_of_temperature_is_there_only_where_bias_is_held_against_it() -> None:
+    fleet = blueprint.blueprint([DeviceInfo("a"), DeviceInfo("b", has_thermal=True)]).root_container
+    (_, first, second) = fleet.contents
+    assert [page.name for page in first.contents] == ["Now", "Dynamic"]
+    assert [page.name for page in second.contents] == ["Now", "Dynamic", "Temperature"]
+    assert second.active_tab == 0
+
+
+def test_gaps_have_their_row_only_where_there_is_a_model() -> None:
+    def views(page: object) -> list[str]:
+        return [getattr(page, "name", None) or ""] + [
+            name for one in getattr(page, "contents", []) for name in views(one)
+        ]
+
+    assert not [name for name in views(blueprint.blueprint([DeviceInfo("a")]).root_container) if "gap" in str(name)]
+    fleet = blueprint.blueprint([DeviceInfo("a"), DeviceInfo("b", has_model=True)]).root_container
+    (_, first, second) = fleet.contents
+    assert not [name for name in views(first) if "gap" in str(name)]
+    assert [name for name in views(second) if "gap" in str(name)] == [
+        "Gyroscopes: gap to the model, σ, and its threshold",
+        "Accelerometers: gap to the model, σ, and its threshold",
+    ]
+
+
+def test_the_view_holds_picture_and_labels() -> None:
+    (left, right), (top, bottom) = dynamic_heat_map.view_bounds(17)
+    assert left < -11.0
+    assert right > dynamic_heat_map.BAR_X + 11.0
+    assert top < -4.0
+    assert bottom > 17 * round(dynamic_heat_map.HEIGHT / 17) + 6.0
