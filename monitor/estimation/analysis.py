@@ -1,13 +1,13 @@
-"""Analysis of a whole recording: Allan variance, confidence intervals and fitted coefficients.
+"""Analysis of a whole recording, with Allan variance, confidence intervals and fitted coefficients.
 
-The results are the reference for the live estimator. The recording is first resampled to a regular grid by the clock
-that also stamps live samples. Missing samples become NaN. ``Analysis.notes`` lists all findings about the time stamps.
+The results are the reference for the live estimator. The recording is first resampled to a regular grid, with the same
+clock as for live samples. Missing samples become NaN. ``Analysis.notes`` lists all irregularities of the time stamps.
 
 ``analyze`` computes the Allan variance and the fit. ``detect_events`` searches the same samples for motion, noise
 changes, spectral lines and outliers. The search is a separate step because it takes longer than the fit.
 
-Samples in motion are removed from the Allan variance only on request, because samples at rest that were wrongly
-detected as motion would be lost. ``detect_events`` always ignores samples in motion.
+Samples in motion are removed from the Allan variance only on request, because the detector may take samples at rest for
+motion. ``detect_events`` always ignores samples in motion.
 """
 
 from collections.abc import Iterable, Sequence
@@ -47,7 +47,7 @@ from monitor.estimation.regular_grid import resample_to_grid
 MIN_SAMPLES: Final = 50
 """Minimum number of samples of a recording."""
 DETECTOR_CHUNK_ROWS: Final = 65_536
-"""Number of rows passed to the change detector at a time."""
+"""Number of rows passed to the change detector in one call."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,11 +59,11 @@ class Analysis:
     notes: tuple[str, ...]
     values: Floats  # [n, 6] on the grid, SI; NaN = missing, or removed because of motion
     fit: Fit
-    bandwidth_hz: Floats  # [6] bandwidth of the sensor; NaN if the curve does not show one
+    bandwidth_hz: Floats  # [6] cutoff of the sensor's low-pass filter; NaN if no filter has been found
     motions: tuple[Motion, ...] = ()
     changes: tuple[Change, ...] = ()
     motion_removed: bool = False  # True if the samples in motion have been removed from ``values``
-    axes_of_temperature: tuple[str, ...] = ()  # axes whose slow variance is mostly explained by temperature
+    axes_of_temperature: tuple[str, ...] = ()  # axes on which temperature explains most of the slow variance
 
 
 def analyze(
@@ -79,28 +79,28 @@ def analyze(
     Parameters
     ----------
     blocks : sequence of SampleBlock
-        Recording with its own time stamps.
+        Recording with time stamps.
     rate_hz : float or None
-        Stated sample rate in Hz. None to estimate it from the time stamps.
+        Stated sample rate in Hz. If None, the rate is estimated from the time stamps.
     tau : TauGrid
         Grid of averaging times, or a tuple of averaging times in seconds.
     notes : iterable of str
-        Notes from reading the file. They come first in the notes of the result.
+        Notes from reading the file, which precede the other notes of the result.
     each : EachAxis
-        Function that maps over the axes. The ``map`` of an executor computes them in parallel.
+        Function that maps over the axes. With the ``map`` method of a thread pool, the axes are computed in parallel.
     remove_motion : bool
         True to remove the samples during which the sensor moved.
 
     Raises
     ------
     NotReady
-        If the recording has fewer than ``MIN_SAMPLES`` samples, or fewer at rest.
+        If the recording has fewer than ``MIN_SAMPLES`` samples, or if fewer than ``MIN_SAMPLES`` samples are at rest.
     ConfigError
-        If none of the listed τ is possible.
+        If no τ of the tuple lies between one sample and half the recording.
     """
     values, rate, found = resample_to_grid(blocks, rate_hz)
     if len(values) < MIN_SAMPLES:
-        raise NotReady(f"{len(values)} samples; at least {MIN_SAMPLES} are needed to say anything")
+        raise NotReady(f"{len(values)} samples; at least {MIN_SAMPLES} are needed for an analysis")
     motions: tuple[Motion, ...] = ()
     if remove_motion:
         values, motions = _without_motion(values, rate)
@@ -133,7 +133,7 @@ def detect_events(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analy
     result : Analysis
         Result of ``analyze``.
     alarms_per_day : float
-        Accepted false alarms of the change detector per day, of all axes together.
+        Accepted false alarms of the change detector per day, for all axes together.
     """
     rate = result.estimate.rate_hz
     moving = np.zeros(len(result.values), np.bool_)
@@ -156,7 +156,7 @@ def detect_events(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analy
 
 
 def fit_other_samples(result: Analysis, samples: Floats, each: EachAxis = map) -> Fit:
-    """Fit other samples at the averaging times of an analysis.
+    """Compute the Allan variance of other samples at the averaging times of an analysis, and fit the coefficients.
 
     Parameters
     ----------
@@ -172,18 +172,18 @@ def fit_other_samples(result: Analysis, samples: Floats, each: EachAxis = map) -
 
 
 def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]]:
-    """Return the samples with those in motion replaced by NaN, and the episodes of motion."""
+    """Return the samples with NaN for samples in motion, and the episodes of motion."""
     moving, motions = detect_motion(values, rate_hz)
     left = len(values) - int(moving.sum())
     if left < MIN_SAMPLES:
-        raise NotReady(f"{left} samples at rest; at least {MIN_SAMPLES} are needed to say anything")
+        raise NotReady(f"{left} samples at rest; at least {MIN_SAMPLES} are needed for an analysis")
     return np.where(moving[:, None], np.nan, values) if moving.any() else values, tuple(motions)
 
 
 def _fit_curve(
     values: Floats, rate_hz: float, factors: Ints, each: EachAxis
 ) -> tuple[AllanCurve, Fit, list[LowPass | None]]:
-    """Return the Allan curve with its intervals, the fit, and the low-pass of each axis that shows one."""
+    """Return the Allan curve with confidence intervals, the fit, and the low-pass filter of each axis or None."""
     n = len(values)
     avar, terms = overlapping_avar(values, factors, each)
     columns, covariances = make_design(factors, rate_hz), covariance_table(n, factors)

@@ -1,8 +1,8 @@
-"""Notes of an analysis for users: sentences about the fit, motion, noise changes, spectral lines and outliers.
+"""Notes of an analysis for users, about the fit, motion, noise changes, spectral lines and outliers.
 
-Each function returns a list of notes, which is empty if there is nothing to report. A list has at most ``MAX_NOTES``
-notes of one kind and the number of omitted notes. Times are in seconds since the first sample. The functions only
-format results and estimate nothing.
+Each function returns a list of notes, which is empty if there is nothing to report. A list contains at most
+``MAX_NOTES`` notes of one kind and a note with the number of omitted notes. Times are in seconds since the first
+sample. The functions only format results and estimate nothing.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -26,33 +26,32 @@ Run = tuple[int, int]
 """Row numbers of the first and the last τ of a range."""
 
 MAX_NOTES: Final = 10
-"""Maximum number of notes of one kind."""
 DEPARTURE_SIGMA: Final = 3.0
-"""Distance from the fit, in standard deviations, beyond which an averaging time departs from it."""
+"""Residual in standard deviations above which an averaging time departs from the fit."""
 LINE_FREQUENCY_TOLERANCE: Final = 0.01
-"""Lines on several axes are reported as one if their frequencies differ by less than this share."""
+"""Relative difference of frequency below which lines on several axes are reported in one note."""
 MIN_OUTLIER_SHARE: Final = 0.001
-"""Shares of outliers up to this value are not reported."""
+"""Smallest share of outliers that is reported."""
 MIN_EXPLAINING_SHARE: Final = 0.05
-"""A line explains a departure of the curve if it contributes at least this share of the Allan variance there."""
+"""Minimum share of the Allan variance that a line must contribute to explain a departure of the curve."""
 MIN_Q_SHARE: Final = 0.2
-"""A line can be mistaken for quantization noise if it contributes at least this share of the Allan variance."""
+"""Minimum share of the Allan variance of a line that can be mistaken for quantization noise."""
 Q_ROWS: Final = 3
 """Number of shortest averaging times that determine Q."""
-BANDWIDTH_OR_VIBRATION: Final = "the sensor's bandwidth or a vibration shows there"
+BANDWIDTH_OR_VIBRATION: Final = "the likely cause is the bandwidth of the sensor or a vibration"
 BELOW_WHITE_NOISE: Final = (
-    "the shortest averaging times lie below white noise, as behind a filter; N is the level of the longer ones, and Q "
-    "no more than a bound"
+    "the Allan variance at the shortest averaging times is below white noise, as after a low-pass filter; N is the "
+    "level at longer averaging times, and Q is only bounded"
 )
-MOTION_LEFT_IN: Final = "the sensor moved, which may be why; --rest strikes it out"
-UNKNOWN_CAUSE: Final = "vibration, motion or temperature may be why"
+MOTION_LEFT_IN: Final = "motion of the sensor may be the cause; --rest removes the samples in motion"
+UNKNOWN_CAUSE: Final = "vibration, motion or temperature may be the cause"
 ORDINALS: Final = ("", "first", "second", "third", "fourth")
 MIN_DEPARTURE_RATIO: Final = 0.5
-"""Averaging times are reported together with the worst one if they depart to the same side by this share of it."""
+"""Minimum departure of a reported averaging time, relative to the largest departure of the curve."""
 
 
 def of_unexplained_curve(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass | None], rate_hz: float) -> list[str]:
-    """Describe where the sum of the five terms does not explain the curve. Axes with the same note share it.
+    """Describe where the five terms do not explain the curve. Axes with the same description are listed in one note.
 
     Parameters
     ----------
@@ -61,26 +60,26 @@ def of_unexplained_curve(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass 
     fit : Fit
         Fit to the curve.
     filters : sequence of LowPass or None
-        Low-pass of each axis, None where the curve does not show one.
+        Low-pass filter of each axis, or None.
     rate_hz : float
         Sample rate in Hz.
     """
-    axes: dict[str, list[str]] = {}
+    found = []
     for i, axis in enumerate(AXES):
         low_pass = filters[i]
         if low_pass is not None:
-            _append_axis(axes, axis, _bandwidth_note(low_pass, rate_hz))
+            found.append((axis, _bandwidth_note(low_pass, rate_hz)))
         elif fit.theta[Q, i] < 0.0 and not fit.left_out[i]:
-            _append_axis(axes, axis, BELOW_WHITE_NOISE)
+            found.append((axis, BELOW_WHITE_NOISE))
         if fit.k_or_r[i]:
-            _append_axis(axes, axis, _k_or_r_note(fit.coefficients.status[K, i] == Status.ESTIMATED))
-    return [f"{', '.join(those)}: {text}" for text, those in axes.items()] + of_misfit(curve, fit)
+            found.append((axis, _k_or_r_note(fit.coefficients.status[K, i] == Status.ESTIMATED)))
+    return _group_axes(found) + of_misfit(curve, fit)
 
 
 def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bool = False) -> list[str]:
-    """List the axes whose curve no sum of the five terms explains, grouped by cause.
+    """List the axes with a curve that the five terms cannot explain, grouped by cause.
 
-    The cause is a spectral line or motion. Axes without a known cause are grouped only if they depart at the same τ.
+    The cause is a spectral line or motion. Axes without a known cause are grouped if they depart at the same τ.
 
     Parameters
     ----------
@@ -91,7 +90,7 @@ def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bo
     found : sequence of Line
         Spectral lines that are reported.
     moved : bool
-        True if the sensor moved and these samples are part of the curve.
+        True if the curve includes samples in motion.
     """
     names, notes = _line_names(found), list[str]()
     out = [i for i in range(len(AXES)) if fit.left_out[i]]
@@ -106,24 +105,14 @@ def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bo
     return notes
 
 
-def of_quantization(curve: AllanCurve, fit: Fit, found: Sequence[Line]) -> list[str]:
-    """Warn where a spectral line contributes so much at the shortest τ that Q may be this line.
-
-    Parameters
-    ----------
-    curve : AllanCurve
-        Measured curve.
-    fit : Fit
-        Fit to the curve.
-    found : sequence of Line
-        Spectral lines of all axes.
-    """
-    axes: dict[str, list[str]] = {}
+def _quantization_notes(curve: AllanCurve, fit: Fit, found: Sequence[Line]) -> list[str]:
+    """Warn if the estimate of Q may be caused by a spectral line."""
+    causes = []
     for one, name in _line_names(found).items():
         estimated = fit.coefficients.status[Q, one.axis] == Status.ESTIMATED
         if estimated and float(np.nanmax(line_share(one, curve)[:Q_ROWS], initial=0.0)) >= MIN_Q_SHARE:
-            _append_axis(axes, AXES[one.axis], f"quantization noise may be {name}")
-    return [f"{', '.join(those)}: {text}" for text, those in axes.items()]
+            causes.append((AXES[one.axis], f"quantization noise may be {name}"))
+    return _group_axes(causes)
 
 
 def replace_guessed_causes(
@@ -134,7 +123,7 @@ def replace_guessed_causes(
     Parameters
     ----------
     notes : sequence of str
-        Notes that include those of ``of_unexplained_curve``.
+        Notes of an analysis, including the result of ``of_unexplained_curve``.
     curve : AllanCurve
         Curve from which these notes were made.
     fit : Fit
@@ -142,16 +131,16 @@ def replace_guessed_causes(
     found : sequence of Line
         Spectral lines that are reported.
     moved : bool
-        True if the sensor moved and these samples are part of the curve.
+        True if the curve includes samples in motion.
     """
     known = of_misfit(curve, fit, found, moved)
     guessed = [note for note in of_misfit(curve, fit) if note not in known]
     kept = [note for note in notes if note not in guessed]
-    return kept + [note for note in known if note not in kept] + of_quantization(curve, fit, found)
+    return kept + [note for note in known if note not in kept] + _quantization_notes(curve, fit, found)
 
 
 def of_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list[str]:
-    """Report how often and how long the sensor moved, and how these samples were treated.
+    """Report how often and how long the sensor moved, and whether the samples in motion were removed.
 
     Parameters
     ----------
@@ -166,14 +155,14 @@ def of_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list
         return []
     times = "once" if len(motions) == 1 else f"{len(motions)} times"
     seconds = sum(motion.seconds for motion in motions)
-    done = "struck out" if removed else "left in; --rest strikes it out"
+    done = "removed" if removed else "not removed; --rest removes the samples in motion"
     notes = [f"the sensor moved {times}, {seconds:.3g} s in all: {done}"]
     notes += [f"at {motion.since / rate_hz:.1f} s: {motion.text}" for motion in motions[:MAX_NOTES]]
     return notes + _count_omitted(len(motions), "motions")
 
 
 def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
-    """Report the changes, and the effect on a curve of the whole recording.
+    """Report changes of the noise and the bias.
 
     Parameters
     ----------
@@ -189,12 +178,14 @@ def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
     ]
     notes += _count_omitted(len(changes), "changes")
     if any(change.kind != "outlier_burst" for change in changes):
-        notes.append("one curve of the whole recording mixes before and after; --window S shows them apart")
+        notes.append(
+            "the curve of the whole recording mixes the noise before and after; --window S shows the noise over time"
+        )
     return notes
 
 
 def of_lines_and_outliers(found: Sequence[Line], far: Floats) -> list[str]:
-    """Report spectral lines, one note for all axes of one frequency, and the share of outliers.
+    """Report spectral lines and the share of outliers. Axes with a line at the same frequency share a note.
 
     Parameters
     ----------
@@ -214,13 +205,13 @@ def of_lines_and_outliers(found: Sequence[Line], far: Floats) -> list[str]:
     if shares:
         notes.append(
             f"outliers beyond {OUTLIER_SIGMA:g} σ of the other samples: {', '.join(shares)} of all; "
-            "the noise is not Gaussian, and intervals assume that it is"
+            "the intervals assume Gaussian noise"
         )
     return notes
 
 
 def _group_by_frequency(found: Sequence[Line]) -> list[list[Line]]:
-    """Group lines of the same frequency; the strongest group comes first."""
+    """Group lines of the same frequency. The group with the strongest line is first."""
     groups: list[list[Line]] = []
     left = sorted(found, key=lambda one: -one.share)
     while left:
@@ -236,7 +227,7 @@ def _line_name(line: Line) -> str:
 
 
 def _line_names(found: Sequence[Line]) -> dict[Line, str]:
-    """Return the name under which each reported line appears in the notes."""
+    """Return the name of each reported line in the notes."""
     return {
         one: _line_name(here[0]).replace("a ", "the ", 1)
         for here in _group_by_frequency(found)[:MAX_NOTES]
@@ -250,11 +241,11 @@ def _count_omitted(count: int, what: str) -> list[str]:
 
 
 def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
-    """Return the first and last τ of the range in which the curve of one axis exceeds the fit by the largest factor.
+    """Return the range of τ in which the curve of one axis departs most from the fit.
 
-    Noise outside the five terms adds to the curve, and the fit is pulled towards it. The largest residuals in σ are
-    therefore elsewhere: where the curve is below the fit, and at the accurately known shortest τ. Only residuals above
-    ``DEPARTURE_SIGMA`` count.
+    The range contains the largest ratio of curve and fit, among residuals above ``DEPARTURE_SIGMA``. The largest
+    residual in σ would not be suitable. Noise outside the five terms pulls the fit upwards, so the largest residuals in
+    σ are often elsewhere, where the curve is below the fit.
     """
     model, edf = fit.fitted[:, axis], fit.edf[:, axis]
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -270,15 +261,18 @@ def _departure(curve: AllanCurve, fit: Fit, axis: int) -> Run:
     return worst, worst
 
 
-def _append_axis(axes: dict[str, list[str]], axis: str, text: str) -> None:
-    """Add an axis to the note with this text."""
-    axes.setdefault(text, []).append(axis)
+def _group_axes(found: Sequence[tuple[str, str]]) -> list[str]:
+    """Return one note for all axes with the same text."""
+    axes: dict[str, list[str]] = {}
+    for axis, text in found:
+        axes.setdefault(text, []).append(axis)
+    return [f"{', '.join(those)}: {text}" for text, those in axes.items()]
 
 
 def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[int, Run]) -> dict[str, dict[int, Run]]:
-    """Group axes and their ranges of τ by the line that contributes most there.
+    """Group axes by the spectral line that contributes most in the range of τ of the axis.
 
-    The key is an empty string if no line contributes enough.
+    The key is an empty string if no line contributes at least ``MIN_EXPLAINING_SHARE``.
     """
     found: dict[str, dict[int, Run]] = {}
     for i, (first, last) in runs.items():
@@ -288,28 +282,28 @@ def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[i
             if one.axis == i
         }
         most = max(shares, key=shares.__getitem__, default="")
-        why = f"{most} shows there" if shares.get(most, 0.0) >= MIN_EXPLAINING_SHARE else ""
+        why = f"the likely cause is {most}" if shares.get(most, 0.0) >= MIN_EXPLAINING_SHARE else ""
         found.setdefault(why, {})[i] = (first, last)
     return found
 
 
 def _left_out_note(tau_s: Floats, axes: Collection[int], why: str) -> str:
-    """Format a note about short averaging times that the fit excludes.
+    """Format a note about the shortest averaging times, which the fit leaves out.
 
-    ``tau_s`` [6] is the longest of them per axis.
+    ``tau_s`` [6] is the longest excluded τ of each axis.
     """
     upto = ", ".join(dict.fromkeys(format_two_digits(float(tau_s[i])) for i in axes))
     return (
-        f"{', '.join(AXES[i] for i in axes)}: the fit leaves out τ up to {upto} s, which no sum of the five terms "
-        f"follows: {why}"
+        f"{', '.join(AXES[i] for i in axes)}: the fit leaves out τ up to {upto} s, which the five terms do not "
+        f"explain: {why}"
     )
 
 
 def _bandwidth_note(low_pass: LowPass, rate_hz: float) -> str:
-    """Format the note on the low-pass of the sensor."""
+    """Format the note on the low-pass filter of the sensor."""
     return (
-        f"white noise ends below half the sample rate, as behind a {ORDINALS[low_pass.order]}-order low-pass at about "
-        f"{low_pass.cutoff * rate_hz:.2g} Hz; N is the level below it"
+        f"white noise ends below half the sample rate, as after a {ORDINALS[low_pass.order]}-order low-pass at about "
+        f"{low_pass.cutoff * rate_hz:.2g} Hz; N is the level below this frequency"
     )
 
 
@@ -325,7 +319,7 @@ def _group_overlapping(runs: Mapping[int, Run]) -> list[dict[int, Run]]:
 
 
 def _misfit_note(tau_s: Floats, fit: Fit, runs: Mapping[int, Run], why: str, at: bool = True) -> str:
-    """Format the note on the axes of ``runs``; ``at`` adds the range of τ."""
+    """Format the note on a misfit of several axes. If ``at`` is true, the note contains the range of τ."""
     low, high = (f"{f(fit.misfit[i] for i in runs) ** 0.5:.2g}" for f in (min, max))
     times = low if low == high else f"{low} to {high}"
     first, last = min(run[0] for run in runs.values()), max(run[1] for run in runs.values())
@@ -333,18 +327,19 @@ def _misfit_note(tau_s: Floats, fit: Fit, runs: Mapping[int, Run], why: str, at:
     where = f"τ = {since} s" if first == last else f"τ from {since} to {upto} s"
     axes = ", ".join(AXES[i] for i in sorted(runs))
     return (
-        f"{axes}: the curve departs from every sum of the five terms (scatter {times} "
+        f"{axes}: the five terms do not explain the curve (scatter {times} "
         f"times wider){f', most at {where}' if at else ''}: {why}; intervals are widened accordingly"
     )
 
 
 def _k_or_r_note(no_slope: bool) -> str:
-    """Format the note on a rise that is K or R.
+    """Format the note on a drift that is due to K or R.
 
-    The rise cannot be attributed because no slope was measured (``no_slope``) or because the record is too short.
+    The cause is unknown because no slope was measured (``no_slope``) or because the recording is too short.
     """
     if no_slope:
-        return "K or R: samples are missing, so that no slope tells a ramp from rate random walk"
+        return "K or R: too many samples are missing to distinguish a ramp from rate random walk"
     return (
-        "K or R: the record drifts by more than Q, N and B make, and is too short to tell a ramp from rate random walk"
+        "K or R: the recording drifts by more than Q, N and B explain, and is too short to distinguish a ramp from "
+        "rate random walk"
     )

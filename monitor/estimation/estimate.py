@@ -1,4 +1,4 @@
-"""Result of the estimator at one moment: ``Estimate``, and the per-sample coefficients ``PerSampleCoefficients``."""
+"""Results of the estimator: ``Estimate`` at one moment, and the coefficients after every sample."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -19,12 +19,12 @@ class PerSampleCoefficients:
     value: Floats  # [n, 5, 6] Q N B K R in SI; NaN where not estimated
 
 
-def concatenate_coefficients(courses: Collection[PerSampleCoefficients]) -> PerSampleCoefficients | None:
-    """Concatenate courses. Return None if there are none."""
-    if not courses:
+def concatenate_coefficients(blocks: Collection[PerSampleCoefficients]) -> PerSampleCoefficients | None:
+    """Concatenate the coefficients of successive blocks of samples. Return None without blocks."""
+    if not blocks:
         return None
     return PerSampleCoefficients(
-        np.concatenate([part.t_ns for part in courses]), np.concatenate([part.value for part in courses])
+        np.concatenate([part.t_ns for part in blocks]), np.concatenate([part.value for part in blocks])
     )
 
 
@@ -37,14 +37,14 @@ class Estimate:
     window_s: float  # length of the full window
     samples: int  # received since the start
     curve: AllanCurve
-    fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN without a fit, or outside it
+    fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN without a fit, or at τ left out
     coefficients: Coefficients
     k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
-    display_curve: AllanCurve | None = None  # same τ, each over its own shorter span; see ``window.display_spans``
-    history: PerSampleCoefficients | None = None  # since the previous estimate, if a fit at every sample is requested
+    display_curve: AllanCurve | None = None  # curve at the same τ over shorter spans, see ``window.display_spans``
+    history: PerSampleCoefficients | None = None  # since the previous estimate, if the fit is updated with every sample
 
     def without_coefficients(self) -> "Estimate":
-        """Return a copy with the curve alone: no fit, and every coefficient unestimated."""
+        """Return a copy without the fit, in which every coefficient is unestimated."""
         shape = self.coefficients.status.shape
         nothing = np.full(shape, np.nan)
         return replace(

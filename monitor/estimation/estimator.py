@@ -1,9 +1,9 @@
-"""Live estimator of one device: sliding window, Allan curve, confidence intervals and fitted coefficients.
+"""Live estimator of one device, with sliding window, Allan curve, confidence intervals and fitted coefficients.
 
 ``Estimator.update`` advances the window by a block of samples. Missing samples keep their places in time.
-``Estimator.get`` returns the current curve and coefficients. It fits with the full covariance of all τ.
+``Estimator.get`` returns the current curve and coefficients. This fit uses the full covariance of all τ.
 
-Optionally, the coefficients are also updated after every sample, by the linear map of ``continuous_refit``.
+Optionally, ``continuous_refit`` also updates the coefficients after every sample.
 
 Cluster sizes are numbers of samples. The sample rate only determines τ in seconds and the units of the coefficients.
 
@@ -45,9 +45,9 @@ from monitor.estimation.fit.low_pass_search import (
 from monitor.estimation.window_snapshot import WindowSnapshot, copy_window
 
 SETTLING_FITS: Final = 10
-"""Number of successive fits after which a fit has converged. Each fit leaves a quarter of the remaining error."""
+"""Number of successive fits after which a fit has converged. Each fit reduces the error to a quarter."""
 MIN_SAMPLES: Final = 8
-"""Minimum number of samples for an estimate. It gives three τ with a few terms each."""
+"""Minimum number of samples for an estimate. Eight samples give three τ with a few terms each."""
 SPECTRUM_SAMPLES: Final = 65_536
 """Number of newest samples whose spectrum is tested for a low-pass filter."""
 MAX_HISTORY_SAMPLES: Final = 65_536
@@ -71,7 +71,7 @@ class Estimator:
     Raises
     ------
     ConfigError
-        If none of the listed τ is possible in this window at this rate.
+        If no τ of the tuple lies between one sample and half the window.
     """
 
     def __init__(self, rate_hz: float, window_s: float, tau: TauGrid = "octave", every_sample: bool = False) -> None:
@@ -81,7 +81,7 @@ class Estimator:
         factors = cluster_sizes(length, rate_hz, tau)
         spans = display_spans(factors, rate_hz, length)
         self._m = factors.size
-        # the first m rows are fitted, the next m rows are only displayed
+        # The first m rows are fitted. The next m rows are only displayed.
         rows, lengths = np.tile(factors, 2), np.concatenate([np.full(self._m, length), spans])
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
@@ -89,24 +89,23 @@ class Estimator:
         self._tables = AxisCovarianceTables(factors, length)
         self._spans = PerTauSpanDegreesOfFreedom(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
-        self._lengths = np.zeros(6, np.int64)  # samples of each axis since its last restart, limited to the window
+        self._lengths = np.zeros(6, np.int64)  # samples in the window since the last restart of each axis
         self._refit = ContinuousRefit(self._window, self._m, self._tables) if every_sample else None
         self._history: deque[PerSampleCoefficients] = deque()
         self._history_samples = 0  # total number of samples in ``_history``
         self._total_hadamard = LiveTotalAndHadamard(self._window)
         self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
-        self._contradicting: list[tuple[CovarianceTable, MeasuredCurve] | None] = [
-            None
-        ] * 6  # curves that contradict their fit
+        # the curves that the five terms do not explain
+        self._contradicting: list[tuple[CovarianceTable, MeasuredCurve] | None] = [None] * 6
         self._low_passes: list[LowPass | None] = [None] * 6
-        self._search_axis = 0  # axis whose low-pass filter is being searched for
+        self._search_axis = 0  # axis of the current search for a low-pass filter
         self._search: Generator[None, None, LowPass | None] | None = None
         self._samples = 0
         self._newest_ns = 0
 
     @property
     def samples(self) -> int:
-        """Number of samples received since the start. A reset does not clear it."""
+        """Number of samples received since the start, including the samples before a reset."""
         return self._samples
 
     @property
@@ -124,7 +123,7 @@ class Estimator:
         return copy_window(self._window, self.rate_hz)
 
     def update(self, samples: SampleBlock) -> None:
-        """Advance the window by the samples missing before the block, then by the block itself."""
+        """Advance the window by the missing samples before a block, then by the block."""
         if samples.lost > self._window.length:
             self.reset()
         elif samples.lost:
@@ -173,15 +172,15 @@ class Estimator:
     def fit_state(self) -> tuple[NDArray[np.bool_], Floats]:
         """Return the terms in the newest fit and the squared coefficients θ in SI, both of shape (5, 6).
 
-        ``restore_fit`` accepts both as the start of the next fit.
+        ``restore_fit`` accepts these arrays as the start of the next fit.
         """
         return (self._entered if self._refit is None else self._refit.entered).copy(), self._theta.copy()
 
     def restore_fit(self, entered: NDArray[np.bool_], theta: Floats) -> None:
-        """Start the next fit from a fit made before a restart of the program, and repeat it until it has converged.
+        """Use a fit from before a restart of the program as the start, and repeat the fit until it converges.
 
-        Terms use hysteresis: the threshold to drop a term is lower than the threshold to add it. A live fit otherwise
-        moves by only one re-weighting per call.
+        The threshold to drop a term is lower than the threshold to add a term, so the result depends on the previous
+        fit. A live fit recomputes the weights only once, so several fits are necessary.
 
         Parameters
         ----------
@@ -196,7 +195,10 @@ class Estimator:
                 self.get()
 
     def refine_rate(self, rate_hz: float) -> None:
-        """Set a more accurate sample rate. The clusters of samples stay the same; τ and the units change."""
+        """Set a more accurate sample rate.
+
+        The cluster sizes in samples stay the same. τ and the units are recomputed.
+        """
         self.rate_hz = rate_hz
         self.window_s = self._window.length / rate_hz
         self._design = make_design(self._factors, rate_hz)
@@ -207,7 +209,7 @@ class Estimator:
         Parameters
         ----------
         fitted : bool
-            False to skip the fit and return the deviations alone.
+            False to return the deviations without a fit.
 
         Raises
         ------
@@ -252,7 +254,10 @@ class Estimator:
         )
 
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
-        """Fit all axes that fill the window together. Fit each restarted axis with covariances of its own length."""
+        """Fit all axes with a full history in one call, and fit each restarted axis separately.
+
+        The covariances depend on the number of samples of an axis.
+        """
         lengths = np.minimum(self._lengths, self._window.samples_in_window)
         slope, slopes = self._window.slopes_of_axes_and_taus(lengths)
         before = self._entered if self._refit is None else self._refit.entered
@@ -281,7 +286,7 @@ class Estimator:
     def _step_low_pass_search(self) -> None:
         """Run one part of the low-pass search of one axis.
 
-        When a search ends, the next axis whose shortest τ contradict its fit is searched.
+        When a search ends, the next search is for an axis whose curve the five terms do not explain.
         """
         if self._search is not None:
             try:

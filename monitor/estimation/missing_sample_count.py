@@ -1,18 +1,19 @@
-"""Distinction of missing samples from late samples in a recording, by the time stamps.
+"""Number of missing samples in a recording, determined from the time stamps.
 
-A missing sample shifts all later time stamps permanently, and a late sample does not. The live clock treats a time step
-of two periods as a gap, because it must place the next sample at once. In a recording, the time stamps after the gap
-are known as well.
+A missing sample shifts all later time stamps permanently. A late sample has no effect on later time stamps. The live
+clock treats every time step of two periods as a gap, because later time stamps are unknown. In a recording, the time
+stamps after the gap are known as well.
 
-For each gap, the time stamps on both sides are compared with those of a constant rate. The median of some tens of rows
-tolerates a few late rows. A late sender may need as many rows to catch up as seemed to be missing, so the range after
-the gap is extended by this number. If gaps follow each other closely, the median after a gap may belong to a late
-sender. The lowest median in the range is then used, because no sample is early. The shift of the time stamps, rounded
-to a whole number between zero and the number claimed by the clock, is the number of missing samples.
+For each gap, the time stamps on both sides are compared with those of a constant rate. The medians over 60 rows
+tolerate a few late rows. If a sender was delayed, it may need many rows to catch up, at most twice the number of rows
+that seemed to be missing. The range after the gap is extended accordingly. If gaps follow each other closely, the
+sender may still be delayed after a gap. The lowest median in the range is then used, because no sample is early. The
+number of missing samples is the shift of the time stamps, rounded to a whole number between zero and the number claimed
+by the clock.
 
-The rate is the median over stretches without a gap, so neither missing nor late samples bias it. A rate that varies by
-half a percent shifts the time stamps by a quarter of a period within the range, which does not count as a missing
-sample.
+The rate is the median over stretches without a gap, so missing and late samples do not bias the rate. If the rate
+varies by half a percent, the time stamps within the range shift by a quarter of a period. Such a shift does not count
+as a missing sample.
 """
 
 from typing import Final
@@ -28,22 +29,25 @@ ROWS_BESIDE_GAP: Final = 60
 Some bus adapters send twenty rows late at once.
 """
 MIN_SHIFT_PERIODS: Final = 2.0 / 3.0
-"""Minimum shift in periods that counts as missing samples. Time stamps may shift by half a period without any loss.
+"""Minimum shift in periods that counts as missing samples. Time stamps may shift by half a period without a loss.
 """
 MAX_CATCH_UP_ROWS: Final = 10_000
-"""Maximum number of rows that a late sender may need to catch up."""
+"""Maximum number of rows that a delayed sender may need to catch up."""
 MAX_RATE_VARIATION: Final = 0.01
-"""Maximum relative variation of the rate after a gap. A smaller decrease of the median is no sign of a late sender."""
+"""Maximum relative variation of the rate after a gap.
+
+A larger decrease of the median shows that a sender was delayed.
+"""
 STRETCH_ROWS: Final = (256, 128, 64, 32, 16, 8, 4, 2)
 """Distances in rows between two time stamps for the rate. The longest distance with enough stretches is used."""
 MIN_STRETCH_RATIO: Final = 4
-"""A distance is usable if at least one in this many rows begins a stretch without a gap."""
+"""A distance is used if at least one row in this number of rows begins a stretch without a gap."""
 
 
 def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -> Ints:
     """Return the number of samples that are missing before each gap.
 
-    The other samples that the clock reported as missing were late.
+    The clock also reports late samples as missing.
 
     Parameters
     ----------
@@ -52,9 +56,10 @@ def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -
     rows : ndarray of int64, shape (k,)
         Rows after the gaps, ascending.
     claimed : ndarray of int64, shape (k,)
-        Number of samples missing before each of ``rows`` if no sample was late.
+        Number of samples that the clock reports as missing before each of ``rows``.
     breaks : ndarray of int64
-        Other rows across which time stamps cannot be compared, after jumps and long pauses.
+        Rows after jumps of the time stamps and after long pauses. Time stamps before and after such a row are not
+        compared.
 
     Returns
     -------
@@ -70,14 +75,14 @@ def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -
     period_ns = _period_ns(t_ns, np.concatenate([rows, breaks]))
     if not period_ns > 0.0:
         return claimed
-    # relative to the first time stamp, because absolute Unix time leaves no digits for fractions of a period
+    # relative to the first time stamp, because a double cannot hold Unix time and fractions of a period
     late = (t_ns - t_ns[0]) / period_ns - np.arange(t_ns.size)
     ends = np.unique(np.concatenate([[0], rows, breaks, [t_ns.size]]))
     return _count_missing(late, rows, claimed, ends, np.searchsorted(ends, rows))
 
 
 def _period_ns(t_ns: Ints, edges: Ints) -> float:
-    """Return the median period over stretches that cross no edge, or over all steps if there are too few stretches."""
+    """Return the median period over stretches without an edge, or over all steps if there are too few stretches."""
     part = np.zeros(t_ns.size, np.int64)
     part[edges] = 1
     part = np.cumsum(part)
@@ -92,7 +97,7 @@ def _period_ns(t_ns: Ints, edges: Ints) -> float:
 
 @compiled
 def _count_missing(late: Floats, rows: Ints, claimed: Ints, ends: Ints, at: Ints) -> Ints:
-    """Count the missing samples before each gap from the delay ``late`` [n] of the rows in periods.
+    """Count the missing samples before each gap. ``late`` [n] is the delay of each row in periods.
 
     Gap k begins at row ``ends[at[k]]``.
     """

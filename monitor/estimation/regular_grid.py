@@ -1,13 +1,13 @@
-"""Resampling of a recording to a regular grid by the clock that stamps live samples. Missing samples become NaN.
+"""Resampling of a recording to a regular grid, with the clock that also stamps live samples.
 
-The live clock treats a time step of two periods as a gap, because it must place the next sample at once. In a complete
-recording, each gap is checked again for samples that were only late (``missing_sample_count``).
+Missing samples become NaN. The clock treats every time step of two periods as a gap. In a recording, each gap is
+checked again, because the sample after the gap may only have been late (``missing_sample_count``).
 
 Rows with the values and the time stamp of an earlier row are removed. Rows that repeat the previous values at a later
-time are kept, because the sensor returned these values. A stated rate is used even if the time stamps contradict it.
+time are kept, because the sensor returned these values. A stated rate is used even if it contradicts the time stamps.
 
-All findings are returned as notes, at most ``MAX_CLOCK_NOTES`` from the clock. A resolution as coarse as the noise is
-noted as well.
+Irregularities of the time stamps and the values are returned as notes, with at most ``MAX_CLOCK_NOTES`` notes of the
+clock.
 """
 
 from collections.abc import Sequence
@@ -28,22 +28,22 @@ from monitor.estimation.detection.resolution import QuantizationStep, find_coars
 from monitor.estimation.missing_sample_count import count_missing_samples
 
 MIN_RATE_DEVIATION: Final = 0.002
-"""Relative deviation of the stated rate from the time stamps that is reported if the time stamps are that accurate."""
+"""Smallest reported deviation of the stated rate from the time stamps, relative to the rate."""
 LARGE_RATE_DEVIATION: Final = 0.02
-"""Relative deviation of the stated rate from the time stamps that is always reported."""
+"""Relative deviation of the stated rate that is reported even if the time stamps are inaccurate."""
 STEP_TOLERANCE: Final = 0.02
 """Relative difference up to which time steps count as equal."""
 MAX_CLOCK_NOTES: Final = 10
-"""Maximum number of notes of the clock; the remaining ones are counted."""
+"""Maximum number of notes of the clock. Further notes are counted."""
 MIN_REPEATED_SHARE: Final = 0.01
 """Shares of repeated rows below this value are not reported."""
 MAX_GAP_SAMPLES: Final = 1_000_000
 """Longest gap in samples that is kept at full length, at 48 bytes per sample.
 
-One missing sample stands for a longer pause. It keeps terms from reaching across the pause.
+A longer pause is replaced by one missing sample, which excludes all differences across the pause.
 """
 SEGMENTS: Final = 8
-"""Number of segments of a recording. The scatter of their rates gives the standard error of the mean rate."""
+"""Number of segments of a recording, whose different rates give the standard error of the mean rate."""
 RATE_SIGMA: Final = 5.0
 """Number of standard errors of the mean rate beyond which a deviation is significant."""
 UNIT_TOLERANCE: Final = 0.05
@@ -58,57 +58,58 @@ def resample_to_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tu
     Parameters
     ----------
     blocks : sequence of SampleBlock
-        Recording with its own time stamps.
+        Recording with time stamps.
     rate_hz : float or None
-        Stated sample rate in Hz. None to estimate it from the time stamps.
+        Stated sample rate in Hz. If None, the rate is estimated from the time stamps.
 
     Returns
     -------
     values : ndarray of float64, shape (n, 6)
-        Samples in rad/s and m/s². The array may share the memory of ``blocks`` and must not be written.
+        Samples in rad/s and m/s². The array may share memory with ``blocks`` and must not be modified.
     rate_hz : float
         Sample rate in Hz.
     notes : list of str
-        Findings about the time stamps and the values.
+        Irregularities of the time stamps and the values.
     """
-    stamped, lost, rate, notes = _stamp(blocks, rate_hz)
-    values = _place_on_grid(stamped, lost)
-    return values, rate, [*notes, *_value_notes(values), *_missing_notes(lost, rate)]
+    _, _, values, rate, notes = _resample(blocks, rate_hz)
+    return values, rate, notes
 
 
 def resample_with_temperature(
     blocks: Sequence[SampleBlock], rate_hz: float | None
 ) -> tuple[Floats, Floats, float, list[str]]:
-    """Do the same as ``resample_to_grid`` and also return the temperature.
+    """Do the same as ``resample_to_grid``, and also return the temperature.
 
     Parameters
     ----------
-    blocks : sequence of SampleBlock
-        Recording with its own time stamps.
-    rate_hz : float or None
-        Stated sample rate in Hz. None to estimate it from the time stamps.
+    blocks, rate_hz
+        As for ``resample_to_grid``.
 
     Returns
     -------
-    values : ndarray of float64, shape (n, 6)
-        Samples in rad/s and m/s². The array may share the memory of ``blocks`` and must not be written.
+    values, rate_hz, notes
+        As for ``resample_to_grid``.
     temperature_c : ndarray of float64, shape (n,)
-        Temperature in °C; NaN means not measured or a missing sample.
-    rate_hz : float
-        Sample rate in Hz.
-    notes : list of str
-        Findings about the time stamps and the values.
+        Second result. Temperature in °C; NaN where not measured and for missing samples.
     """
-    stamped, lost, rate, notes = _stamp(blocks, rate_hz)
-    values = _place_on_grid(stamped, lost)
+    stamped, lost, values, rate, notes = _resample(blocks, rate_hz)
     missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost).tolist()
     parts = [
         part
         for samples, hole in zip(stamped, missing, strict=True)
         for part in (np.full(hole, np.nan), samples.temperature_c)
     ]
-    notes = [*notes, *_value_notes(values), *_missing_notes(lost, rate)]
     return values, np.concatenate(parts), rate, notes
+
+
+def _resample(
+    blocks: Sequence[SampleBlock], rate_hz: float | None
+) -> tuple[list[SampleBlock], Ints, Floats, float, list[str]]:
+    """Return the stamped blocks, the missing samples before each block, the samples, the rate, and all notes."""
+    stamped, lost, rate, notes = _stamp(blocks, rate_hz)
+    values = _place_on_grid(stamped, lost)
+    notes += _repeated_notes(values) + _resolution_notes(find_coarse_axes(values)) + _missing_notes(lost, rate)
+    return stamped, lost, values, rate, notes
 
 
 def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[SampleBlock], Ints, float, list[str]]:
@@ -129,13 +130,8 @@ def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[S
     return stamped, lost, rate, notes + _step_notes(steps, progress, rate) + _late_notes(late)
 
 
-def _value_notes(values: Floats) -> list[str]:
-    """Format the notes on repeated rows and on coarse resolution."""
-    return _repeated_notes(values) + _resolution_notes(find_coarse_axes(values))
-
-
 def _count_missing(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, int]:
-    """Return the samples missing before each block, and the number of gaps that were only late samples."""
+    """Return the number of missing samples before each block, and the number of gaps without missing samples."""
     lost = np.array([samples.lost for samples in stamped], np.int64)
     short = (lost > 0) & (lost <= MAX_GAP_SAMPLES)
     rows = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
@@ -151,7 +147,7 @@ def _count_missing(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, in
 
 
 def _place_on_grid(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
-    """Return all rows in one array [n, 6] with NaN for missing samples, without a copy if the blocks are contiguous."""
+    """Return all rows in one array [n, 6] with NaN for missing samples. Contiguous blocks are not copied."""
     missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost)
     if not missing.any() and (whole := _contiguous([samples.values for samples in stamped])) is not None:
         return whole
@@ -166,7 +162,7 @@ def _place_on_grid(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
 
 
 def _contiguous(parts: Sequence[Floats]) -> Floats | None:
-    """Return the rows of the common base array if the parts follow each other in it, otherwise None."""
+    """Return the rows of the common base array if the parts are contiguous in this array, otherwise None."""
     whole = parts[0].base
     if len(parts) == 1:
         return parts[0]
@@ -191,11 +187,13 @@ def _address(array: Floats) -> int:
 def _missing_notes(lost: Ints, rate_hz: float) -> list[str]:
     """Format the notes on long pauses and on missing samples."""
     long, short = lost[lost > MAX_GAP_SAMPLES], lost[(lost > 0) & (lost <= MAX_GAP_SAMPLES)]
-    notes = [f"a pause of {n / rate_hz:.6g} s is too long to keep in place; no term reaches across" for n in long]
+    notes = [
+        f"a pause of {n / rate_hz:.6g} s is too long to be kept and is replaced by one missing sample" for n in long
+    ]
     if short.size:
         samples = "1 sample is" if short.sum() == 1 else f"{short.sum()} samples are"
         places = "1 place" if short.size == 1 else f"{short.size} places"
-        notes.append(f"{samples} missing in {places}; terms that touch them are left out")
+        notes.append(f"{samples} missing in {places}; differences that contain them are left out")
     return notes
 
 
@@ -204,18 +202,19 @@ def _late_notes(late: int) -> list[str]:
     if not late:
         return []
     times = "once" if late == 1 else f"{late} times"
-    return [
-        f"a sample came late by a period or more {times}; later ones made good for it, so that none is missing there"
-    ]
+    return [f"a sample was late by a period or more {times}; later times show that no sample is missing there"]
 
 
 def _repeated_notes(values: Floats) -> list[str]:
-    """Format the note on rows that repeat the previous one."""
+    """Format the note on rows that repeat the previous row."""
     share = estimate_repeated_share(values)
     if share < MIN_REPEATED_SHARE:
         return []
     percent = 100.0 * share
-    return [f"{percent:.2g} % of rows repeat the one before: the sensor updates slower than it is read; they are kept"]
+    return [
+        f"{percent:.2g} % of rows repeat the previous row, because the sensor updates more slowly than it is read; "
+        "these rows are kept"
+    ]
 
 
 def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
@@ -229,8 +228,8 @@ def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
         low, high = (format_two_digits(f(one.step / one.noise for one in those)) for f in (min, max))
         times = low if low == high else f"{low} to {high}"
         notes.append(
-            f"values come in steps of {size} ({axes}), {times} times the noise from sample to sample: quantization "
-            "shapes the shortest τ"
+            f"values have steps of {size} ({axes}), {times} times the noise from sample to sample; quantization "
+            "affects the shortest τ"
         )
     return notes
 
@@ -240,15 +239,17 @@ def _step_notes(steps: Ints, progress: tuple[Floats, Floats] | None, rate_hz: fl
     if not steps.size:
         return []
     if progress is None:
-        return [f"the rate used is {rate_hz:g} Hz; the times do not go on and say none"]
+        return [f"the rate used is {rate_hz:g} Hz; the times do not increase and give no rate"]
     uneven = _uneven_notes(steps, rate_hz)
     mean_hz, known = _rate(*progress)
     if abs(mean_hz / rate_hz - 1.0) < min(max(MIN_RATE_DEVIATION, RATE_SIGMA * known), LARGE_RATE_DEVIATION):
         return uneven
     if _is_even(steps):
         step_s = float(steps.mean()) / NS_PER_S
-        return [f"the rate used is {rate_hz:g} Hz, but the times step by {step_s:.6g} s, {1.0 / step_s:.6g} Hz"]
-    return [*uneven, f"the rate used is {rate_hz:g} Hz, but by the times {mean_hz:.5g} samples came a second"]
+        return [
+            f"the rate used is {rate_hz:g} Hz, but the times increase in steps of {step_s:.6g} s, {1.0 / step_s:.6g} Hz"
+        ]
+    return [*uneven, f"the rate used is {rate_hz:g} Hz, but the times give a mean of {mean_hz:.5g} Hz"]
 
 
 def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
@@ -261,28 +262,29 @@ def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
         return []
     unit_s = _unit_s(steps)
     if unit_s > UNEVEN_STEP_SHARE / rate_hz:
-        return [f"times have a resolution of {unit_s:.3g} s; samples are taken to be even"]
+        return [f"times have a resolution of {unit_s:.3g} s; equal time steps are assumed"]
     worst_s = float(steps[steps < FORWARD_JUMP_S * NS_PER_S].max()) / NS_PER_S
     return [
-        f"times step unevenly: by {middle:.3g} s in the median, {high:.3g} s at 90 %, {worst_s:.3g} s at worst; "
-        "samples are taken to be even"
+        f"time steps are uneven: median {middle:.3g} s, 90 % quantile {high:.3g} s, maximum {worst_s:.3g} s; "
+        "equal time steps are assumed"
     ]
 
 
 def _is_even(steps: Ints) -> bool:
     """Return True if all steps are equal within ``STEP_TOLERANCE``.
 
-    The difference of two steps may exceed int64 if a time stamp is far off, so it is computed in floating point.
+    With a wrong time stamp, the difference of two steps may exceed int64, so it is computed in floating point.
     """
     return float(steps.max()) - float(steps.min()) <= STEP_TOLERANCE * float(steps.min())
 
 
 def _unit_s(steps: Ints) -> float:
-    """Return the time unit of which all steps are whole multiples, in seconds; 0 if there is none."""
+    """Return the time unit in seconds of which all steps are whole multiples, or 0 if there is none."""
     on = steps[steps > 0]
     if not on.size:
         return 0.0
-    unit = float(on[on < 1.5 * on.min()].mean())  # a third of a second is not a whole number of nanoseconds
+    # a mean, because a third of a second is not a whole number of nanoseconds
+    unit = float(on[on < 1.5 * on.min()].mean())
     whole = np.abs(steps / unit - np.rint(steps / unit)) < UNIT_TOLERANCE
     return unit / NS_PER_S if whole.all() else 0.0
 
@@ -290,9 +292,9 @@ def _unit_s(steps: Ints) -> float:
 def _count_and_time(
     stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, steps: Ints
 ) -> tuple[Floats, Floats] | None:
-    """Return the cumulative samples (with missing ones) and seconds at the segment ends, without jumps of the clock.
+    """Return the number of samples and the time in seconds from the start to the end of each segment.
 
-    The result is None if no time passes.
+    The number includes missing samples. Jumps of the time stamps are left out. The result is None if no time passes.
     """
     rows = np.unique(np.linspace(0, steps.size, SEGMENTS + 1).astype(np.int64))
     starts = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
@@ -301,7 +303,7 @@ def _count_and_time(
     jumps = np.zeros(0, np.int64)
     if low <= -JUMP_S * NS_PER_S or high >= FORWARD_JUMP_S * NS_PER_S:
         jumps = np.flatnonzero((steps <= -JUMP_S * NS_PER_S) | (steps >= FORWARD_JUMP_S * NS_PER_S)) + 1
-    # the time and the samples that a jump skips are not counted
+    # The time and the samples of a jump are not counted.
     over = np.concatenate([[0], np.cumsum(steps[jumps - 1])])[np.searchsorted(jumps, rows, "right")]
     at_jumps = np.where(np.isin(jumps, starts), lost[np.searchsorted(starts, jumps, "right") - 1], 0) + 1
     left_out = np.concatenate([[0], np.cumsum(at_jumps)])[np.searchsorted(jumps, rows, "right")]
@@ -311,7 +313,7 @@ def _count_and_time(
 
 
 def _rate(came: Floats, passed_s: Floats) -> tuple[float, float]:
-    """Return the mean rate in Hz and its relative standard error from the segments; the error is 1 for few samples."""
+    """Return the mean rate in Hz and the relative standard error, which is 1 if there are too few samples."""
     mean_hz = float(came[-1] / passed_s[-1])
     if came[-1] < 2 * SEGMENTS or (np.diff(came) <= 0.0).any():
         return mean_hz, 1.0
@@ -322,12 +324,14 @@ def _rate(came: Floats, passed_s: Floats) -> tuple[float, float]:
 def _mean_rate(progress: tuple[Floats, Floats] | None) -> float:
     """Return the rate of a recording without a stated rate."""
     if progress is None:
-        raise NotReady("the times of the recording do not go on, so that its rate is unknown; state it with --rate HZ")
+        raise NotReady(
+            "the times of the recording do not increase, so the rate is unknown; state the rate with --rate HZ"
+        )
     rate_hz = snap_to_standard_rate(_rate(*progress)[0])
     try:
         return RATE_HZ.check(rate_hz)
     except ConfigError as error:
         raise RecordingError(
-            f"the times of the recording give a sample rate that is not supported: {error}; t must be in seconds, or "
-            "state the rate with --rate HZ"
+            f"the times of the recording give a sample rate that is not supported: {error}; check that t is in "
+            "seconds, or state the rate with --rate HZ"
         ) from None

@@ -162,18 +162,13 @@ def rate_slope_per_tau(rates: Floats, factors: Ints) -> Floats:
     terms = len(rates) + 1 - 2 * m
     ends = np.stack([np.zeros_like(m), m, 2 * m, terms, terms + m, terms + 2 * m])
     places, at = np.unique(ends, return_inverse=True)
-    mean = _present_mean(rates)
+    count, mean = _mean(rates)
+    mean = np.where(count < MIN_PRESENT_SHARE * len(rates), np.nan, mean)
     first, second, third, fourth, fifth, sixth = _sums_of_phase(rates, mean, places)[at.reshape(6, -1)]
     blocks = (sixth - 2.0 * fifth + fourth) - (third - 2.0 * second + first)
     with np.errstate(invalid="ignore", divide="ignore"):
         bent = blocks / (terms * m.astype(np.float64) ** 2)[:, None]
         return np.where((terms > 0)[:, None] & ~np.isnan(mean), bent, np.nan)
-
-
-def _present_mean(values: Floats) -> Floats:
-    """Return the mean [k] of the finite values of each column [n, k]; NaN where too many values are missing."""
-    count, mean = _mean(values)
-    return np.where(count < MIN_PRESENT_SHARE * len(values), np.nan, mean)
 
 
 @compiled
@@ -216,6 +211,11 @@ def _sums_of_phase(values: Floats, mean: Floats, places: Ints) -> Floats:
     return result
 
 
+def octaves(longest: int) -> Ints:
+    """Return the powers of two 1, 2, 4, … up to ``longest``."""
+    return 2 ** np.arange(max(longest, 1).bit_length(), dtype=np.int64)
+
+
 def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints:
     """Return the cluster sizes m = τ · rate of a grid of averaging times.
 
@@ -244,7 +244,7 @@ def cluster_sizes(samples: int, rate_hz: float, tau: TauGrid = "octave") -> Ints
     """
     longest = samples // 4
     if tau == "octave":
-        return 2 ** np.arange(max(longest, 1).bit_length(), dtype=np.int64)
+        return octaves(longest)
     if tau == "decade10":
         exponents = np.arange(0, np.log10(max(longest, 1)) + 1e-9, 0.1)
         return np.unique(np.rint(10.0**exponents).astype(np.int64))

@@ -56,11 +56,6 @@ class PhaseRing(NamedTuple):
     n: int  # number of samples
 
 
-def octaves(longest: int) -> Ints:
-    """Return the powers of two 1, 2, 4, … up to ``longest``."""
-    return 2 ** np.arange(max(longest, 1).bit_length(), dtype=np.int64)
-
-
 def _integrate_to_phase(values: Floats) -> PhaseRing:
     """Return the phase of the mean-free rates [n, k], in C order."""
     phase = np.zeros((len(values) + 1, values.shape[1]))

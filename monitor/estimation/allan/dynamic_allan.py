@@ -28,7 +28,6 @@ from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_desi
 STEPS_PER_WINDOW: Final = 20
 """Default number of steps per window length."""
 MAX_STEPS: Final = 500
-"""Maximum number of steps."""
 
 Progress = Callable[[float], None]
 """Callback that receives the completed share, 0 to 1."""
@@ -137,7 +136,7 @@ def _length(rate_hz: float, window_s: float) -> int:
 def _ends(n: int, length: int, rate_hz: float, step_s: float | None) -> NDArray[np.int64]:
     """Return the end index of the window at each step. The first window ends as soon as it is full."""
     if step_s is not None and not 0.0 < step_s < np.inf:
-        raise ConfigError(f"step of {step_s:g} s; it must be above 0")
+        raise ConfigError(f"step of {step_s:g} s; the step must be above 0")
     if n < length:
         raise NotReady(f"{n / rate_hz:g} s are recorded, less than the window of {length / rate_hz:g} s")
     step = max(round(length / STEPS_PER_WINDOW if step_s is None else step_s * rate_hz), 1)

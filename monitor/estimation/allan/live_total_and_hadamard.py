@@ -28,14 +28,14 @@ import numpy as np
 from drivers.errors import ConfigError
 from drivers.sample import Floats, Ints
 from monitor.estimation.allan import hadamard, total
-from monitor.estimation.allan.difference_moments import Moments, PhaseRing, octaves, variance_of_sums
+from monitor.estimation.allan.batch import octaves
+from monitor.estimation.allan.difference_moments import Moments, PhaseRing, variance_of_sums
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.allan.window import FULL_SCALE, AllanWindow
 from monitor.estimation.allan.window_kernel import AXES
 
 TOTAL, HADAMARD = 0, 1
-"""Indices of the two statistics."""
 MIN_SAMPLES: Final = 8
 """Minimum number of samples for a round."""
 MOMENTS_RENEWAL_RATIO: Final = 1.02

@@ -34,13 +34,13 @@ import numpy as np
 
 from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
+from monitor.estimation.allan.batch import octaves
 from monitor.estimation.allan.difference_moments import (
     NUM_COEFFICIENTS,
     Moments,
     PhaseRing,
     correct_bias,
     mean_squares,
-    octaves,
     phase_autocovariance,
     quadrature_nodes,
     theta_per_sample,

@@ -1,31 +1,33 @@
 """Detector of noise changes, bias steps and bursts of outliers, with a specified rate of false alarms.
 
-Each axis is monitored in octaves of averaging time. Each octave has its own reference, learned from the samples since
-its last change. The detector returns a ``Change`` of one of three kinds:
+Each axis is monitored in octaves of averaging time. Each octave has a reference variance, learned from the samples
+since the last change. The detector returns a ``Change`` of one of three kinds.
 
-- ``noise_changed``: with the coefficients Q N B K that explain the variances since the onset, or with a frequency band.
-- ``bias_stepped``: with the means on both sides.
-- ``outlier_burst``: with the number and the size of the outliers.
+- ``noise_changed`` contains the changed coefficients Q N B K, or a frequency band if no coefficient explains the
+  change.
+- ``bias_stepped`` contains the means before and after the step.
+- ``outlier_burst`` contains the number and the size of the outliers.
 
-``change_kernel`` computes the statistics, ``changed_coefficients`` the coefficients.
+``change_kernel`` computes the statistics, and ``changed_coefficients`` identifies the coefficients.
 
-- **False alarms.** ``alarms_per_day`` of six axes with constant noise is divided among noise changes (eight tenths),
-  steps and bursts. The threshold for noise changes is h = ln(looks per day · RATE_AT_ZERO / alarms per day). The
-  constant was measured at thresholds of 8 to 12, where alarms are frequent, and is used at 13 to 20
-  (``tests/experiments/benchmarks/changes.py``).
-- **Learning.** A band can raise an alarm when its reference has ``MIN_REFERENCE_TERMS`` terms and ``LEARN_S`` have
-  passed. This takes a minute for the shortest octaves and 128 clusters for the longer ones, and longer for correlated
-  terms. A change within this time is not detected. The reference is kept while nothing is detected, so it becomes more
-  accurate. A slow drift of the noise is eventually reported as a change, because it is compared with all earlier
-  samples. Noise that fluctuates more slowly than the learning time is reported as well.
+- **False alarms.** Of the false alarms on six axes with constant noise, eight tenths are allowed for noise changes, one
+  tenth for steps and one tenth for bursts. The threshold for noise changes is h = ln(tests per day · RATE_AT_ZERO /
+  alarms per day). ``RATE_AT_ZERO`` was measured at thresholds of 8 to 12, where alarms are frequent. It is extrapolated
+  to the thresholds in use, which are 13 to 20 (``tests/experiments/benchmarks/changes.py``).
+- **Learning.** An octave can raise an alarm when the reference has ``MIN_REFERENCE_TERMS`` terms and is at least
+  ``LEARN_S`` old. The shortest octaves need a minute for this, and the longer octaves need the time of 128 clusters.
+  Correlated terms need more time. A change during the learning time is not detected. Without a change, the reference is
+  never discarded and becomes more accurate. A slow drift of the noise is eventually reported as a change, because new
+  samples are compared with all earlier samples. Fluctuations of the noise that are slower than the learning time are
+  reported as well.
 - **After a change**, the samples since the onset are the new reference. Octaves that are too long for these
   samples start without a reference.
-- **A burst** raises the share of extreme differences while the median stays the same. After its end, the burst is
-  removed from the reference.
+- **A burst** of outliers raises the share of extreme differences and does not change the median. After the end of a
+  burst, the samples of the burst are removed from the reference.
 
-``analyze`` and the live service share this detector. ``reconcile`` tests steps of level and noise by the likelihood
-ratio of its own model of the axis (``diagnostics.level_step_gains``, ``single_steps``, ``variance_history``), because
-the gain of a step must be comparable with the gain of every other effect.
+``analyze`` and the live service share this detector. ``reconcile`` tests steps of the level and of the noise by the
+likelihood ratio of the fitted model of the axis (``diagnostics.level_step_gains``, ``single_steps``,
+``variance_history``). The gain of a step must be comparable with the gains of all other effects.
 """
 
 from collections.abc import Mapping
@@ -75,31 +77,37 @@ from monitor.estimation.detection.change_kernel import (
 from monitor.estimation.detection.changed_coefficients import HaarVariancesBeforeAfter, identify_noise_change
 
 MAX_CLUSTER_S: Final = 300.0
-"""Longest cluster in seconds. Longer ones would learn for days and show temperature rather than noise."""
+"""Longest cluster in seconds.
+
+Longer clusters would need days of learning and respond to temperature rather than noise.
+"""
 LEARN_S: Final = 60.0
-"""Minimum learning time in seconds. It suffices to resolve spectral lines of width 1/``LEARN_S``."""
+"""Minimum learning time in seconds. Spectral lines of width 1/``LEARN_S`` are resolved in this time."""
 MIN_DWELL_SAMPLES: Final = 256
 """Minimum number of samples between an alarm and its decision."""
 MAX_DWELL_S: Final = 60.0
 """Maximum time between an alarm and its decision, in seconds."""
 MAX_BURST_S: Final = 60.0
-"""Maximum duration of a burst in seconds. After a longer burst, the axis learns a new reference."""
+"""Maximum duration of a burst in seconds. After a longer burst, a new reference is learned."""
 RATE_AT_ZERO: Final = 0.07
-"""Number of alarms per z², for six ratios together, divided by e^−h.
+"""Number of alarms per tested z² and per e^−h, for all six variance ratios together.
 
 Measured values are 0.053–0.065 (``tests/experiments/benchmarks/changes.py``).
 """
 NOISE_SHARE: Final = 0.8
 """Share of the false alarms for noise changes."""
 OTHER_SHARE: Final = 0.1
-"""Share of the false alarms for steps, and for bursts."""
+"""Share of the false alarms for steps. The share for bursts is the same."""
 SKIP_BLOCK_ROWS: Final = 4096
-"""Number of missing samples that are processed at a time."""
+"""Largest number of missing samples processed in one call."""
 MAX_CLIPPED_RATIO: Final = 4.0
-"""Ratio of the clipped variances above which clipping biases the size of a change. Unclipped squares are then used."""
+"""Ratio of the clipped variances above which clipping would bias the size of a change.
+
+Above it, squares are not clipped.
+"""
 
 Q_OR_VIBRATION: Final = "quantization noise or vibration near Nyquist"
-"""Name of a change of Q. HaarVariancesBeforeAfter cannot distinguish the two causes (``changed_coefficients``)."""
+"""Name of a change of Q. The two causes cannot be distinguished, see ``changed_coefficients``."""
 NOISE_NAMES: Final = {
     "g": {"Q": Q_OR_VIBRATION, "N": "angle random walk", "B": "bias instability", "K": "rate random walk"},
     "a": {
@@ -114,18 +122,20 @@ NOISE_NAMES: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One change of one axis. Times are numbers of samples since the start of the detector."""
+    """Change of one axis. Times are numbers of samples since the start of the detector."""
 
     kind: str  # noise_changed, bias_stepped, outlier_burst
     axis: int  # index into AXES
     since: int  # estimated onset
-    found: int  # sample of the alarm; the change is returned up to a minute later, after its size is estimated
+    found: int  # sample of the alarm; the change is returned up to a minute later, when the size has been estimated
     sigma: float  # significance in standard deviations
-    what: Mapping[str, tuple[float, float]]  # before, after in SI: coefficients, band (from, to in Hz) and rms, …
+    what: Mapping[
+        str, tuple[float, float]
+    ]  # values before and after in SI: coefficients, band (from, to in Hz) and rms, …
     text: str  # description for users
 
     def sides(self) -> dict[str, dict[str, float]]:
-        """Return ``what`` for output, with the keys ``before`` and ``after``, or ``from`` and ``to`` for a band."""
+        """Return ``what`` with the keys ``before`` and ``after``, or ``from`` and ``to`` for a band."""
         return {
             name: {"from": first, "to": second} if name == "band" else {"before": first, "after": second}
             for name, (first, second) in self.what.items()
@@ -138,7 +148,7 @@ class ChangeDetector:
     Parameters
     ----------
     rate_hz : float
-        Sample rate in Hz. It sets the learning times and the units of the results.
+        Sample rate in Hz, which determines the learning times and the units of the results.
     alarms_per_day : float
         Accepted false alarms per day, of all axes together.
 
@@ -161,8 +171,8 @@ class ChangeDetector:
         self.rate_hz = rate_hz
         self._octaves = min(max(floor(log2(MAX_CLUSTER_S * rate_hz)), 7), 20) + 1
         self._state = make_state(self._octaves)
-        looks = DAY_S * rate_hz * len(AXES)  # z² per day, and pairs of blocks per day
-        # computed from the lower tail, because 1 - p would be rounded to 1 for p below 1e-16
+        looks = DAY_S * rate_hz * len(AXES)  # z² per day, which is also the number of pairs of blocks per day
+        # The lower tail is used, because 1 - p would be rounded to 1 for p below 1e-16.
         once = -NormalDist().inv_cdf(min(0.5 * OTHER_SHARE * alarms_per_day / looks, 0.01))
         self._state.levels[:] = (
             max(log(looks * RATE_AT_ZERO / (NOISE_SHARE * alarms_per_day)), 1.0),
@@ -181,17 +191,8 @@ class ChangeDetector:
         """True for octaves [J, 6] (clusters of 2^j samples) whose reference is long enough for an alarm."""
         band = self._state.band
         known = (band[:, :, N] >= MIN_REFERENCE_TERMS * band[:, :, F] ** 2) & (band[:, :, S] > 0.0)
-        return np.asarray((known & self._is_old_enough[:, None]).T)
-
-    @property
-    def learned_axes(self) -> NDArray[np.bool_]:
-        """True for axes [6] on which at least the shortest octave can raise an alarm."""
-        return np.asarray(self.watched_octaves[0])
-
-    @property
-    def _is_old_enough(self) -> NDArray[np.bool_]:
-        """True for axes whose reference is at least ``LEARN_S`` old."""
-        return np.asarray(self.samples - self._state.born >= LEARN_S * self.rate_hz)
+        old_enough = self.samples - self._state.born >= LEARN_S * self.rate_hz
+        return np.asarray((known & old_enough[:, None]).T)
 
     def update(self, values: Floats) -> None:
         """Process samples.
@@ -226,18 +227,18 @@ class ChangeDetector:
             self.update(hole[: n - start])
 
     def take(self) -> list[Change]:
-        """Return the changes found since the last call, in order."""
+        """Return the changes found since the last call, in the order of detection."""
         found, self._found = self._found, []
         return found
 
     def restart(self, axis: int | None = None) -> None:
-        """Restart the reference of one axis, or of all axes."""
+        """Start a new reference of one axis, or of all axes."""
         for one in range(len(AXES)) if axis is None else (axis,):
             self._restart_reference(one)
         set_due(self._state)
 
     def _decide(self, axis: int) -> None:
-        """Decide on the alarm of one axis after its waiting time."""
+        """Decide which change caused the alarm of one axis, after the waiting time."""
         s = self._state
         alarm = s.alarm[axis].copy()
         s.alarm[axis] = 0.0
@@ -253,25 +254,29 @@ class ChangeDetector:
             self._report_noise_change(axis, alarm, after, before_n, before_s)
 
     def _cum_at(self, sample: int) -> Floats:
-        """Return the sums [6, J, 5] stored at or shortly after a sample; the age is accurate to a quarter."""
+        """Return the sums [6, J, 5] stored at or after a sample, at most a quarter of the sample's age later."""
         at = self._state.snap_at
         later = np.where(at >= sample, at, NEVER)
         return np.asarray(self._state.snap[np.unravel_index(int(later.argmin()), at.shape)])
 
     def _is_bulk_unchanged(self, axis: int, after: Floats, before: float) -> bool:
-        """Return True if outliers explain the alarm: they raise the mean of z² more than they change its median."""
+        """Return True if outliers explain the alarm, because the mean of z² has risen much more than the median."""
         n, extremes = after[UNIT_N], after[UNIT_EXTREME]
         if extremes < 3 or not before > 0.0:
             return False
         return bool(self._bulk_variance_ratio(axis, after) < 1.0 + 0.5 * (after[UNIT_RAW] / n / before - 1.0))
 
     def _bulk_variance_ratio(self, axis: int, after: Floats) -> float:
-        """Return the variance relative to the reference from the share of small differences of Gaussian noise."""
+        """Return the ratio of the variances after and before the alarm, estimated from the share of small differences.
+
+        For Gaussian noise, the share of differences below a fixed limit determines the variance. Outliers hardly affect
+        it.
+        """
         whole = self._state.cum[axis, 0] - after
         usual, now = whole[UNIT_INSIDE] / whole[UNIT_N], after[UNIT_INSIDE] / after[UNIT_N]
         if not 0.02 < usual < 0.98 or now >= 1.0:
             return 1.0
-        # share p of |z| below a quantile q·σ: q = Φ⁻¹((1 + p)/2)
+        # A share p of |z| lies below q·σ with q = Φ⁻¹((1 + p)/2).
         quantile = NormalDist().inv_cdf
         return float((quantile(0.5 + 0.5 * usual) / quantile(0.5 + 0.5 * max(now, 1e-3))) ** 2)
 
@@ -296,17 +301,17 @@ class ChangeDetector:
         band[keep, LIMIT], band[keep, SEEDED] = CLIP * v1[keep], SEED
 
     def _report_burst(self, axis: int, alarm: Floats, after: Floats, before_n: Floats, before_s: Floats) -> None:
-        """Report a burst of outliers after its end, and remove it from the reference."""
+        """Report a burst of outliers after the end, and remove the samples of the burst from the reference."""
         s = self._state
         now = self.samples
         latest = s.cum[axis, 0, UNIT_EXTREME] - self._cum_at(now - MIN_DWELL_SAMPLES // 2)[axis, 0, UNIT_EXTREME]
         lasting = now - alarm[START] >= max(MAX_BURST_S * self.rate_hz, 2 * MIN_DWELL_SAMPLES)
         if latest > 0 and not lasting:
             s.alarm[axis] = alarm
-            s.alarm[axis, DUE] = now + MIN_DWELL_SAMPLES  # a multiple of TICK, like all decision times
+            s.alarm[axis, DUE] = now + MIN_DWELL_SAMPLES  # a multiple of TICK_SAMPLES, like all decision times
             return
         count, variance = after[0, UNIT_EXTREME], before_s[0] / before_n[0]
-        # an outlier of size a in one sample gives one z² = a²/2
+        # An outlier of size a in one sample gives one z² of a²/2.
         scale = sqrt(2.0 * max(after[0, UNIT_RAW] - after[0, UNIT_S], 0.0) / max(count, 1.0))
         what = {"count": (0.0, float(count)), "scale": (sqrt(variance), scale)}
         text = f"{AXES[axis]} {count:.0f} outliers of about {format_rate(AXES[axis], scale)} within " + (
@@ -331,7 +336,7 @@ class ChangeDetector:
         self._clear_suspicion(axis)
 
     def _clear_suspicion(self, axis: int) -> None:
-        """Clear all suspicions of one axis, and skip the blocks that contain samples of the change."""
+        """Reset the evidence of changes of one axis, and skip the blocks that contain samples of the change."""
         s = self._state
         s.cusum[axis] = s.unit[axis] = 0.0
         s.cusum[axis, :, :, SINCE] = self.samples
@@ -341,7 +346,7 @@ class ChangeDetector:
         s.fill[axis] = -under_way.astype(np.int64)
 
     def _restart_reference(self, axis: int, born: int | None = None) -> None:
-        """Discard reference and suspicions of one axis; the cascade of sums continues."""
+        """Start a new reference of one axis, and reset the evidence. The block sums of the octaves are kept."""
         s = self._state
         s.born[axis] = self.samples if born is None else born
         s.band[axis] = s.spread[axis] = 0.0
@@ -351,7 +356,7 @@ class ChangeDetector:
 
 
 def _noise_text(axis: str, what: Mapping[str, tuple[float, float]]) -> str:
-    """Describe the change with the names of the coefficients."""
+    """Describe a noise change with the names of the coefficients, or with the frequency band."""
     names = NOISE_NAMES[axis[0]]
     letters = [f"{names[letter]} {_format_change(*what[letter])}" for letter in what if letter in names]
     if letters:

@@ -1,27 +1,31 @@
-"""Compiled kernel of the change detector: Haar differences of every octave, their CUSUMs and the alarm state.
+"""Compiled kernel of the change detector, with the Haar differences of every octave, the CUSUMs and the alarms.
 
-Samples are processed in ticks of 32, with NaN for missing ones, and the results are stored in ``ChangeState``. The
-kernel stops when an alarm has reached its waiting time. The decision is therefore made at the same sample for any
-division of the input into blocks.
+Samples are processed in groups of 32, which are called ticks. Missing samples are NaN. The kernel stops when the
+waiting time after an alarm has passed. The decision is therefore made at the same sample for any division of the input
+into blocks.
 
-- **Cascade.** A binary counter of block sums: octave j joins two blocks of m = 2^j samples to one difference z = (mean
-  − mean')/√2, whose mean square is the Allan variance at m. It then passes their sum to the next octave. Differences of
-  one octave do not overlap, and Haar functions of different octaves are orthogonal. For white noise and random walk,
-  all z are therefore independent. The cost is two additions per sample and axis, for any number of octaves.
-- **Evidence.** n and S are the number and the sum of the z² since the start of the reference, n₁ and S₁ those since a
-  suspected onset. The hypothesis "variance × r since the onset" is compared with "no change". The likelihood ratio uses
-  only quantities that do not depend on the unknown variance (the maximal invariant under scale). Its logarithm is
+- **Cascade.** Octave j combines two blocks of m = 2^j samples to a Haar difference z = (mean − mean')/√2. The mean
+  square of z is the Allan variance at m. The sum of the two blocks is a block of the next octave. Differences of one
+  octave do not overlap, and Haar functions of different octaves are orthogonal. For white noise and random walk, all z
+  are therefore independent. The cost is two additions per sample and axis, for any number of octaves.
+- **Evidence.** The n squares z² since the start of the reference have the sum S, and the n₁ squares since a suspected
+  onset have the sum S₁. The hypothesis that the variance has been multiplied by r since the onset is compared with the
+  hypothesis of no change. The likelihood ratio uses only quantities that do not depend on the unknown variance (the
+  maximal invariant under scale). The logarithm of the likelihood ratio, called the evidence g, is
 
       g = −(n/2) ln(1 − (1 − 1/r) S₁/S) − (n₁/2) ln r.
 
-  For a long reference, g is Page's CUSUM, the sum of ½[u(1 − 1/r) − ln r]. For a short reference, g includes the
-  uncertainty of the reference. Without a change, the mean of the likelihood ratio e^g is 1 for every onset, so P(alarm
-  within k looks) ≤ k e^−h (Shiryaev–Roberts). The onset moves on whenever g ≤ 0.
-- **Non-Gaussian and dependent noise.** z² is clipped at ``CLIP`` times the reference, (4σ)². This affects 6e-5 of
-  Gaussian z² and lowers their mean by 2e-4, in the reference and after the onset alike. g is divided by F, the ratio by
-  which sums of z² scatter more than Gaussian ones. A second cascade of Haar differences over the z² measures F. Heavy
-  tails, spectral lines and coarse resolution have fewer degrees of freedom than terms.
-- **Steps** are detected where one pair of blocks lies before, and the next but one after, a possible step.
+  With a long reference, g is Page's CUSUM, the sum of ½[u(1 − 1/r) − ln r] with u = z² over the reference variance.
+  With a short reference, g is smaller, because the reference is uncertain. Without a change, the mean of e^g is 1 for
+  every onset. The probability of an alarm at threshold h within k tests is therefore at most k e^−h (Shiryaev–Roberts).
+  If g ≤ 0, the suspected onset is set to the current sample.
+- **Non-Gaussian and dependent noise.** z² is clipped at ``CLIP`` times the reference variance, which corresponds to 4σ.
+  For Gaussian noise, clipping affects a share of 6e-5 of the values and lowers the mean by 2e-4, both in the reference
+  and after the onset. The evidence g is divided by a factor F, the ratio of the measured variance of sums of z² to the
+  variance for independent Gaussian z. F is estimated from the Haar differences of successive sums of z². F exceeds 1
+  for heavy tails, spectral lines and coarse resolution.
+- **Steps** are detected by comparing a pair of blocks with the next but one pair. The pair between them may contain the
+  step.
 """
 
 from typing import Final, NamedTuple
@@ -39,80 +43,85 @@ GAIN: Final = 1.0 - 1.0 / RATIOS
 HALF_LOG: Final = 0.5 * np.log(RATIOS)
 """The term ½ ln r of each ratio r."""
 TICK_SAMPLES: Final = 32
-"""Number of samples processed at a time. z² of the shortest octaves are summed over it, because logarithms are slow."""
+"""Number of samples in a tick. The z² of the shortest octaves are summed over a tick, because logarithms are slow."""
 SHORT: Final = 5
 """Number of octaves within a tick."""
 RAREST: Final = 1e-6
-"""Minimum share of extremes that is assumed for the reference."""
+"""Minimum share of extreme values that is assumed for the reference."""
 HUGE: Final = 1e150
 """Samples at or above this absolute value count as missing, because their square overflows."""
 CLIP: Final = 16.0
 """Level at which z² is clipped, relative to the reference."""
 EXTREME: Final = 36.0
-"""Value of u = z² over the reference beyond which a difference counts as an outlier: 6σ, 2e-9 of Gaussian noise."""
+"""Ratio of z² to the reference variance above which a difference is an outlier.
+
+The limit is 6σ, which a share of 2e-9 of Gaussian values exceeds.
+"""
 MEDIAN: Final = 0.45494
 """Median of χ² with one degree of freedom."""
 SEED: Final = 31
-"""Number of first z² of a band. Their median sets the clip level, so that an outlier at the start has no effect."""
+"""Number of first z² of an octave, whose median determines the clip level. An outlier at the start has no effect."""
 SETTLED: Final = 256
 """Number of z² after which the clip level is final."""
 MIN_REFERENCE_TERMS: Final = 64
 """Minimum number of terms of a reference for an alarm, multiplied by F².
 
-One factor F makes the terms as informative as this many independent ones. The other ensures that F is known for sums
-much longer than the correlation of the terms.
+With the first factor F, correlated terms contain as much information as this number of independent terms. With the
+second factor, F is known for sums that are much longer than the correlation of the terms.
 """
 MIN_BAND_TERMS: Final = 16
-"""Minimum number of terms of a band for a bound on the variation of the mean by slow noise."""
+"""Minimum number of terms of a longer octave from which the variation of the mean by slow noise is estimated."""
 MIN_SPREAD_PAIRS: Final = 8
 """Minimum number of pairs for a valid spread F."""
 MAX_FLANK: Final = 12.0
-"""Value of u beyond which a pair of blocks beside a step is not at rest."""
+"""Ratio of z² to the reference variance above which a pair of blocks beside a step is not at rest."""
 CONFIRM_PAIRS: Final = 2
-"""Number of pairs after a step that must stay at its height."""
+"""Number of pairs after a step whose means must stay at the new level."""
 SLOTS: Final = 4
-"""Number of snapshots per level in ``State.snap``."""
+"""Number of snapshots per level in ``ChangeState.snap``."""
 NEVER: Final = 1 << 62
-"""Sample number that stands for "no decision is due"."""
+"""Sample number that means "no decision is due"."""
 
 N, S, LIMIT, SEEDED, F = range(5)
-"""Columns of ``State.band``."""
+"""Columns of ``ChangeState.band``."""
 UNIT_N, UNIT_S, UNIT_RAW, UNIT_INSIDE, UNIT_EXTREME = range(5)
-"""Columns of ``State.unit`` and ``State.cum``."""
+"""Columns of ``ChangeState.unit`` and ``ChangeState.cum``."""
 N1, S1, SINCE, G = range(4)
-"""Columns of ``State.cusum``."""
+"""Columns of ``ChangeState.cusum``."""
 HELD, FULL, SQUARES, COUNT, SPREAD = range(5)
-"""Columns of ``State.spread``."""
+"""Columns of ``ChangeState.spread``."""
 NOISE, BURST, STEP = 1.0, 2.0, 3.0
 """Kinds of alarms."""
-KIND, WHERE, START, FOUND, EVIDENCE, DUE = range(6)
-"""Columns of ``State.alarm``."""
+KIND, START, FOUND, EVIDENCE, DUE = range(5)
+"""Columns of ``ChangeState.alarm``."""
 BEFORE, AFTER, PLACE, SIGMA, LEFT = range(1, 6)
-"""Columns of ``State.step``; column 0 is the octave."""
+"""Columns of ``ChangeState.step``; column 0 is the octave."""
 TOTAL, NEXT_DUE = 0, 1
-"""Elements of ``State.clock``."""
+"""Elements of ``ChangeState.clock``."""
 H_NOISE, H_BURST, STEP_SIGMA, DWELL, LONGEST_DWELL, LEARN_TIME = range(6)
-"""Elements of ``State.levels``."""
+"""Elements of ``ChangeState.levels``."""
 
 
 class ChangeState(NamedTuple):
-    """State of the detector of constant size. A = 6 axes, J octaves, L = 12 levels."""
+    """State of the change detector for A = 6 axes, J octaves and L = 12 levels. The size of the state is constant."""
 
     levels: Floats  # [6] thresholds, and times in samples; see H_NOISE
     clock: Ints  # [2] samples since the start; sample of the next decision
     born: Ints  # [A] sample at which the reference began
     stage: Floats  # [A, TICK] samples of the current tick
     half: Floats  # [A, J, 2] sum and count of the block that waits for its partner
-    fill: Ints  # [A, J] number of complete pairs stored for steps; −1: do not use the current pair
+    fill: Ints  # [A, J] number of complete pairs stored for the detection of steps; −1: do not use the current pair
     ring: Floats  # [A, J, 2, 2] mean and block difference of the last two pairs
     seeds: Floats  # [A, J, SEED] first z²
-    band: Floats  # [A, J, 5] reference: count, sum of clipped z², clip level, seeds stored, F
-    unit: Floats  # [A, J, 5] since the last look: count, clipped z², z², count below the median, extremes
+    band: Floats  # [A, J, 5] reference: number and sum of clipped z², clip level, number of seeds, F
+    unit: (
+        Floats  # [A, J, 5] since the last test: number, sum of clipped z², sum of z², number below the median, extremes
+    )
     cum: Floats  # [A, J, 5] the same since the start
     cusum: Floats  # [A, J, 6, 4] n1, S1, sample of the suspected onset, evidence g
-    spread: Floats  # [A, J, L, 5] cascade over z²: stored sum, 1 if stored, squared differences, pairs, spread
-    burst: Floats  # [A, 2] CUSUM of extremes, and the sample at which it was last zero
-    alarm: Floats  # [A, 6] pending alarm, see KIND; kind 0 means none
+    spread: Floats  # [A, J, L, 5] sums of z²: stored sum, 1 if stored, squared differences, pairs, spread F
+    burst: Floats  # [A, 2] CUSUM of extremes, and the last sample at which the CUSUM was zero
+    alarm: Floats  # [A, 5] pending alarm, see KIND; kind 0 means none
     step: Floats  # [A, 6] octave (−1 means none), mean before and after, position, sigma, pairs left to confirm
     snap: Floats  # [levels, SLOTS, A, J, 5] snapshots of ``cum``, with a spacing proportional to their age
     snap_at: Ints  # [levels, SLOTS] sample numbers of the snapshots
@@ -126,7 +135,7 @@ def make_state(octaves: int) -> ChangeState:
         np.zeros((a, TICK_SAMPLES)), np.zeros((a, j, 2)), np.zeros((a, j), np.int64), np.zeros((a, j, 2, 2)),
         np.zeros((a, j, SEED)),
         np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, 5)), np.zeros((a, j, RATIOS.size, 4)),
-        np.zeros((a, j, 12, 5)), np.zeros((a, 2)), np.zeros((a, 6)), np.zeros((a, 6)),
+        np.zeros((a, j, 12, 5)), np.zeros((a, 2)), np.zeros((a, 5)), np.zeros((a, 6)),
         np.zeros((40, SLOTS, a, j, 5)), np.full((40, SLOTS), -1, np.int64),
     )  # fmt: skip
     state.step[:, 0] = -1.0
@@ -140,7 +149,7 @@ def advance(s: ChangeState, rows: Floats, first: int) -> int:
 
     Parameters
     ----------
-    s : State
+    s : ChangeState
         State, updated in place.
     rows : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s²; NaN means missing.
@@ -164,7 +173,7 @@ def advance(s: ChangeState, rows: Floats, first: int) -> int:
 
 @compiled
 def _tick(s: ChangeState, axis: int, now: int) -> None:
-    """Process a tick of one axis: first the octaves within the tick, then the carry through the longer octaves."""
+    """Process a tick of one axis, first the octaves shorter than a tick, then the longer octaves."""
     sums = s.stage[axis]
     total, count = 0.0, 0.0
     for i in range(TICK_SAMPLES):
@@ -173,8 +182,9 @@ def _tick(s: ChangeState, axis: int, now: int) -> None:
             count += 1.0
         else:
             sums[i] = np.nan
-    if _count_extremes(sums, s.band, s.cum, s.burst, axis, now) > s.levels[H_BURST]:
-        _suspect_burst(s, axis, now)
+    evidence = _count_extremes(sums, s.band, s.cum, s.burst, axis, now)
+    if evidence > s.levels[H_BURST] and s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_TIME]:
+        _alarm(s, axis, BURST, s.burst[axis, 1], evidence, now)
     h = s.levels[H_NOISE]
     for j in range(SHORT):
         _differences(sums, s.band, s.unit, s.seeds, axis, j)
@@ -200,9 +210,12 @@ def _tick(s: ChangeState, axis: int, now: int) -> None:
 
 @compiled
 def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: int, j: int) -> None:
-    """Add all differences of sums of 2^j samples in a tick, and leave the joined sums in front of ``sums``.
+    """Add the squared Haar differences of one octave within a tick.
 
-    Indices are used because array views would cost more than the work itself.
+    On input, ``sums`` begins with the sums over blocks of 2^j samples. On return, it begins with the sums over blocks
+    of twice the length.
+
+    The code uses indices, because array views would cost more than the arithmetic.
     """
     scale = 0.5 / (1 << j) ** 2
     limit = band[axis, j, LIMIT]
@@ -231,7 +244,7 @@ def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: 
 
 @compiled
 def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: float, count2: float, now: int) -> None:
-    """Process two blocks of 2^j samples. A block is not used if more than a sixteenth of it is missing."""
+    """Process two blocks of 2^j samples. A block with more than a sixteenth of the samples missing is not used."""
     m = 1 << j
     least = m - m // 16
     fill = s.fill[axis, j]
@@ -254,7 +267,7 @@ def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: f
 
 @compiled
 def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: float) -> None:
-    """Add one z² to its band, or store it with the first ones, which only set the clip level."""
+    """Add one z² to the sums of an octave. The first values are stored and determine the clip level."""
     if band[axis, j, SEEDED] == SEED:
         limit = band[axis, j, LIMIT]
         unit[axis, j, UNIT_N] += 1.0
@@ -297,9 +310,9 @@ def _median_of_seeds(first: Floats) -> float:
 def _look(
     unit: Floats, cum: Floats, band: Floats, spread: Floats, cusum: Floats, axis: int, j: int, now: int, h: float
 ) -> int:
-    """Add the collected z² to the reference and the CUSUMs of one band.
+    """Add the new z² of one octave to the reference and to the CUSUMs.
 
-    Return the index of the ratio whose evidence exceeds h, or −1.
+    Return the index of the variance ratio with the largest evidence above the threshold h, or −1 if there is none.
     """
     k, q = unit[axis, j, UNIT_N], unit[axis, j, UNIT_S]
     if k == 0.0:
@@ -319,10 +332,11 @@ def _look(
 
 @compiled
 def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: float) -> None:
-    """Update F: squared Haar differences of sums of z² over 1, 2, 4, … looks, relative to independent Gaussian z.
+    """Update the factor F of one octave.
 
-    The standard deviation of the estimate is subtracted if chance may explain it. F is the largest value of all
-    lengths.
+    F is estimated from the squared Haar differences of sums of z² over 1, 2, 4, … tests, relative to the expectation
+    for independent Gaussian z. An estimate that is not significantly above 1 is reduced by its standard deviation. The
+    largest estimate of all lengths is used.
     """
     v = band[axis, j, S] / band[axis, j, N]
     for level in range(spread.shape[2]):
@@ -338,7 +352,7 @@ def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: f
         if count >= MIN_SPREAD_PAIRS and v > 0.0:
             expected = 4.0 * k * (1 << level) * v * v * count
             found, error = spread[axis, j, level, SQUARES] / expected, np.sqrt(3.0 / count)
-            if found < 1.0 + 2.0 * error:  # a significantly larger value is used without a correction
+            if found < 1.0 + 2.0 * error:  # A significantly larger value is not reduced.
                 found /= 1.0 + error
             spread[axis, j, level, SPREAD] = found
             largest = 1.0
@@ -351,16 +365,16 @@ def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: f
 def _raise_cusums(
     cusum: Floats, band: Floats, axis: int, j: int, k: float, q: float, now: int, threshold: float
 ) -> int:
-    """Update the evidence g of each ratio as described in the module docstring.
+    """Update the evidence g of each variance ratio, as described in the module docstring.
 
-    Return the ratio with the largest evidence above the threshold, or −1.
+    Return the index of the ratio with the largest evidence above the threshold, or −1 if there is none.
     """
     n, total, spread = band[axis, j, N], band[axis, j, S], band[axis, j, F]
     best, largest = -1, threshold
     for i in range(RATIOS.size):
         n1 = cusum[axis, j, i, N1] + k
         s1 = cusum[axis, j, i, S1] + q
-        g = -1.0  # negative by Jensen's inequality, unless the mean since the onset changed in the direction of r
+        g = -1.0  # By Jensen's inequality, g is negative unless the variance has changed in the direction of r.
         if (s1 * n - total * n1) * GAIN[i] > 0.0:
             g = (-0.5 * n * np.log(1.0 - GAIN[i] * s1 / total) - n1 * HALF_LOG[i]) / spread
         if g <= 0.0:
@@ -374,18 +388,18 @@ def _raise_cusums(
 
 @compiled
 def _suspect(s: ChangeState, axis: int, j: int, i: int, now: int) -> None:
-    """Raise an alarm for a ratio above its threshold, if the reference is long enough."""
+    """Raise an alarm for a noise change if the reference is long enough, otherwise restart the reference."""
     since = s.cusum[axis, j, i, SINCE]
     enough = s.band[axis, j, N] - s.cusum[axis, j, i, N1] >= MIN_REFERENCE_TERMS * s.band[axis, j, F] ** 2
     if enough and since - s.born[axis] >= s.levels[LEARN_TIME]:
-        _alarm(s, axis, NOISE, j, since, s.cusum[axis, j, i, G], now)
+        _alarm(s, axis, NOISE, since, s.cusum[axis, j, i, G], now)
     elif s.alarm[axis, KIND] == 0.0:
         _relearn(s, axis, j)
 
 
 @compiled
 def _relearn(s: ChangeState, axis: int, j: int) -> None:
-    """Restart the reference of a band that changed while it was being learned."""
+    """Restart the reference of an octave that changed during the learning time."""
     s.band[axis, j] = 0.0
     s.band[axis, j, F] = 1.0
     s.spread[axis, j] = 0.0
@@ -395,7 +409,7 @@ def _relearn(s: ChangeState, axis: int, j: int) -> None:
 
 @compiled
 def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis: int, now: int) -> float:
-    """Update the CUSUM of extremes as Bernoulli trials, and return its value.
+    """Update and return the CUSUM of extreme values, which are treated as Bernoulli trials.
 
     The CUSUM tests whether the share of extreme values is ten times the share at rest, and at least 1 %.
     """
@@ -419,24 +433,16 @@ def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis
 
 
 @compiled
-def _suspect_burst(s: ChangeState, axis: int, now: int) -> None:
-    """Raise an alarm for too many extremes, if the reference is long enough."""
-    if s.burst[axis, 1] - s.born[axis] >= s.levels[LEARN_TIME]:
-        _alarm(s, axis, BURST, 0, s.burst[axis, 1], s.burst[axis, 0], now)
+def _alarm(s: ChangeState, axis: int, kind: float, since: float, evidence: float, now: int) -> None:
+    """Record an alarm of an axis that has none.
 
-
-@compiled
-def _alarm(s: ChangeState, axis: int, kind: float, j: int, since: float, evidence: float, now: int) -> None:
-    """Record the first alarm of an axis.
-
-    The decision waits for as long again as the alarm took to be raised, within limits.
+    The waiting time before the decision is the time from the onset to the alarm, within limits.
     """
     alarm = s.alarm[axis]
     if alarm[KIND] != 0.0 and not (alarm[FOUND] == now and evidence > alarm[EVIDENCE]):
         return
     wait = np.ceil(min(max(now - since, s.levels[DWELL]), s.levels[LONGEST_DWELL]) / TICK_SAMPLES) * TICK_SAMPLES
-    alarm[KIND], alarm[WHERE], alarm[START], alarm[FOUND] = kind, j, since, now
-    alarm[EVIDENCE], alarm[DUE] = evidence, now + wait
+    alarm[KIND], alarm[START], alarm[FOUND], alarm[EVIDENCE], alarm[DUE] = kind, since, now, evidence, now + wait
     s.step[axis, 0] = -1.0
     set_due(s)
 
@@ -452,9 +458,9 @@ def set_due(s: ChangeState) -> None:
 
 @compiled
 def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: int) -> None:
-    """Test whether the newest pair of blocks shows a step from the one before the last.
+    """Test for a step between the newest pair of blocks and the next but one older pair.
 
-    Both pairs must be at rest, and no slope may explain the difference.
+    The two pairs must be at rest, and a linear slope must not explain the difference.
     """
     ring = s.ring[axis, j]
     height = mean - ring[0, 0]
@@ -473,10 +479,10 @@ def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: in
     for above in range(j + 1, j + 4):
         if s.band[axis, above, N] < MIN_BAND_TERMS:
             return
-        # variation of means four blocks apart by random walk and flicker: 10/3 of 5.33, and less
+        # Random walk and flicker also change the means of blocks that are four blocks apart.
         v = max(v, 2.0 * s.band[axis, above, S] / s.band[axis, above, N])
     sigma = np.abs(height) / np.sqrt(v * band[F])
-    straight = height - 2.0 * (d + ring[0, 1])  # without the part explained by the slopes on both sides
+    straight = height - 2.0 * (d + ring[0, 1])  # without the part that the slopes on both sides explain
     share = (ring[1, 0] - ring[0, 0]) / height  # share of the middle pair that lies after the step
     if sigma <= s.levels[STEP_SIGMA] or straight * height < 0.5 * square or not -0.3 < share < 1.3:
         return
@@ -488,7 +494,7 @@ def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: in
 
 @compiled
 def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
-    """Confirm a step that stays at its height for ``CONFIRM_PAIRS`` pairs, and discard it otherwise."""
+    """Confirm a step if the mean stays at the new level for ``CONFIRM_PAIRS`` pairs, and discard the step otherwise."""
     step = s.step[axis]
     if np.abs(mean - step[AFTER]) > 0.5 * np.abs(step[AFTER] - step[BEFORE]):
         step[0] = -1.0
@@ -496,8 +502,8 @@ def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
     step[LEFT] -= 1.0
     if step[LEFT] == 0.0 and s.alarm[axis, KIND] == 0.0:
         alarm = s.alarm[axis]
-        alarm[KIND], alarm[WHERE], alarm[START] = STEP, step[0], step[PLACE]
-        alarm[FOUND], alarm[EVIDENCE], alarm[DUE] = now, 0.5 * step[SIGMA] ** 2, now
+        alarm[KIND], alarm[START], alarm[FOUND] = STEP, step[PLACE], now
+        alarm[EVIDENCE], alarm[DUE] = 0.5 * step[SIGMA] ** 2, now
         set_due(s)
 
 
@@ -505,7 +511,8 @@ def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
 def _remember(s: ChangeState, tick: int) -> None:
     """Store a snapshot of ``cum``.
 
-    Odd multiples of 2^k ticks go to the slots of level k, so that the spacing of the snapshots grows with their age.
+    A snapshot at an odd multiple of 2^k ticks is stored in level k, so that the spacing of the snapshots grows with
+    age.
     """
     level = 0
     while tick & 1 == 0:

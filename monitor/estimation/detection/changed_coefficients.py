@@ -1,22 +1,22 @@
 """Identification of the coefficients Q, N, B and K that changed, from the variances of octaves before and after.
 
-The change of the Haar variances, δ_j = after − before, is linear in the changes of Q², N², B², K². The columns are the
-sampled Allan variances of the terms (IEEE Std 952 annex C). The variance of δ_j is 2F(after²/n_after +
-before²/n_before).
+The change of the Haar variance of octave j, δ_j = after − before, is linear in the changes of Q², N², B² and K². The
+factors are the sampled Allan variances of the terms (IEEE Std 952 annex C). If the variances are means of n_before and
+n_after terms with spread F, the variance of δ_j is 2F(after²/n_after + before²/n_before).
 
-All 16 subsets of the coefficients are fitted by weighted least squares. Each coefficient must improve χ² by
-``CHI2_PER_LETTER``, so that it is named if it is significant at 3σ beside the others. No coefficient may become
-negative. None may rise while another falls, because two opposite changes at the same time are less likely than a filter
-or a spectral line.
+All 16 subsets of the coefficients are fitted by weighted least squares. Each coefficient of a subset must decrease χ²
+by ``CHI2_PER_LETTER``, which corresponds to a significance of 3σ. No coefficient may become negative. All coefficients
+of a subset must change in the same direction, because two opposite changes at the same time are less likely than a
+filter or a spectral line.
 
-A subset with too large a misfit is rejected. In this case no coefficient explains the change, and the changed frequency
-band is reported. A Haar difference of clusters τ responds most at f = 0.371/τ, and the band extends by half an octave
-on both sides. Real sensors do not follow the standard terms exactly, so a misfit only counts beyond ``SHAPE_TOLERANCE``
-of the variance.
+If the misfit of the best subset is too large, no coefficient explains the change, and the changed frequency band is
+reported. A Haar difference of clusters of length τ is most sensitive at f = 0.371/τ. The band extends by half an octave
+on both sides. Real sensors do not follow the standard terms exactly, so deviations up to ``SHAPE_TOLERANCE`` of the
+variance are tolerated.
 
-Q also represents a vibration near the Nyquist frequency. A line at a third of the sample rate makes A²
-sin⁴(πfτ)/(πfτ)², where sin⁴ is 9/16 at every octave, which is exactly the 1/τ² of Q. No statistic of octaves can
-distinguish them, so the text for Q names both.
+Q also represents a vibration near the Nyquist frequency. A line of amplitude A contributes A² sin⁴(πfτ)/(πfτ)². At a
+third of the sample rate, sin⁴ is 9/16 at every octave, so the contribution is proportional to 1/τ², as for Q. Octaves
+cannot distinguish quantization noise and such a vibration, so the text for a change of Q names both causes.
 """
 
 from dataclasses import dataclass
@@ -33,7 +33,7 @@ CHANGE_SYMBOLS: Final = "QNBK"
 CHI2_PER_LETTER: Final = 9.0
 """Minimum decrease of χ² for each coefficient."""
 SHAPE_TOLERANCE: Final = 0.03
-"""Share of the variance by which octaves may deviate from the shape of the terms."""
+"""Tolerated deviation of an octave from the standard terms, as a share of the variance."""
 MAX_MISFIT_SIGMA: Final = 2.5
 """Largest misfit of a subset, in standard deviations of χ²."""
 MIN_TERMS: Final = 8.0
@@ -44,7 +44,7 @@ PEAK_F_TAU: Final = 0.371
 
 @dataclass(frozen=True, slots=True)
 class HaarVariancesBeforeAfter:
-    """Haar variances of one axis before and after a change, arrays [J]; octave j has clusters of 2^j samples."""
+    """Haar variances of one axis before and after a change. Element j of each array is for clusters of 2^j samples."""
 
     before: Floats  # variance, squared unit of the axis
     n_before: Floats  # number of terms, divided by their spread F
@@ -53,11 +53,14 @@ class HaarVariancesBeforeAfter:
 
     @property
     def usable_octaves(self) -> np.ndarray:
-        """True for octaves with enough terms before and after the change."""
+        """Boolean array, True for octaves with enough terms before and after the change."""
         return (self.n_after >= MIN_TERMS) & (self.n_before >= MIN_TERMS) & (self.before > 0.0)
 
     def evidence(self) -> float:
-        """Return the log likelihood ratio of "each octave changed" over "none changed", minus its mean by chance."""
+        """Return the logarithm of the likelihood ratio of "all octaves changed" and "no octave changed".
+
+        The expectation without a change is subtracted.
+        """
         ok = self.usable_octaves & (self.after > 0.0)
         n0, n1, v0, v1 = self.n_before[ok], self.n_after[ok], self.before[ok], self.after[ok]
         pooled = (n0 * v0 + n1 * v1) / (n0 + n1)
@@ -78,9 +81,9 @@ def identify_noise_change(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> 
     Returns
     -------
     dict of str to tuple of float
-        Value before and after in SI for each letter. Without a letter, ``band`` holds the lowest and highest frequency
-        in Hz, and ``rms`` the Haar deviation before and after at the octave that changed most. Empty if no octave has
-        enough terms.
+        Value before and after in SI for each changed coefficient. If no coefficient explains the change, ``band``
+        contains the lowest and the highest frequency in Hz. ``rms`` then contains the Haar deviation before and after
+        at the octave that changed most. The dictionary is empty if no octave has enough terms.
     """
     ok = octaves.usable_octaves
     if not ok.any():
@@ -93,7 +96,7 @@ def identify_noise_change(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> 
         columns, v0, 2.0 * v0**2 / n0 + (SHAPE_TOLERANCE * v0) ** 2, np.zeros(len(CHANGE_SYMBOLS))
     )
     change, misfit, var = np.zeros(len(CHANGE_SYMBOLS)), np.inf, 2.0 * (v1**2 / n1 + v0**2 / n0)
-    for _ in range(3):  # weights from the model, so that a variance that is small by chance gets no large weight
+    for _ in range(3):  # weights from the model, because a variance that is small by chance must not get a large weight
         change, chosen, misfit = _select_letters(columns, v1 - v0, var + (SHAPE_TOLERANCE * v1) ** 2, floor)
         model = np.maximum(v0 + columns @ change, 0.2 * v1)
         var = 2.0 * (model**2 / n1 + v0**2 / n0)
@@ -107,7 +110,7 @@ def identify_noise_change(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> 
 def _select_letters(
     columns: Floats, values: Floats, var: Floats, floor: Floats
 ) -> tuple[Floats, tuple[int, ...], float]:
-    """Return the coefficients, the indices and the χ² of the subset with the smallest penalized χ²."""
+    """Return the changes, the indices and the χ² of the subset of coefficients with the smallest penalized χ²."""
     weight = 1.0 / np.sqrt(var)
     best, which = np.zeros(len(CHANGE_SYMBOLS)), tuple[int, ...]()
     least = price = float(((values * weight) ** 2).sum())
@@ -118,7 +121,7 @@ def _select_letters(
             scaled, *_ = np.linalg.lstsq(a / scale, values * weight, rcond=1e-9)
             x = scaled / scale
             if (x < -floor[list(chosen)]).any():
-                # a coefficient that would become negative is set to zero, which is allowed if it fits
+                # A coefficient that would become negative is set to zero, and χ² is computed with this value.
                 x = np.maximum(x, -floor[list(chosen)])
             if (x > 0.0).any() and (x < 0.0).any():
                 continue
@@ -133,7 +136,7 @@ def _select_letters(
 def _find_band(tau: Floats, v0: Floats, v1: Floats, sigma: Floats, rate_hz: float) -> dict[str, tuple[float, float]]:
     """Return the band of octaves around the most significant one.
 
-    The band includes neighbours that are significant and change by at least half as much.
+    The band includes neighbouring octaves that changed significantly and by at least half the relative amount.
     """
     relative, strength = v1 / v0 - 1.0, np.abs(v1 - v0) / sigma
     top = int(strength.argmax())

@@ -1,26 +1,26 @@
-"""Detection of spectral lines, resonances and outliers, which no sum of the five Gaussian noise terms explains.
+"""Detection of spectral lines, resonances and outliers, which the five Gaussian noise terms cannot explain.
 
-The input is a recording on a regular grid and its Allan deviation. The results are a ``Line`` for each relevant peak,
-and the share of outliers of each axis. Both use at most ``MAX_STRETCHES`` stretches of ``ROWS`` samples, spread over
-the recording, so that the longest recording takes no more than a second. Stretches with more than
+The input is a recording on a regular grid and the Allan curve of the recording. The results are a ``Line`` for each
+relevant peak, and the share of outliers of each axis. At most ``MAX_STRETCHES`` stretches of ``ROWS`` samples, spread
+over the recording, are searched. The longest recording therefore takes no more than a second. Stretches with more than
 ``MAX_MISSING_SHARE`` missing samples are skipped.
 
-- **Lines.** The periodograms (Hann) of the stretches are averaged (Welch 1967). A peak exceeds the medians of the bins
-  on both sides by ``MIN_PEAK_SIGMA`` and by the factor ``MIN_PEAK_RATIO``. The search uses single bins for lines and
-  bins ``WIDE_BINS`` times wider for resonances. The power of a peak is the part above the level on both sides of the
-  peak. A peak is reported if it adds ``MIN_LINE_SHARE`` or more of the Allan variance at some τ. A line of amplitude A
-  adds A² sin⁴(πfτ) / (m sin(πf/rate))² (the sine of IEEE Std 952, annex C, averaged over m samples instead of
-  continuously). A resonance is treated as a line of the same power.
+- **Lines.** The periodograms of the stretches with a Hann window are averaged (Welch 1967). A peak exceeds the medians
+  of the bins on both sides by ``MIN_PEAK_SIGMA`` and by the factor ``MIN_PEAK_RATIO``. Lines are searched in single
+  bins, and resonances in bins that are ``WIDE_BINS`` times wider. The power of a peak is the power above the level of
+  both sides. A peak is reported if it contributes a share of at least ``MIN_LINE_SHARE`` of the Allan variance at some
+  τ. A line of amplitude A contributes A² sin⁴(πfτ) / (m sin(πf/rate))². This is the formula of IEEE Std 952, annex C,
+  for a mean of m samples instead of an integral. A resonance is treated as a line of the same power.
 - **Outliers** deviate by more than ``OUTLIER_SIGMA`` σ of their stretch from the median of the ``BLOCK`` samples around
   them. They also deviate by half as much from the median of the ``NEIGHBOURS`` samples on each side, which excludes
   slopes and curvature within the block. σ is estimated from the median distance, which changes by an eighth if one
-  sample in ten is an outlier. It is at least one step of the resolution.
+  sample in ten is an outlier. σ is at least one quantization step.
 
-Lines below ``FIRST_BIN`` bins of a stretch and short-lived lines are not detected.
+Lines with fewer than ``FIRST_BIN`` cycles per stretch and lines of short duration are not detected.
 
-``reconcile`` tests lines and outliers with other statistics. It compares hypotheses by their log-likelihood, so it
-needs the gain of a line or of a second Gaussian in a series that is whitened by the current model. Such a gain exists
-neither for an averaged spectrum nor for the distance from a median.
+``reconcile`` tests lines and outliers with other statistics, because it compares hypotheses by log-likelihood. The gain
+in log-likelihood is computed from a series that is whitened by the current model. It cannot be computed from an
+averaged spectrum or from distances from a median.
 """
 
 from collections.abc import Iterator
@@ -47,20 +47,20 @@ MAX_STRETCHES: Final = 128
 MAX_OUTLIER_STRETCHES: Final = 32
 """Maximum number of stretches searched for outliers.
 
-In 131 072 samples, a share of a thousandth is known to a tenth of its value.
+With 131 072 samples, a share of 0.001 is known with a relative error of 10 %.
 """
 MAX_MISSING_SHARE: Final = 0.05
 """Maximum share of missing samples in a stretch."""
 MIN_PEAK_SIGMA: Final = 6.5
 """Minimum height of a peak in σ.
 
-A thousand recordings each of white, flicker, quantized, random-walk, low-passed, coarse and repeated noise show no line
-with this value, with 2048 samples or 20 000.
+With this value, no line was found in a thousand simulated recordings each of white, flicker, quantized, random-walk,
+low-pass filtered, coarse and repeated noise. The recordings had 2048 or 20 000 samples.
 """
 MIN_PEAK_RATIO: Final = 1.6
 """Minimum factor by which a peak exceeds both sides.
 
-Within a side, a slope or the edge of a filter rises by a smaller factor.
+A slope or the edge of a filter rises by a smaller factor within the bins of a side.
 """
 WIDE_BINS: Final = 16
 """Width in bins of the wider bins in which resonances are searched."""
@@ -83,7 +83,8 @@ OUTLIER_SIGMA: Final = 5.0
 BLOCK: Final = 63
 """Number of samples in a block for the median.
 
-It is odd, so that the median is a sample and distances from it are whole steps of the resolution.
+The number is odd, so that the median is one of the samples. Distances from the median are then whole quantization
+steps.
 """
 NEIGHBOURS: Final = 3
 """Number of neighbours on each side. Up to three outliers in a row are detected."""
@@ -94,9 +95,9 @@ class Line:
     """Spectral peak of one axis."""
 
     axis: int  # index into AXES
-    frequency_hz: float  # as sampled, possibly an alias
+    frequency_hz: float  # frequency after sampling, possibly an alias
     amplitude: float  # amplitude of a sine of the same power, rad/s or m/s²
-    share: float  # share of the Allan variance, at the τ where it is largest
+    share: float  # largest share of the Allan variance at any τ
     wide: bool  # True for a resonance, wider than the resolution of the spectrum
 
 
@@ -105,8 +106,8 @@ class _Peak:
     """Peak in the spectrum of one axis."""
 
     middle: float  # centre in bins
-    power: float  # mean square above the level of its sides, squared unit of the axis
-    wide: bool  # True if it is wider than the resolution of the spectrum
+    power: float  # mean square above the level of both sides, squared unit of the axis
+    wide: bool  # True for a peak wider than the resolution of the spectrum
 
 
 def detect_lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve) -> list[Line]:
@@ -121,7 +122,7 @@ def detect_lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve
     rate_hz : float
         Sample rate in Hz.
     curve : AllanCurve
-        Allan curve of the recording, which determines the relevant peaks.
+        Allan curve of the recording, which determines whether a peak is relevant.
     """
     rows = min(ROWS, 1 << (len(values) // MIN_STRETCHES).bit_length() >> 1)
     if rows < MIN_ROWS:
@@ -152,7 +153,7 @@ def outlier_share(values: Floats, moving: Mask) -> Floats:
     Returns
     -------
     ndarray of float64, shape (6,)
-        Share of samples beyond ``OUTLIER_SIGMA`` σ; NaN with too few samples.
+        Share of outliers; NaN if there are too few samples.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[::50, 2] = 30.0
@@ -172,7 +173,7 @@ def outlier_share(values: Floats, moving: Mask) -> Floats:
 
 
 def line_share(line: Line, curve: AllanCurve) -> Floats:
-    """Return the share [m] of the Allan variance of its axis that a line contributes at each τ.
+    """Return the share [m] of the Allan variance that a line contributes at each τ.
 
     Parameters
     ----------
@@ -195,15 +196,20 @@ def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[F
 
 
 def _filled(part: Floats) -> Floats:
-    """Return a stretch without its mean, with 0 for missing samples."""
+    """Return a stretch with the mean subtracted, and with 0 for missing samples."""
     there = np.isfinite(part)
     return np.where(there, part - part[there].mean(), 0.0)
 
 
 def _spectrum(parts: Floats) -> Floats:
-    """Return the mean square per bin [rows / 2] of zero-mean stretches [k, rows]; the sum is the variance."""
+    """Return the mean square per bin [rows / 2] of zero-mean stretches [k, rows].
+
+    The sum over the bins is the variance.
+    """
     window = np.hanning(parts.shape[1])
-    turned = np.fft.rfft(parts * window, axis=1)[:, :-1]  # the bin at half the rate has only one degree of freedom
+    turned = np.fft.rfft(parts * window, axis=1)[
+        :, :-1
+    ]  # without the bin at half the rate, which has only one degree of freedom
     power = (turned.real**2 + turned.imag**2).mean(axis=0)
     return np.asarray(2.0 * power / (parts.shape[1] * (window**2).sum()))
 
@@ -217,7 +223,7 @@ def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
         if power.size < MIN_BINS:
             continue
         runs = _find_runs(_significant_bins(power, parts * width, side))
-        # in the order of height, so that the highest peak takes the bins of its flanks
+        # The highest peak comes first, because the bins of its flanks are not searched again.
         for first, last in sorted(runs, key=lambda run: -power[slice(*run)].max()):
             if first * width < FIRST_BIN or taken[first * width : last * width].any():
                 continue
@@ -228,7 +234,7 @@ def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
             if above.sum() > 0.0:
                 weights = np.maximum(above, 0.0)
                 middle = float((np.arange(begin, end) * weights).sum() / weights.sum())
-                # leakage of a strong line is significant far from it, but not high
+                # The leakage of a strong line is significant in many bins, but low.
                 high = int((above > above.max() / 4.0).sum())
                 wide = width > 1 or high > 2 * NEAR_BINS + 1
                 found.append(_Peak(width * (middle + 0.5) - 0.5, width * float(above.sum()), wide))
@@ -236,15 +242,15 @@ def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
 
 
 def _significant_bins(power: Floats, averaged: int, side: int) -> Mask:
-    """Return the bins above the medians of both sides, by more than chance and by more than a slope."""
+    """Return a mask of the bins that exceed the medians of both sides by ``MIN_PEAK_SIGMA`` and ``MIN_PEAK_RATIO``."""
     bins, reach = power.size, NEAR_BINS + side
-    # the spectrum is mirrored at both ends
+    # The spectrum is mirrored at both ends.
     padded = np.pad(power, reach, mode="reflect")
     around = np.lib.stride_tricks.sliding_window_view(padded, side)
     left, right = (np.median(around[at : at + bins], axis=1) for at in (0, reach + NEAR_BINS + 1))
     level = np.maximum(left, right)
     ratio = power / level
-    chi = 2.0 / (9.0 * 2.0 * averaged)  # Wilson & Hilferty 1931, 2 degrees of freedom per periodogram
+    chi = 2.0 / (9.0 * 2.0 * averaged)  # Wilson & Hilferty (1931) with two degrees of freedom per periodogram
     sigma = (np.cbrt(ratio) - (1.0 - chi)) / np.sqrt(chi)
     return np.asarray((sigma > MIN_PEAK_SIGMA) & (ratio > MIN_PEAK_RATIO) & (level > 0.0))
 
@@ -252,7 +258,7 @@ def _significant_bins(power: Floats, averaged: int, side: int) -> Mask:
 def _find_feet(power: Floats, first: int, last: int, averaged: int) -> tuple[int, int]:
     """Return the first bin of a peak and the bin after the last.
 
-    A peak extends ``NEAR_BINS`` beyond the significant bins, and further while the spectrum decreases.
+    A peak extends ``NEAR_BINS`` beyond the significant bins, and further as long as the spectrum decreases.
     """
     falls, step = 1.0 - FOOT_SIGMA / (NEAR_BINS * averaged) ** 0.5, NEAR_BINS
     first, last = max(first - step, 0), min(last + step, power.size)
@@ -264,20 +270,20 @@ def _find_feet(power: Floats, first: int, last: int, averaged: int) -> tuple[int
 
 
 def _find_runs(marks: Mask) -> list[tuple[int, int]]:
-    """Return the first index of each run of True, and the index after its end."""
+    """Return the first index and the index after the end of each run of True."""
     edges = np.flatnonzero(np.diff(marks.astype(np.int8), prepend=0, append=0)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _make_line(axis: int, peak: _Peak, bin_hz: float, rate_hz: float, curve: AllanCurve) -> Line:
-    """Convert a peak to a line with its share of the Allan curve."""
+    """Convert a peak to a ``Line``, and compute the share of the Allan variance."""
     frequency, amplitude = peak.middle * bin_hz, (2.0 * peak.power) ** 0.5
     shares = _allan_share(axis, frequency / rate_hz, amplitude, curve)
     return Line(axis, frequency, amplitude, float(np.nanmax(shares, initial=0.0)), peak.wide)
 
 
 def _allan_share(axis: int, turns: float, amplitude: float, curve: AllanCurve) -> Floats:
-    """Return the share [m] of a curve that a line of this many cycles per sample contributes."""
+    """Return the share [m] of the Allan variance that a line with ``turns`` cycles per sample contributes."""
     half = np.pi * turns
     made = (amplitude * np.sin(curve.factors * half) ** 2 / np.sin(half)) ** 2 / curve.factors
     return np.asarray(made / (curve.factors * curve.avar[:, axis]))
@@ -300,7 +306,7 @@ def _outlier_share(part: Floats) -> float:
 
 
 def _interpolated_median(away: Floats, step: float) -> float:
-    """Return the median of distances that come in steps, interpolated within a step."""
+    """Return the median of quantized distances, interpolated within a quantization step."""
     middle = float(np.median(away))
     below, upto = (away < middle - step / 4.0).mean(), (away < middle + step / 4.0).mean()
     return middle + step * float((0.5 - below) / max(upto - below, 1.0 / away.size) - 0.5)

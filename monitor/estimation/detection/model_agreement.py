@@ -1,14 +1,15 @@
-"""Decision whether a sensor agrees with its noise model, and events when this decision changes.
+"""Decisions whether the axes of a sensor agree with the noise model, and events when a decision changes.
 
-The window is compared with the model ten times per second, and successive results are nearly the same. A second result
-above the threshold is therefore no independent evidence. Some of many windows also exceed the threshold by chance. A
-model is rejected only if the gap exceeded the stricter limit ``AxisGap.alarm`` in every comparison while an eighth of
-the window was replaced, and at least ``MIN_SAMPLES`` samples. Above twice the threshold, where chance is excluded,
-``MIN_SAMPLES`` samples suffice. A rejected model is accepted again if the gap stays below ``null95`` for as long.
-Between these limits, the decision does not change. In a simulation of 1600 windows of six axes with 128 comparisons
-each, a true model was rejected three times.
+The window is compared with the model ten times per second, and successive results are strongly correlated. Several
+results above the threshold are therefore not independent evidence. In addition, some of many windows exceed the
+threshold by chance. A model is rejected only if every comparison exceeds the stricter limit ``AxisGap.alarm`` until an
+eighth of the window and at least ``MIN_SAMPLES`` samples have been replaced. If the gap is above twice the threshold,
+chance is excluded, and ``MIN_SAMPLES`` new samples are sufficient. A rejected model is accepted again if the gap stays
+below ``null95`` until the same share of the window has been replaced. Between the two limits, the decision does not
+change. In a simulation of 1600 windows of six axes with 128 comparisons each, a true model was rejected three times.
 
-Both changes are reported as a ``model_disagrees`` event. The field ``agrees`` of the event is the new decision.
+A rejection and a renewed acceptance are reported as ``model_disagrees`` events. The field ``agrees`` of the event is
+the new decision.
 """
 
 from collections.abc import Mapping
@@ -19,7 +20,6 @@ from drivers.sample import AXES, Event
 from monitor.estimation.detection.model_gap import MIN_SAMPLES, AxisGap, ModelGap
 
 KIND: Final = "model_disagrees"
-"""Kind of the events."""
 RENEWED_SHARE: Final = 0.125
 """Share of the window that must be replaced while a gap persists."""
 CLEAR_FACTOR: Final = 2.0
@@ -35,14 +35,14 @@ class _Axis:
 
 
 class ModelAgreement:
-    """Decision for each axis of one device whether it agrees with its model."""
+    """Decisions whether the axes of one device agree with the noise model."""
 
     def __init__(self) -> None:
         self._axes = {axis: _Axis() for axis in AXES}
 
     @property
     def decisions(self) -> Mapping[str, bool]:
-        """Current decision for each axis that has one: True if it agrees with its model."""
+        """Current decision for each decided axis, True if the axis agrees with the model."""
         return {axis: one.agrees for axis, one in self._axes.items() if one.agrees is not None}
 
     def update(self, comparison: ModelGap) -> list[Event]:
@@ -71,6 +71,7 @@ class ModelAgreement:
 def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
     """Build the event for a changed decision."""
     lo, hi = gap.tau_s
+    tau = f"{lo:.3g} s" if lo == hi else f"{lo:.3g} to {hi:.3g} s"
     what = {
         "agrees": agrees,
         "gap": gap.gap,
@@ -80,23 +81,11 @@ def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
         "tau_hi": hi,
     }
     if agrees:
-        text = f"{gap.axis} agrees with its model again: {gap.gap:.1f} σ apart at most"
+        text = f"{gap.axis} agrees with its model again: the largest gap is {gap.gap:.1f} σ"
     else:
         text = (
-            f"{gap.axis} disagrees with its model at τ {format_tau_range(gap)}: "
-            f"deviation {gap.ratio:.3g} times the model's, "
-            f"{gap.gap:.3g} σ apart where chance stays below {gap.threshold:.1f}"
+            f"{gap.axis} disagrees with its model at τ {tau}: "
+            f"the deviation is {gap.ratio:.3g} times the deviation of the model, "
+            f"a gap of {gap.gap:.3g} σ with a threshold of {gap.threshold:.1f} σ"
         )
     return Event(KIND, t_ns, text, gap.axis, {"model": what}, since_ns, gap.gap)
-
-
-def format_tau_range(gap: AxisGap) -> str:
-    """Format the range of τ with the largest gap.
-
-    >>> import numpy as np
-    >>> one = np.ones(1)
-    >>> format_tau_range(AxisGap("gz", one, one, one, 9.0, (0.04, 1.28), 0, 2.0, 3.0, 3.5, 1000))
-    '0.04 to 1.28 s'
-    """
-    lo, hi = gap.tau_s
-    return f"{lo:.3g} s" if lo == hi else f"{lo:.3g} to {hi:.3g} s"

@@ -1,25 +1,26 @@
-"""Comparison of the Allan variance of the live window with the Allan variance of the noise model, for each axis.
+"""Comparison of the Allan variance of the live window with the Allan variance of the noise model.
 
-The comparison of an axis gives the difference at each τ in standard deviations, the largest difference (the gap) and
-the limits that a true model exceeds only by chance. ``model_agreement.ModelAgreement`` converts successive comparisons
-into events.
+For each axis, the comparison gives the difference at each τ in standard deviations and the largest difference, called
+the gap. It also gives the limits that the gap of a true model exceeds only by chance.
+``model_agreement.ModelAgreement`` converts successive comparisons into events.
 
 If the model is true, ν σ²(τ)/σ²_model(τ) is approximately χ² with ν degrees of freedom. The cube root of χ² is
 approximately normal (Wilson & Hilferty, PNAS 17, 1931), which gives
 
     z(τ) = ((σ²/σ²_model)^(1/3) − 1 + 2/(9ν)) / √(2/(9ν)).
 
-ν = 2 σ⁴_model/Var is computed from the model and not from the fit. For Q N B K of the model, Var is the exact
-covariance of ``uncertainty``. For other effects (resonance, low-pass, correlated noise), Var is the integral 4/M ∫ (S
-G)² df of M terms with the spectral kernel G of the Allan variance. The integral is accurate if the window is long
-compared with the memory of the noise. τ with fewer than ``MIN_EDF`` degrees of freedom are not compared, because a sum
-of squares then differs too much from χ².
+The degrees of freedom ν = 2 σ⁴_model/Var are computed from the model and not from the fit. Var is the variance of the
+measured Allan variance. For the terms Q N B K, Var is computed exactly in ``uncertainty``. Other effects such as a
+resonance, a low-pass or correlated noise have a power spectral density S. For a mean of M terms, Var is then 4/M ∫ (S
+G)² df with the spectral kernel G of the Allan variance. The integral is accurate if the window is long compared with
+the correlation time of the noise. Averaging times with fewer than ``MIN_EDF`` degrees of freedom are not compared,
+because the distribution then differs too much from χ².
 
-For normal z_i with any correlation, P(all |z_i| < c) ≥ ∏ P(|z_i| < c) (Šidák, J. Am. Stat. Assoc. 62, 1967). The limits
-therefore account for the number of τ and axes. Of 100 independent windows of a true model, at most one exceeds
-``threshold`` on any axis. Overlapping τ are correlated, so the true share is lower. Of 2500 simulated windows of six
-axes and 14 octaves, 0.5 % exceeded it with Q N B K, and 0.9 % with random walk alone. The share is higher with
-telegraph noise and jumps, which are not Gaussian.
+The limits account for the number of τ and axes by the inequality of Šidák (J. Am. Stat. Assoc. 62, 1967), P(all |z_i| <
+c) ≥ ∏ P(|z_i| < c). The inequality holds for normal z_i with any correlation. Of 100 independent windows of a true
+model, at most one exceeds ``threshold`` on any axis. Overlapping τ are correlated, so the true share is lower. Of 2500
+simulated windows of six axes and 14 octaves, 0.5 % exceeded ``threshold`` with Q N B K, and 0.9 % with random walk
+alone. The share is higher for telegraph noise and jumps, which are not Gaussian.
 """
 
 from collections.abc import Mapping
@@ -40,11 +41,11 @@ from monitor.noise.standard_terms import STANDARD_TERMS
 MIN_EDF: Final = 2.0
 """Minimum degrees of freedom of a compared τ."""
 MIN_SAMPLES: Final = 1000
-"""Minimum number of samples of an axis. It determines N to 3 %."""
+"""Minimum number of samples of an axis. With 1000 samples, the error of N is 3 %."""
 FALSE_ALARM: Final = 0.01
 """Share of independent windows of a true model that exceed the threshold on any axis."""
 FALSE_ALARM_WATCHED: Final = 0.001
-"""The same share for ``AxisGap.alarm``."""
+"""Share of independent windows of a true model that exceed ``AxisGap.alarm`` on any axis."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,21 +57,16 @@ class AxisGap:
     model: Floats  # [m] Allan deviation of the model; NaN if unknown
     z: Floats  # [m] standard deviations above the model; NaN if not compared
     gap: float  # largest |z|
-    tau_s: tuple[float, float]  # range of τ around the largest |z| that exceed the threshold on the same side
+    tau_s: tuple[float, float]  # range of τ around the largest |z| that exceeds the threshold on the same side
     row: int  # row of the largest |z|
-    null95: float  # 95 of 100 windows of a true model are below, for this axis alone
-    threshold: float  # 99 of 100 windows are below on all axes
-    alarm: float  # 999 of 1000 windows are below on all axes, for repeated comparisons
+    null95: float  # limit that 95 of 100 windows of a true model do not exceed on this axis
+    threshold: float  # limit that 99 of 100 windows of a true model do not exceed on any axis
+    alarm: float  # limit that 999 of 1000 windows do not exceed on any axis, for repeated comparisons
     samples: int  # samples of this axis in the window
 
     @property
-    def exceeds_threshold(self) -> bool:
-        """True if the gap exceeds the threshold, so that chance does not explain it."""
-        return self.gap > self.threshold
-
-    @property
     def ratio(self) -> float:
-        """Ratio of the measured deviation to that of the model at the largest gap."""
+        """Ratio of the measured deviation to the deviation of the model at the largest gap."""
         return float(self.measured[self.row] / self.model[self.row])
 
 
@@ -89,7 +85,7 @@ class ModelGap:
 
 
 class PreparedModel:
-    """Noise model prepared for comparison with the curves of one window.
+    """Noise model prepared for comparison with the Allan curves of a window.
 
     Parameters
     ----------
@@ -107,7 +103,7 @@ class PreparedModel:
         self._of: tuple[float, tuple[int, ...]] = (0.0, ())  # rate and cluster sizes of the prepared values
 
     def compare(self, estimate: Estimate) -> ModelGap:
-        """Compare all axes that are measured, part of the model, and long enough."""
+        """Compare all axes that are part of the model and have at least ``MIN_SAMPLES`` samples in the window."""
         curve = estimate.curve
         tables = self._prepare(curve.factors, estimate.rate_hz)
         found: dict[str, AxisGap] = {}
@@ -126,7 +122,10 @@ class PreparedModel:
         )
 
     def _prepare(self, factors: Ints, rate_hz: float) -> AxisCovarianceTables:
-        """Compute the expected curves once per rate and list of cluster sizes, and return the covariance tables."""
+        """Return the covariance tables.
+
+        If the rate or the cluster sizes have changed, the expected curves are recomputed.
+        """
         of = (rate_hz, tuple(factors.tolist()))
         if self._of[1] != of[1]:
             self._tables = AxisCovarianceTables(factors, self._length)
@@ -139,7 +138,7 @@ class PreparedModel:
 
 
 def samples_of_axis(curve: AllanCurve, axis: int) -> int:
-    """Return the number of samples of an axis in the window. It is less than ``curve.n`` if the axis was restarted.
+    """Return the number of samples of an axis in the window, which is less than ``curve.n`` for a restarted axis.
 
     Parameters
     ----------
@@ -158,7 +157,7 @@ class _Expected:
 
     avar: Floats  # [m] Allan variance, squared unit of the axis
     shape: Floats  # [4] Q² N² B² K² at τ0 = 1
-    more: Floats  # [m] variance of one term in excess of that of Q N B K, unit⁴
+    more: Floats  # [m] variance of one term beyond the variance from Q N B K, unit⁴
 
     @classmethod
     def of(cls, model: NoiseModel, axis: str, factors: Ints, rate_hz: float) -> "_Expected":
@@ -167,8 +166,8 @@ class _Expected:
         tau_s = factors / rate_hz
         shape, classic = _standard_terms(model, axis, rate_hz)
         more = _excess_variance(spectrum, classic, factors, rate_hz)
-        # a ramp has no variance of its own, but its product with the noise has; the effect is at most that of a
-        # random walk of the same size
+        # A ramp has no variance, but the product of ramp and noise has. The effect is at most the effect of a random
+        # walk of the same size.
         shape[K] += 1.5 * spectrum.slope**2 * float(tau_s.max()) / rate_hz
         return cls(spectrum.avar(tau_s), shape, more)
 
@@ -182,7 +181,7 @@ class _Expected:
 
 
 def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Floats, NoiseModel]:
-    """Return Q² N² B² K² of an axis at τ0 = 1, and the model of these terms alone."""
+    """Return Q², N², B² and K² of an axis at τ0 = 1, and a model with only these terms."""
     letters = ("Q", "N", "B", "K")
     kinds = tuple(STANDARD_TERMS[letter] for letter in letters)
     powers = (2.0, 1.0, 0.0, -1.0)
@@ -195,10 +194,11 @@ def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Float
 
 
 def _excess_variance(spectrum: Spectrum, classic: NoiseModel, factors: Ints, rate_hz: float) -> Floats:
-    """Return 4 ∫ (S² − S_standard²) G² df plus 4 Σ P S G² of the lines, at τ0 = 1; times 1/M it is a variance.
+    """Return the variance of the Allan variance that the standard terms do not explain, times the number of terms.
 
-    d is a second difference with spectrum S G, where G = 2 sin⁴(πνm)/(m sin πν)². Over M terms, Var(mean d²) is 2/M Σ_c
-    r(c)², by Parseval 2/M ∫ (S G)² dν. A line of mean square P adds 4/M P S G² at its frequency.
+    A second difference of noise with the spectral density S has the spectral density S G, where G = 2 sin⁴(πνm)/(m sin
+    πν)². By Parseval's theorem, the result is 4 ∫ (S² − S_standard²) G² dν. A spectral line of mean square P adds 4 P S
+    G² at the frequency of the line. All quantities are at τ0 = 1.
     """
     (axis,) = classic.effects
     f_hz = frequency_grid(MIN_FREQUENCY_CYCLES * rate_hz / float(factors.max()), 1.0 / rate_hz, spectrum.peaks)
@@ -226,7 +226,7 @@ def _kernel(nu: Floats, m: int) -> Floats:
 def _axis_gap(
     axis: str, tau_s: Floats, avar: Floats, expected: Floats, edf: Floats, samples: int, axes: int
 ) -> AxisGap | None:
-    """Compare one axis of a model with ``axes`` axes; return None if no τ can be compared."""
+    """Compare one axis of a model that has ``axes`` axes. Return None if no τ can be compared."""
     expected = np.where(expected > 0.0, expected, np.nan)
     z = normal_score(avar / expected, edf)
     judged = np.isfinite(z)
@@ -250,9 +250,10 @@ def _axis_gap(
 
 
 def normal_score(ratio: Floats, edf: Floats) -> Floats:
-    """Return the distance of χ²/ν from one in standard deviations, by its cube root; NaN below ``MIN_EDF``.
+    """Return the deviation of χ²/ν from 1 in standard deviations, computed from the cube root of the ratio.
 
-    In the example, 129.561 is the 97.5 % point of χ² with 100 degrees of freedom.
+    The result is NaN for fewer than ``MIN_EDF`` degrees of freedom. In the example, 129.561 is the 97.5 % quantile of
+    χ² with 100 degrees of freedom.
 
     Parameters
     ----------

@@ -1,16 +1,16 @@
 """Detection of motion, knocks and handling of the sensor, and removal of these samples from the stream.
 
 The detector replaces samples in motion by NaN, so that all later statistics treat them as missing. It also returns a
-``Motion`` for each episode. No noise level has to be configured. The noise at rest is learned from the samples of each
-axis and updated (method: ``motion_kernel``). An episode is removed from one block before its first moving block to two
-blocks after its last moving block.
+``Motion`` for each episode. The noise at rest is learned from the samples of each axis and updated continuously, so no
+noise level has to be configured. ``motion_kernel`` describes the method. One block before the first moving block of an
+episode and two blocks after the last moving block are removed as well.
 
-Samples are delayed until the next block is decided. The delay is two blocks, which is 0.5 s, or 16 samples for sensors
-sampled below 32 Hz. A constant disturbance that lasts for 60 s counts as rest from then on and is left to the change
-detector. Learning a first reference takes eight blocks. Until then, only signals that no MEMS sensor shows at rest
-count as motion.
+Samples are delayed by two blocks, because the decision for a block needs the following block. Two blocks take 0.5 s, or
+16 samples at sample rates below 32 Hz. After 60 s, a constant disturbance counts as rest and is left to the change
+detector. The first reference is learned in eight blocks. During these blocks, only signals that are too strong for any
+MEMS sensor at rest count as motion.
 
-Rotation at a constant rate below 2 °/s, and motion below the noise, are not detected.
+Rotation at a constant rate below 2 °/s is not detected. Motion below the noise is not detected either.
 """
 
 from collections import deque
@@ -42,7 +42,6 @@ MAX_KNOCK_BLOCKS: Final = 2
 """Largest number of moving blocks of a knock, if the orientation of the sensor did not change."""
 
 Kind = Literal["knock", "motion", "handling/orientation"]
-"""Kinds of motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +51,7 @@ class Motion:
     kind: Kind
     since: int  # index of the first removed sample, including missing samples
     until: int  # index after the last removed sample
-    seconds: float  # duration of the motion, without the blocks removed before and after
+    seconds: float  # duration of the motion, without the additional blocks before and after
     axis: str  # axis with the largest excursion relative to the noise
     peak: float  # excursion from the mean at rest, rad/s or m/s²
     text: str  # description for users
@@ -92,7 +91,7 @@ class MotionDetector:
         return bool(self._state.place[BEGAN] >= 0)
 
     def advance_and_take_decided(self, samples: SampleBlock) -> list[SampleBlock]:
-        """Process a block, and return the samples that have become final, oldest first."""
+        """Process a block, and return the samples for which motion has been decided, oldest first."""
         first = self._index + samples.lost
         self._held.append((first, samples))
         self._index = first + len(samples)
@@ -101,7 +100,7 @@ class MotionDetector:
         return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
     def flush(self) -> list[SampleBlock]:
-        """Return the delayed samples as if the stream ended here. An open episode ends, too."""
+        """Return the delayed samples and end the current episode, because the stream has ended."""
         blocks, moving, episodes = _allocate_output(0, self._size)
         filled = advance(
             _read_only(np.empty((0, len(AXES)))), 0, self._size, True, self._state, blocks, moving, episodes
@@ -114,7 +113,7 @@ class MotionDetector:
         return motions
 
     def _release(self, blocks: Ints, moving: Ints, episodes: Floats) -> list[SampleBlock]:
-        """Store the episodes, and return the samples of the decided blocks."""
+        """Store the finished episodes, and return the samples of the blocks for which motion has been decided."""
         motions = [_make_motion(episode, self._size, self._rate_hz) for episode in episodes]
         self._motions += motions
         self.episodes += len(motions)
@@ -165,7 +164,7 @@ def block_size(rate_hz: float) -> int:
 def _read_only(values: Floats) -> Floats:
     """Return the samples as a contiguous read-only array, like those of a ``SampleBlock``.
 
-    Other layouts and access flags would compile the kernel again.
+    Numba compiles a kernel again for each memory layout and access flag.
     """
     view = np.ascontiguousarray(values, np.float64).view()
     view.flags.writeable = False
@@ -187,7 +186,7 @@ def _remove_moving(samples: SampleBlock, struck: NDArray[np.bool_]) -> SampleBlo
 
 
 def _make_motion(episode: Floats, size: int, rate_hz: float) -> Motion:
-    """Convert an episode of the kernel to a ``Motion``."""
+    """Convert a row of the kernel's output to a ``Motion``."""
     first, last = int(episode[FIRST]), int(episode[LAST])
     axis, peak = AXES[int(episode[AXIS])], float(episode[PEAK])
     moving = last - first + 1

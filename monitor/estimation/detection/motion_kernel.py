@@ -1,17 +1,18 @@
-"""Compiled kernel of the motion detector: blocks of samples, the reference at rest, and the decision for each block.
+"""Compiled kernel of the motion detector, which learns a reference at rest and decides for each block of samples.
 
-Two numbers describe each axis of a block: the logarithm of the variance, and the mean. Both exclude the sample furthest
-from the mean, because an outlier is a single sample and a knock lasts longer. The reference is the median and the
-half-width between the quartiles of both numbers over the last ``REFERENCE_BLOCKS`` blocks at rest. The quartiles are
-exact, because the blocks are inserted into a sorted ring. Up to a quarter of unusual blocks does not affect the
-reference. Drift of the sensor widens the accepted band.
+Each axis of a block is described by the logarithm of the variance and by the mean. The sample furthest from the mean is
+excluded, because an outlier is a single sample and a knock lasts longer. The reference consists of the medians and
+quartiles of the log variance and the mean over the last ``REFERENCE_BLOCKS`` blocks at rest. The quartiles are exact,
+because the blocks are inserted into a sorted array. Up to a quarter of unusual blocks does not affect the reference. A
+drift of the sensor widens the accepted range.
 
-A block is moving if the variance of any axis is too large or the mean is off. If all axes are still at a new mean, the
-sensor has a new orientation, and the reference is shifted. A disturbance that remains constant replaces the reference.
-Blocks far quieter than the reference replace it as well, because the reference was then learned in motion.
+A block is moving if the variance of any axis is too large or the mean of any axis is too far from the reference. If all
+axes are still at a new mean, the sensor has a new orientation, and the reference is shifted. A constant disturbance
+becomes the new reference after some time. Blocks with a far smaller variance than the reference become the new
+reference as well, because the old reference was learned in motion.
 
-Samples must be passed in order. Their index alone determines the block of a row, so the decisions do not depend on how
-the stream is divided.
+Samples must be passed in order. The index of a sample determines the block, so the decisions do not depend on the
+division of the stream into calls.
 """
 
 from math import exp, inf, log, nan, sqrt
@@ -28,18 +29,18 @@ GYROS: Final = 3
 REFERENCE_BLOCKS: Final = 240
 """Number of blocks in the reference.
 
-It is 60 s of blocks of 0.25 s. A disturbance becomes rest after as many blocks.
+240 blocks of 0.25 s take 60 s. A constant disturbance counts as rest after this number of blocks.
 """
 MIN_REFERENCE_BLOCKS: Final = 8
-"""Minimum number of blocks at rest for a first reference. The accepted bands are then twice as wide as later."""
+"""Minimum number of blocks at rest for a first reference. The accepted ranges are then twice as wide as later."""
 BAND: Final = 8.0
 """Largest deviation of the mean or the log variance of a block at rest, in standard deviations (from quartiles)."""
 LOUDER: Final = log(4.0)
 """Minimum rise of the log variance for motion. Smaller changes are left to the change detector."""
 LOUDEST: Final = log(100.0)
-"""Rise of the log variance that always counts as motion, even if the reference contains motion and scatters more."""
+"""Rise of the log variance that always counts as motion, even if the reference contains motion."""
 TOGETHER: Final = log(2.5)
-"""Minimum mean rise of the log variance over all axes, for motion that no single axis shows."""
+"""Minimum mean rise of the log variance over all axes, for motion that is too weak on each single axis."""
 TOGGLE: Final = 0.25
 """Variance of toggling between two neighbouring levels, in squared steps."""
 DRIFT: Final = 100.0
@@ -52,42 +53,43 @@ If most axes are this quiet for ``MIN_REFERENCE_BLOCKS`` blocks, the reference w
 NEVER_AT_REST: Final = (0.1,) * 3 + (1.0,) * 3
 """Limits in rad/s and m/s² that no MEMS sensor exceeds at rest.
 
-They apply to the rms within a block and to the change between blocks, and only until there is a reference.
+The limits apply to the rms within a block and to the change between blocks while there is no reference.
 """
 SETTLED: Final = 4
 """Number of blocks without change after which another mean is a new orientation."""
 NEW_BIAS: Final = 0.035
 """Deviation of the mean of a gyroscope that is accepted after handling: 0.035 rad/s, 2 °/s.
 
-This limit allows for g-sensitivity and bias steps. A larger deviation counts as rotation, except after ``SPUN`` blocks.
+The limit is larger than g-sensitivity and bias steps. A larger deviation counts as rotation until ``SPUN`` blocks have
+passed.
 """
 SPUN: Final = 40
 """Number of blocks (10 s) after which a larger mean without other signs of motion is accepted.
 
-The reference was then learned in rotation.
+In this case, the reference was learned during rotation.
 """
 REMOVED_AFTER: Final = 2
-"""Number of blocks removed after a moving block. The block before a moving block is removed as well."""
+"""Number of blocks that are removed after a moving block. The block before a moving block is removed as well."""
 EPISODE_GAP_BLOCKS: Final = 4
 """Number of blocks at rest that end an episode."""
 LOOK_EVERY: Final = 20
-"""Number of blocks between two tests whether an episode has become steady."""
+"""Number of blocks between two tests for a constant disturbance."""
 WANDER: Final = 4.0
 """Largest ratio of the scatter of means at rest to the scatter expected from the noise within blocks."""
 MIN_VARIANCE: Final = 1e-30
 """Variance assigned to a constant."""
 MIN_BLOCK_SAMPLES: Final = 4
-"""Minimum number of samples in a block for a decision. At least half of the block must be present as well."""
+"""Minimum number of samples in a block for a decision. At least half of the samples must be present as well."""
 
 OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED = range(10)
-"""Elements of ``State.place``:
+"""Elements of ``MotionState.place``:
 
 - ``OPEN``: block being filled.
 - ``HELD``, ``HELD_MOVES``: block whose decision is pending (-1 means none), and this decision.
-- ``QUIET_RUN``: quiet blocks since the last moving one.
+- ``QUIET_RUN``: number of blocks at rest since the last moving block.
 - ``BEGAN``, ``LATEST``: first (-1 means none) and latest moving block of the open episode.
-- ``STILL``: blocks that were still.
-- ``QUIET``: blocks quieter than the reference.
+- ``STILL``: number of successive still blocks.
+- ``QUIET``: number of successive blocks with a far smaller variance than the reference.
 - ``RECENT``: total number of blocks.
 - ``TURNED``: whether the orientation changed in the episode.
 """
@@ -96,7 +98,7 @@ FIRST, LAST, CHANGED, AXIS, PEAK = range(5)
 LOG_VARIANCE, MEAN = 0, 1
 """Kinds of block statistics, the first index of the rings."""
 COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
-"""Columns of ``State.open``:
+"""Columns of ``MotionState.open``:
 
 - ``COUNT``: number of samples.
 - ``SHIFT``: first sample.
@@ -113,10 +115,10 @@ class MotionState(NamedTuple):
     place: Ints  # [10] counters and flags, see OPEN
     open: Floats  # [6, 8] block being filled, see COUNT
     seen: Ints  # [6] total number of blocks at rest that were learned
-    shifted: Floats  # [6] sum of the shifts of the means by new orientations that are still in the ring
-    ring: Floats  # [2, 6, LEARNED] log variance and mean of blocks at rest, in order of time
-    ordered: Floats  # [2, 6, LEARNED] the same, sorted
-    recent: Floats  # [2, 6, LEARNED] log variance and mean of all recent blocks
+    shifted: Floats  # [6] sum of the shifts of the means by new orientations, while earlier blocks are in the ring
+    ring: Floats  # [2, 6, REFERENCE_BLOCKS] log variance and mean of blocks at rest, in order of time
+    ordered: Floats  # [2, 6, REFERENCE_BLOCKS] the same values, sorted
+    recent: Floats  # [2, 6, REFERENCE_BLOCKS] log variance and mean of all recent blocks
     peaks: Floats  # [2, 6] largest excursion of the open episode, in SI and relative to the noise
 
 
@@ -137,7 +139,7 @@ def make_state() -> MotionState:
 def advance(
     values: Floats, first: int, size: int, ends: bool, s: MotionState, blocks: Ints, moving: Ints, episodes: Floats
 ) -> Ints:
-    """Process consecutive rows, and return the decisions and episodes that have become final.
+    """Process consecutive rows, and write the new decisions and the finished episodes to the output arrays.
 
     Parameters
     ----------
@@ -148,9 +150,9 @@ def advance(
     size : int
         Number of samples in a block.
     ends : bool
-        True if the stream ends after these rows. The open block is then decided, the pending decision is returned, and
-        an open episode ends.
-    s : State
+        True if the stream ends after these rows. The decision for the last, incomplete block is then made at once, and
+        the current episode ends.
+    s : MotionState
         State, updated in place.
     blocks, moving : ndarray of int64, shape (at least n/size + 2,)
         Result: number of each block, and 1 if it moves.
@@ -196,7 +198,7 @@ def advance(
 
 @compiled
 def _close(size: int, s: MotionState, blocks: Ints, moving: Ints, episodes: Floats, filled: Ints) -> None:
-    """Complete the open block: measure, decide, learn, and release the previous block."""
+    """Complete the current block, decide whether it moves, update the reference, and output the previous block."""
     number = s.place[OPEN]
     follows = s.place[HELD] == number - 1
     now = np.empty((2, AXES))
@@ -220,7 +222,7 @@ def _close(size: int, s: MotionState, blocks: Ints, moving: Ints, episodes: Floa
 
 @compiled
 def _measure(a: int, s: MotionState, now: Floats) -> None:
-    """Compute log variance and mean of one axis of the block without the sample furthest from the mean."""
+    """Compute the log variance and the mean of one axis of the block without the sample furthest from the mean."""
     n = s.open[a, COUNT]
     mean = s.open[a, SUM] / n
     square = s.open[a, SQUARES] - n * mean * mean
@@ -285,14 +287,14 @@ def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
 
 @compiled
 def _band(a: int, n: int, size: int, s: MotionState) -> float:
-    """Return the distance of the mean of a block from the median of the means that is still rest."""
+    """Return the largest distance of a mean at rest from the median of the reference."""
     explained = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) / sqrt(size)
     return BAND * min(max(_scatter(s.ordered[MEAN, a], n), explained), DRIFT / BAND * explained)
 
 
 @compiled
 def _take_over(now: Floats, s: MotionState) -> None:
-    """Shift the reference to the current means of all axes; their scatter is kept."""
+    """Shift the means of the reference to the current means of all axes, without a change of the scatter."""
     for a in range(AXES):
         n = min(s.seen[a], REFERENCE_BLOCKS)
         if now[MEAN, a] == now[MEAN, a] and n > 0:
@@ -309,7 +311,7 @@ def _take_over(now: Floats, s: MotionState) -> None:
 
 @compiled
 def _learn(now: Floats, moves: bool, number: int, size: int, s: MotionState) -> None:
-    """Add a block at rest to the reference, or replace a reference that has proved wrong."""
+    """Add a block at rest to the reference, or replace the reference by recent blocks."""
     newest = s.place[RECENT] % REFERENCE_BLOCKS
     s.place[RECENT] += 1
     quieter = measured = 0
@@ -339,7 +341,7 @@ def _learn(now: Floats, moves: bool, number: int, size: int, s: MotionState) -> 
 
 @compiled
 def _insert(a: int, log_variance: float, mean: float, s: MotionState) -> None:
-    """Add one value to both rings of an axis, and remove the oldest."""
+    """Add the values of one block to the reference of an axis, and remove the oldest block."""
     at, n = s.seen[a] % REFERENCE_BLOCKS, min(s.seen[a], REFERENCE_BLOCKS)
     for kind in range(2):
         value, ordered = log_variance if kind == LOG_VARIANCE else mean, s.ordered[kind, a]
@@ -361,7 +363,7 @@ def _insert(a: int, log_variance: float, mean: float, s: MotionState) -> None:
 
 @compiled
 def _rank(ordered: Floats, n: int, value: float) -> int:
-    """Return the position of a value in a sorted ring."""
+    """Return the position of a value in a sorted array."""
     low, high = 0, n - 1
     while low < high:
         middle = (low + high) // 2
@@ -389,9 +391,9 @@ def _begin_anew(blocks: int, s: MotionState) -> None:
 
 @compiled
 def _steady(size: int, s: MotionState) -> bool:
-    """Return True if the last ``REFERENCE_BLOCKS`` blocks are one steady state.
+    """Return True if the last ``REFERENCE_BLOCKS`` blocks show a constant disturbance.
 
-    Both halves must agree, without bursts and without a mean that wanders.
+    The first and the second half of these blocks must agree. Bursts and a wandering mean are not allowed.
     """
     half, ordered = REFERENCE_BLOCKS // 2, np.empty(REFERENCE_BLOCKS)
     for a in range(AXES):
@@ -421,7 +423,10 @@ def _steady(size: int, s: MotionState) -> bool:
 
 @compiled
 def _sort_recent(s: MotionState, kind: int, a: int, begin: int, end: int, ordered: Floats) -> int:
-    """Sort the values that are not NaN of the recent blocks begin ≤ k < end, oldest first; return their number."""
+    """Write the sorted values of the recent blocks begin ≤ k < end, counted from the oldest, without NaN.
+
+    Return how many.
+    """
     n = 0
     for k in range(begin, end):
         value = s.recent[kind, a, (s.place[RECENT] + k) % REFERENCE_BLOCKS]
@@ -437,13 +442,13 @@ def _sort_recent(s: MotionState, kind: int, a: int, begin: int, end: int, ordere
 
 @compiled
 def _median(ordered: Floats, n: int) -> float:
-    """Return the median of the first n of a sorted array; NaN if there are none."""
+    """Return the median of the first n values of a sorted array; NaN if n is 0."""
     return 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]) if n > 0 else nan
 
 
 @compiled
 def _interpolate(ordered: Floats, n: int, p: float) -> float:
-    """Return the quantile of the first n ≥ 1 of a sorted array, interpolated linearly between ranks."""
+    """Return the quantile p of the first n ≥ 1 values of a sorted array, interpolated linearly between ranks."""
     rank = (n - 1) * p
     lower = int(rank)
     share = rank - lower
@@ -452,13 +457,13 @@ def _interpolate(ordered: Floats, n: int, p: float) -> float:
 
 @compiled
 def _quantile(ordered: Floats, n: int, p: float) -> float:
-    """Return the quantile of the first n of a sorted ring by the nearest rank."""
+    """Return the quantile p of the first n values of a sorted array, without interpolation."""
     return float(ordered[int(p * (n - 1) + 0.5)])
 
 
 @compiled
 def _scatter(ordered: Floats, n: int) -> float:
-    """Return the standard deviation estimated from the wider half between the quartiles."""
+    """Return the standard deviation, estimated from the larger distance of the two quartiles from the median."""
     low, middle, high = _quantile(ordered, n, 0.25), _quantile(ordered, n, 0.5), _quantile(ordered, n, 0.75)
     return max(high - middle, middle - low) / NORMAL_QUARTILE
 
@@ -468,7 +473,7 @@ def _scatter(ordered: Floats, n: int) -> float:
 
 @compiled
 def _remember(now: Floats, number: int, s: MotionState) -> None:
-    """Start or continue an episode with a moving block, and update its peaks."""
+    """Add a moving block to the current episode or to a new one, and update the peaks of the episode."""
     if s.place[BEGAN] < 0:
         s.place[BEGAN], s.place[TURNED] = number, 0
         for a in range(AXES):
@@ -497,7 +502,7 @@ def _emit(s: MotionState, blocks: Ints, moving: Ints, filled: Ints) -> None:
 
 @compiled
 def _end(s: MotionState, episodes: Floats, filled: Ints) -> None:
-    """Write the open episode to the output and close it."""
+    """Write the current episode to the output and end it."""
     axis = 0
     for a in range(1, AXES):
         if s.peaks[1, a] > s.peaks[1, axis]:

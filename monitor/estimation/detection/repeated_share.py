@@ -1,13 +1,12 @@
 """Share of rows in a recording that repeat the previous row because the sensor had no new measurement.
 
 With a coarse resolution, values also repeat by chance, but then the axes repeat independently of each other. A repeated
-measurement repeats all axes at once. The noise may change during a recording, so the share is computed in up to
-``MAX_STRETCHES`` stretches of ``ROWS`` rows, spread over the recording, and the median is returned. With fewer than two
-axes of data, the share is 0.
+measurement repeats all axes at the same time. The noise may change during a recording. The result is therefore the
+median of the shares in up to ``MAX_STRETCHES`` stretches of ``ROWS`` rows, spread over the recording. With fewer than
+two measured axes, the share is 0.
 
-``reconcile`` tests the repeats of a single axis instead (``value_statistics.detect_repeats``). It adds effects to one
-axis at a time and needs the log-likelihood gain of the repeats and their positions, which a share of all axes does not
-give.
+``reconcile`` tests each axis separately (``value_statistics.detect_repeats``), because it needs the positions of the
+repeats and the gain in log-likelihood for a single axis.
 """
 
 from typing import Final
@@ -19,20 +18,18 @@ from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 
 ROWS: Final = 1000
-"""Number of rows in a stretch, within which the noise is assumed constant."""
+"""Number of rows in a stretch. The noise is assumed to be constant within a stretch."""
 MAX_STRETCHES: Final = 500
-"""Maximum number of stretches."""
 BISECTIONS: Final = 40
-"""Number of bisection steps."""
 
 
 def estimate_repeated_share(values: Floats) -> float:
-    """Return the share of rows [n, 6] that repeat the previous one because the sensor had no new measurement.
+    """Return the share of rows [n, 6] that repeat the previous row because the sensor had no new measurement.
 
-    Let s be the share of repeated rows, and q_a the share of the other rows in which axis a repeats because of its
-    resolution. Axis a then repeats in a share s + (1 - s) q_a of the rows. All axes repeat at once in a share
-    s + (1 - s) Π q_a, because the noises of the axes are independent. The function solves these equations for s. NaN
-    means missing.
+    Let s be the share of repeated rows, and q_a the share of the other rows in which the value of axis a repeats by
+    chance. The share of rows in which axis a repeats is then s + (1 - s) q_a. The noise of different axes is
+    independent, so the share of rows in which all axes repeat is s + (1 - s) Π q_a. The function solves these equations
+    for s. NaN means missing.
 
     >>> noise = np.random.default_rng(0).normal(size=(5000, 6)).round()
     >>> estimate_repeated_share(noise), round(estimate_repeated_share(noise.repeat(2, axis=0)), 1)
@@ -53,7 +50,7 @@ def estimate_repeated_share(values: Floats) -> float:
 
 @compiled
 def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, pairs: Ints, repeats: Ints, whole: Ints) -> None:
-    """Count the complete pairs of rows of each stretch, the pairs in which each axis repeats, and in which all do."""
+    """Count the complete pairs of rows in each stretch, the repeats of each axis, and the repeats of all axes."""
     for stretch in range(begins.size):
         begin = begins[stretch]
         for i in range(begin + 1, min(begin + ROWS, len(values))):
@@ -75,9 +72,13 @@ def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, pairs: Ints, 
 
 
 def _solve_share(each: Floats, all_of_them: Floats) -> Floats:
-    """Solve all_of_them = s + (1 - s) Π (each - s)/(1 - s) for the shares s [k] by bisection; ``each`` is [k, axes]."""
+    """Return the shares s [k] that solve all_of_them = s + (1 - s) Π (each - s)/(1 - s), by bisection.
+
+    ``each`` [k, axes] contains the shares of rows in which each axis repeats, and ``all_of_them`` [k] the shares in
+    which all axes repeat.
+    """
     explained = each.prod(axis=1)
-    # no repeated rows within the counting error; a constant axis, each = 1, does not affect the test
+    # The repeats are explained by chance. A constant axis, each = 1, does not affect this test.
     none = all_of_them <= explained + 3.0 * np.sqrt(explained / ROWS)
     each, all_of_them = each[~none], all_of_them[~none]
     low, high = np.zeros(len(each)), np.minimum(each.min(axis=1), all_of_them)

@@ -1,12 +1,12 @@
 """Detection of quantization steps that are as large as the noise and therefore distort the measured noise.
 
 For each axis, the quantization step and the noise from sample to sample are estimated from at most ``MAX_STRETCHES``
-stretches of ``ROWS`` samples, spread over the recording. The step is the smallest distance of two different values. The
-noise is computed from the mean absolute difference of successive samples. Coarse steps do not change this mean, and a
-few outliers or a slow drift have little effect on it.
+stretches of ``ROWS`` samples, spread over the recording. The step is the smallest distance between two different
+values. The noise is computed from the mean absolute difference of successive samples. This mean does not depend on the
+step size, and a few outliers or a slow drift hardly affect it.
 
-``reconcile`` also detects steps far finer than the noise (``value_statistics.detect_quantization``). This takes a
-search for the common divisor of all differences, and a comparison with the resolution of the number format.
+``reconcile`` also detects steps that are far smaller than the noise (``value_statistics.detect_quantization``). It
+searches for the common divisor of all differences and compares the divisor with the resolution of the number format.
 """
 
 from dataclasses import dataclass
@@ -21,14 +21,13 @@ MIN_STEP_TO_NOISE: Final = 0.5
 ROWS: Final = 4096
 """Maximum number of samples in a stretch."""
 MAX_STRETCHES: Final = 16
-"""Maximum number of stretches."""
 GRID_TOLERANCE: Final = 0.1
 """Deviation from a whole number of steps, as a share of the step, within which a value is on the grid.
 
 Values rounded to float32 are on the grid.
 """
 SIGMA_PER_MEAN_DISTANCE: Final = 0.8862269254527580
-"""√π/2, the ratio of σ to the mean distance of two samples of Gaussian noise."""
+"""√π/2, the ratio of σ to the mean distance between two samples of Gaussian noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +40,7 @@ class QuantizationStep:
 
 
 def find_coarse_axes(values: Floats) -> list[QuantizationStep]:
-    """Return the axes whose values [n, 6] have steps of at least ``MIN_STEP_TO_NOISE`` of their noise.
+    """Return the axes of samples [n, 6] whose quantization step is at least ``MIN_STEP_TO_NOISE`` times the noise.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[:, 4] = noise[:, 4].round()
@@ -65,7 +64,7 @@ def find_coarse_axes(values: Floats) -> list[QuantizationStep]:
 
 
 def _step(levels: Floats, least: float) -> float | None:
-    """Return the step of the grid on which all values lie, or None without a grid of steps of at least ``least``."""
+    """Return the step of the regular grid that contains all values, or None if the step would be below ``least``."""
     apart = np.diff(levels)
     if not apart.size or not apart.min() >= least:
         return None

@@ -1,8 +1,8 @@
-"""Motion and change detection on the samples of one device, before they reach the estimator.
+"""Motion and change detection on the samples of one device, before the estimator receives the samples.
 
 The monitor receives blocks in order and returns the blocks for the estimator. If requested, it replaces samples in
-motion by missing samples. Each finding is an event with the times of the samples. A noise change also requests a
-restart of the estimate of one axis. The change detector never receives samples in motion.
+motion by missing samples. Motion and changes are reported as events with the times of the samples. A noise change also
+requests a restart of the estimate of one axis. The change detector never receives samples in motion.
 """
 
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from monitor.estimation.detection.change_detection import Change, ChangeDetector
 from monitor.estimation.detection.motion_detection import Motion, MotionDetector
 
 MAX_RATE_CHANGE: Final = 0.02
-"""Relative change of the sample rate up to which the detectors continue with the same block length."""
+"""Largest relative change of the sample rate for which the detectors continue with the same block length."""
 MAX_SKIPPED_SAMPLES: Final = 10_000_000
 """Largest gap that the change detector processes as missing samples, which takes 1.6 s.
 
@@ -37,7 +37,7 @@ class SignalMonitor:
     rate_hz : float
         Sample rate in Hz.
     remove_motion : bool
-        True to return samples in motion as missing. False to return all samples at once and unchanged.
+        True to replace samples in motion by missing samples. False to return all samples unchanged and without delay.
     alarms_per_day : float
         Accepted false alarms of the change detector per day. 0 disables the change detection.
     keep_samples_at_rest : bool
@@ -79,7 +79,7 @@ class SignalMonitor:
     def set_rate(self, rate_hz: float) -> None:
         """Set a more accurate sample rate.
 
-        If it differs by more than ``MAX_RATE_CHANGE``, the detectors start again.
+        If the rate differs by more than ``MAX_RATE_CHANGE``, the detectors start again.
         """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
             self._pending = self.flush()
@@ -107,12 +107,15 @@ class SignalMonitor:
         return events
 
     def take_restarts(self) -> list[RestartRequest]:
-        """Return the requests to restart an axis since the last call."""
+        """Return the restart requests that were made since the last call."""
         restarts, self._restarts = self._restarts, []
         return restarts
 
     def take_samples_at_rest(self) -> list[SampleBlock]:
-        """Return the decided samples since the last call, with those in motion removed; they are 0.5 s late."""
+        """Return the samples since the last call with a delay of 0.5 s.
+
+        Samples in motion are replaced by missing samples.
+        """
         still, self._still = self._still, []
         return still
 
@@ -120,12 +123,8 @@ class SignalMonitor:
         """Start new detectors at the current rate."""
         self._began = self._received
         self._rest = MotionDetector(self._rate_hz)
-        self._first = 0  # index since then of the first sample that the change detector received
-        self._changes = self._detector() if self._alarms_per_day > 0.0 else None
-
-    def _detector(self) -> ChangeDetector:
-        """Return a new change detector."""
-        return ChangeDetector(self._rate_hz, self._alarms_per_day)
+        self._first = 0  # index of the first sample that the change detector received, counted from ``_began``
+        self._changes = ChangeDetector(self._rate_hz, self._alarms_per_day) if self._alarms_per_day > 0.0 else None
 
     def _with_pending(self, still: list[SampleBlock]) -> list[SampleBlock]:
         """Return the pending blocks of the previous rate, followed by the given blocks."""
@@ -144,7 +143,8 @@ class SignalMonitor:
         for samples in still:
             if samples.lost > MAX_SKIPPED_SAMPLES:
                 self._report_changes(self._changes)
-                self._changes, self._first = self._detector(), self._first + self._changes.samples + samples.lost
+                self._first += self._changes.samples + samples.lost
+                self._changes = ChangeDetector(self._rate_hz, self._alarms_per_day)
             elif samples.lost:
                 self._changes.skip(samples.lost)
             self._changes.update(samples.values)
@@ -170,5 +170,8 @@ class SignalMonitor:
         return Event(change.kind, found_ns, change.text, AXES[change.axis], what, since_ns, change.sigma)
 
     def _t_ns(self, index: int) -> int:
-        """Return the time of a sample from its index since the last start, at most the time of the newest sample."""
+        """Return the time of a sample, given its index since the last start.
+
+        The time is at most that of the newest sample.
+        """
         return self._newest_ns - round(max(self._received - self._began - 1 - index, 0) / self._rate_hz * 1e9)

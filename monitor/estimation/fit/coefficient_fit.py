@@ -1,28 +1,30 @@
 """Weighted non-negative least-squares fit of the coefficients Q N B K R to an Allan curve of several axes.
 
-The Allan variance is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares. The weights
-are the inverse covariance of the τ under the fitted model, or the inverse variances alone if the fit must be fast. The
-weights are recomputed a few times. The errors of the coefficients are then within a few percent of the Cramér–Rao
-limit.
+The Allan variance is linear in θ = (Q², N², B², K², R²). Each axis is fitted by non-negative least squares. The weight
+matrix is the inverse covariance of the Allan variances at all τ under the fitted model. A fast fit uses only the
+variances. The weights are recomputed a few times. The errors of the coefficients are then within a few percent of the
+Cramér–Rao limit.
 
-The unconstrained solution û determines the status of each coefficient. Its variance is v(t) = c0 + c1 t + c2 t² if the
-true θ_a is t, from the covariances of ``uncertainty``. A term is included if û_a/√c0, computed with the variance for an
-absent term, exceeds a threshold. The interval of the term is the set of t that û does not contradict. A term that is
-not included has a one-sided bound, which is never tighter than the bound from an estimate of zero.
+The status of each coefficient is determined from the solution û without the constraint θ ≥ 0. If the true squared
+coefficient is t, the variance of û is a polynomial v(t) = c0 + c1 t + c2 t², which follows from the covariances of
+``uncertainty``. A term is included if û exceeds a multiple of √c0, the standard deviation for an absent term. The
+confidence interval of the term contains all t for which û is a plausible estimate. A term that is not included has a
+one-sided bound, which is never tighter than the bound from an estimate of zero.
 
-The Allan variance alone cannot distinguish a ramp from a random walk. If the slope s of the window is known, the fit
-uses the Allan variance of the samples without this slope, so that K is unbiased with and without a ramp. R is included
-if s is larger than expected from the noise with K at the upper end of the interval of K. Otherwise K or R may cause the
-slope, and both are bounded. If the slope is unknown, R is only bounded, and a ramp is estimated as K.
+The Allan variance alone cannot distinguish a ramp from a random walk. If the slope of the rate in the window is known,
+the fit uses the Allan variance without the contribution of this slope, so that K is unbiased with and without a ramp. R
+is included if the slope is significantly larger than the slope that noise would cause. For this test, K is set to the
+upper end of the confidence interval. Otherwise K or R may cause the slope, and both coefficients are bounded. If the
+slope is unknown, R is only bounded, and a ramp is estimated as K.
 
-The bandwidth of real sensors ends below half the sample rate. White noise behind a low-pass has the Allan variance N²/τ
-− c/τ² beyond the memory of the filter. The second term is the column of Q with a negative sign. If the shortest τ
-contradict the fit, Q² may therefore become negative. A negative Q² represents the band limit, and Q is only bounded by
-the Allan variance at the shortest τ. While the shortest τ still contradict the fit, the shortest τ is left out. If no
-filter explains the Allan variance, for example because of a spectral line or motion, no τ is left out, and the misfit
-is reported.
+The bandwidth of real sensors ends below half the sample rate. White noise after a low-pass filter has the Allan
+variance N²/τ − c/τ² at τ beyond the memory of the filter. The term c/τ² has the shape of quantization noise with a
+negative sign. If the fit is inconsistent with the shortest τ, Q² may therefore become negative. A negative Q²
+represents the band limit, and Q is only bounded by the Allan variance at the shortest τ. If the fit is still
+inconsistent, the shortest τ are left out one after another. If no filter explains the Allan variance, for example
+because of a spectral line or motion, no τ is left out, and the misfit is reported.
 
-The fit accepts any curve. An axis with too few τ, or without noise, is UNESTIMATED.
+The fit accepts any curve. All coefficients of an axis with too few τ or without noise are UNESTIMATED.
 """
 
 from collections.abc import Callable, Sequence
@@ -49,14 +51,11 @@ from monitor.noise.standard_terms import unit_allan_variances
 TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 """Powers of the sample rate that convert Q N B K R from τ0 = 1 to SI."""
 
-ENTER_ONCE: Final = 2.33  # σ, for a single fit of one curve: 1 % of absent terms are added
-ENTER_WATCHED: Final = 3.0  # σ, for repeated fits of a live window
-LEAVE_WATCHED: Final = 1.5  # σ, for repeated fits of a live window
 PER_AXIS_FIELDS: Final = ("theta", "fitted", "edf", "entered", "left_out", "scatter", "misfit", "k_or_r")
 """Fields of ``Fit`` that have one column per axis, besides the coefficients."""
-THRESHOLDS_ONCE: Final = (ENTER_ONCE, ENTER_ONCE)
-"""Thresholds in σ to add and to drop a term in a single fit."""
-THRESHOLDS_WATCHED: Final = (ENTER_WATCHED, LEAVE_WATCHED)
+THRESHOLDS_ONCE: Final = (2.33, 2.33)
+"""Thresholds in σ to add and to drop a term in a single fit. They add 1 % of absent terms."""
+THRESHOLDS_WATCHED: Final = (3.0, 1.5)
 """Thresholds in σ to add and to drop a term in repeated fits. The difference is a hysteresis."""
 
 
@@ -74,13 +73,13 @@ class Fit:
     """Result of one fit of six axes."""
 
     coefficients: Coefficients
-    theta: Floats  # [5, 6] Q² N² B² K² R² of the fitted curve, SI; Q² < 0 stands for a band limit
+    theta: Floats  # [5, 6] Q² N² B² K² R² of the fitted curve, SI; a negative Q² represents a band limit
     fitted: Floats  # [m, 6] Allan variance of the fitted model, squared unit; NaN without a model or if left out
-    edf: Floats  # [m, 6] equivalent degrees of freedom of the measured curve; NaN where the curve is
-    entered: NDArray[np.bool_]  # [5, 6] True for the terms in the fit; the next fit takes them as ``before``
-    left_out: Ints  # [6] number of shortest τ that contradicted every fit
+    edf: Floats  # [m, 6] equivalent degrees of freedom of the measured curve; NaN where the curve is NaN
+    entered: NDArray[np.bool_]  # [5, 6] True for the terms in the fit
+    left_out: Ints  # [6] number of shortest τ left out, because they contradict every fit
     scatter: Floats  # [6] variance of the curve about the fit, relative to noise of the five terms
-    misfit: Floats  # [6] the same if it is larger than chance explains, otherwise 1
+    misfit: Floats  # [6] ``scatter`` if chance does not explain this value, otherwise 1
     k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
 
 
@@ -102,7 +101,7 @@ def make_design(factors: Ints, rate_hz: float) -> Design:
 def shared_inputs(
     design: Design, table: CovarianceTable, blind: Floats | None = None, ask: bool = True
 ) -> SharedInputs:
-    """Return the inputs that are the same for every fit at one window length.
+    """Return the inputs of a fit that depend only on the window length.
 
     Parameters
     ----------
@@ -116,7 +115,7 @@ def shared_inputs(
         True to leave out the shortest τ that contradict the fit.
     """
     flat = design.columns.copy()
-    # the mean amount by which subtracting the line lowers each noise, see the level in ``fit_axis``
+    # The slope includes noise, so the subtraction of the slope reduces the expected contribution of each noise term.
     flat[:, :NOISES] -= (2.0 * table.bend - table.slope) * design.columns[:, R, None]
     flat[:, ~design.columns.any(axis=0)] = 0.0  # terms that are not fitted
     blind = np.zeros(design.factors.size) if blind is None else blind
@@ -246,7 +245,7 @@ def _combine(fits: Sequence[Fit], join: Callable[[Sequence[NDArray[Any]]], NDArr
 
 
 def empty_fit(avar: Floats) -> Fit:
-    """Return the result for a curve [m, 6] that has not been fitted: every coefficient is unestimated."""
+    """Return the result for a curve [m, 6] that has not been fitted, in which all coefficients are unestimated."""
     nothing = np.full((5, avar.shape[1]), np.nan)
     status = np.full((5, avar.shape[1]), Status.UNESTIMATED, np.int8)
     return Fit(
@@ -265,12 +264,9 @@ def empty_fit(avar: Floats) -> Fit:
 def _white_edf(design: Design, table: CovarianceTable, terms: Ints) -> Floats:
     """Return the degrees of freedom for white noise, used until there is a fit.
 
-    A sensor shows white noise in its first seconds.
+    In the first seconds, the noise of a sensor is mostly white.
     """
-    own = table.covariance[:, :, WHITE].diagonal()[:, None] * _present_ratio(table.terms[:, None], terms)
+    whole = table.terms[:, None]
+    ratio = np.where((whole > 0) & (terms > 0), whole / np.maximum(terms, 1), np.nan)  # of all terms to present terms
+    own = table.covariance[:, :, WHITE].diagonal()[:, None] * ratio
     return np.asarray(2.0 * design.columns[:, N, None] ** 2 / own)
-
-
-def _present_ratio(whole: Ints, terms: Ints) -> Floats:
-    """Return the terms of a window without gaps over the terms present; NaN if there are none."""
-    return np.where((whole > 0) & (terms > 0), whole / np.maximum(terms, 1), np.nan)

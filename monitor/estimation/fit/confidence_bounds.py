@@ -1,4 +1,4 @@
-"""Confidence bounds of one coefficient: ends of intervals and upper bounds from measured variances (compiled)."""
+"""Compiled functions for the confidence interval and the upper bound of a coefficient."""
 
 from typing import Final
 
@@ -13,16 +13,16 @@ from monitor.estimation.fit.least_squares import N, Q
 UPPER_BOUND_Z: Final = Z95
 """Quantile of an upper bound.
 
-It gives 97.5 % for a single fit. It still gives 95 % of the reported bounds when large terms are estimated instead and
-their intervals miss as well.
+With this quantile, a bound has a probability of 97.5 % in a single fit. Large terms are estimated instead of bounded,
+so the probability among the reported bounds is lower, but at least 95 %.
 """
 EXCLUSION_SIGMA: Final = 3.3
-"""Distance in σ by which a curve lies below a term that it does not contain.
+"""Distance in σ below the contribution of a term, beyond which a measured variance excludes the term.
 
-With 20 τ, none is that far off by chance in 99 of 100 cases.
+With 20 τ, the probability that any variance deviates by this distance by chance is 1 %.
 """
 MIN_CUBE_ROOT_FACTOR: Final = 0.05
-"""Minimum factor of the cube root of χ². Below it (under two degrees of freedom) a measured variance gives no bound."""
+"""Minimum factor of the cube root of χ². Below this factor, that is below two degrees of freedom, there is no bound."""
 
 
 @compiled
@@ -44,17 +44,18 @@ def pearson_quantile(z: float, skewness: float) -> float:
 
 @compiled
 def interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> float:
-    """Return √t at which the estimate û lies k √v(t) above t.
+    """Return one end of the confidence interval of a coefficient.
 
-    Here k is the quantile of Φ(z) with the skewness 2 √c2 of the estimate alone, and t solves the equation
-    (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0. The end is clipped at zero.
+    The end is √t, where t is the true squared coefficient for which the estimate û lies k standard deviations √v(t)
+    above t. The number k is the quantile of probability Φ(z) of a distribution with the skewness 2 √c2. The value t
+    solves the equation (1 − k²c2) t² − (2û + k²c1) t + û² − k²c0 = 0. A negative t is replaced by zero.
 
     Parameters
     ----------
     estimate : float
         Unconstrained estimate û of the squared coefficient.
     c0, c1, c2 : float
-        Coefficients of its variance v(t) = c0 + c1 t + c2 t².
+        Coefficients of the variance v(t) = c0 + c1 t + c2 t² of û.
     z : float
         Normal quantile, positive for the lower end and negative for the upper end.
     """
@@ -70,16 +71,17 @@ def interval_end(estimate: float, c0: float, c1: float, c2: float, z: float) -> 
 
 @compiled
 def limit_by_curve(curve: Floats, edf: Floats, rows: Ints, columns: Floats, memory: int, terms: TermResults) -> None:
-    """Limit the coefficients of a curve that the five terms do not describe: none may exceed the whole curve at any τ.
+    """Limit the coefficients of a curve that the five terms do not explain.
 
-    N is only limited beyond ``memory`` samples. Below, the filter of the sensor may have removed white noise.
+    The contribution of a single term must not exceed the measured Allan variance at any τ. N is only limited at τ of
+    more than ``memory`` samples, because a filter of the sensor may have removed white noise at shorter τ.
 
     Parameters
     ----------
     curve, edf : ndarray of float64, shape (m,)
         Allan variance and its degrees of freedom.
     rows : ndarray of int64
-        Rows in use.
+        Indices of the τ in use.
     columns : ndarray of float64, shape (m, 5)
         Allan variance of unit coefficients.
     memory : int
@@ -122,14 +124,14 @@ def upper_limit(avar: float, edf: float, z: float) -> float:
 
 @compiled
 def bound_by_first_point(avar: float, edf: float, column: float, terms: TermResults) -> None:
-    """Bound Q by the whole first point of the curve, because the band limit of the sensor hides Q.
+    """Bound Q by the first measured Allan variance, because the band limit of the sensor hides Q.
 
     Parameters
     ----------
     avar, edf : float
-        First point of the curve and its degrees of freedom.
+        First measured Allan variance, and the degrees of freedom.
     column : float
-        Allan variance of unit Q at this point.
+        Allan variance of Q = 1 at the same τ.
     terms : TermResults
         Results of the fit, updated in place.
     """

@@ -1,24 +1,24 @@
-"""Per-sample update of the coefficients in compiled code: the window advances by one sample, and the fit follows.
+"""Update of the coefficients with every sample, in compiled code.
 
-For fixed weights, the normal equations of the fit are linear in the Allan variance. ``SolutionMaps`` holds this linear
-map, which takes about eighty products per axis. The non-negative solution is a problem with four unknowns. If another
-set of terms becomes positive, the equations are solved again with the same weights.
+For fixed weights, the normal equations of the fit are linear in the Allan variance. ``SolutionMaps`` contains the
+matrices of this linear map, whose evaluation takes about eighty products per axis. If the set of positive terms
+changes, the four normal equations are solved again with the same weights.
 
-Weights and the selection of terms are recomputed in the following cases:
+The weights and the selection of terms are recomputed in each of the following cases.
 
 - A term would be added or dropped.
-- A coefficient has changed by a fifth and by more than its scatter.
+- A coefficient has changed by a fifth and by more than the standard deviation.
 - The slope would add or drop a ramp.
 - The window has grown by a tenth, or half of it has been replaced.
 
-Between two computations, outdated weights add at most 2 % to the error of a coefficient, because the error depends on
-the weights only in second order.
+Between two computations, the weights are outdated. The error of a coefficient depends on the weights only in second
+order, so outdated weights increase the error by at most 2 %.
 
-The kernel returns when an axis needs new maps, and ``fit_axes`` is then called from Python. These calls are rare, and
-``fit_axes`` would otherwise be compiled a second time as a part of the kernel.
+When an axis needs a new map, the kernel returns, and Python calls ``fit_axes``. Such calls are rare. If the kernel
+itself called ``fit_axes``, the compiler would have to compile this function a second time.
 
-The result contains Q N B K R for every sample, with NaN where a coefficient is not estimated. Intervals are computed
-only by ``Estimator.get``.
+The result contains Q N B K R for every sample, with NaN where a coefficient is not estimated. Only ``Estimator.get``
+computes confidence intervals.
 """
 
 from typing import Final, NamedTuple
@@ -59,14 +59,14 @@ from monitor.estimation.fit.fit_kernel import fit_axes
 from monitor.estimation.fit.least_squares import Q, R, invert_on_subset, nonzero_term_bits, solve_nonnegative
 
 REFRESH: Final = 2
-"""Minimum number of times that the maps are recomputed within one window length."""
+"""Minimum number of fits of an axis within one window length."""
 PATIENCE: Final = 64
-"""Number of attempts per window length for an axis without a solution, or with a misfit of the five terms.
+"""Minimum number of fits within one window length for an axis without a solution or with a misfit.
 
-The maps cannot detect that a band limit, a spectral line or a transient has disappeared.
+The linear map cannot show that a band limit, a spectral line or a transient has disappeared.
 """
 OPTIONS: Final = FitOptions(*THRESHOLDS_WATCHED, full=False, warm=True)
-"""Options of the fits that recompute the maps."""
+"""Options of the fits that recompute the linear maps."""
 
 U0, U1, U2, U3 = (np.uintp(a) for a in range(NOISES))
 
@@ -74,7 +74,7 @@ U0, U1, U2, U3 = (np.uintp(a) for a in range(NOISES))
 class RefitState(NamedTuple):
     """State of the fit of all axes."""
 
-    curves: CurvesOfAxes  # curves and slopes at the last fit of each axis, except for the slope of the newest window
+    curves: CurvesOfAxes  # curves and slopes at the last fit of each axis; only ``slope`` is that of the newest window
     output: FitOutput
     maps: SolutionMaps
     ages: Ints  # [6] number of samples since the last fit of each axis
@@ -108,25 +108,25 @@ class ContinuousRefit:
         self.reset()
 
     def reset(self) -> None:
-        """Restart the fit of all axes, without any term."""
+        """Restart the fits of all axes. No term is in the new fits."""
         output = empty_fit_output(AXES, self._rows, np.zeros((AXES, 5), np.bool_))
         self._state = RefitState(self._curves, output, empty_solution_maps(AXES, self._rows), self._ages)
         self._used: list[CovarianceTable | None] = [None] * AXES  # tables from which ``_known`` was computed
         self._known: list[SharedInputs] = []
 
     def restart(self, axis: int) -> None:
-        """Restart the fit of one axis. It is fitted at the next sample."""
+        """Restart the fit of one axis. The axis is fitted at the next sample."""
         output = self._state.output
         output.entered[axis], output.status[axis], output.theta[axis] = False, 0, np.nan
         self._request_fit(axis)
 
     @property
     def entered(self) -> NDArray[np.bool_]:
-        """Terms in the fit, shape (5, 6)."""
+        """Boolean array of shape (5, 6), True for the terms in the fit."""
         return self._state.output.entered.T
 
     def advance_and_refit(self, design: Design, samples: Floats, lengths: Ints) -> Floats:
-        """Advance the window by samples and return the coefficients after each.
+        """Advance the window by samples, and return the coefficients after each sample.
 
         Parameters
         ----------
@@ -161,7 +161,7 @@ class ContinuousRefit:
                     self._fit([axis for axis in range(AXES) if due >> axis & 1], to_si, coefficients[done - 1])
 
     def _fit(self, axes: list[int], to_si: Floats, coefficients: Floats) -> None:
-        """Fit some axes to their curves, and write the estimated coefficients into ``coefficients`` [5, 6]."""
+        """Fit some axes, and write the estimated coefficients into ``coefficients`` [5, 6]."""
         output = self._state.output
         for axis in axes:
             fit_axes(axis, axis + 1, self._known[axis], self._curves, OPTIONS, output, self._state.maps)
@@ -169,7 +169,7 @@ class ContinuousRefit:
         coefficients[:, axes] = np.where(output.status[axes] == Status.ESTIMATED, size, np.nan).T
 
     def _find_tables(self, design: Design, lengths: Ints) -> int:
-        """Find the table of every axis, and return for how many samples all tables stay valid."""
+        """Find the covariance table of every axis, and return for how many samples all tables stay valid."""
         filled = min(self._window.samples_in_window + 1, self._window.length)
         lasts = UNLIMITED_SAMPLES
         for axis in range(AXES):
@@ -192,15 +192,15 @@ class ContinuousRefit:
 def _follow(
     buffers: WindowBuffers, state: RefitState, lengths: Ints, to_si: Floats, start: int, end: int, coefficients: Floats
 ) -> tuple[int, int]:
-    """Advance by staged samples from row ``start``, and write the coefficients of each into that row.
+    """Advance by the samples in the input buffer of the window, and write the coefficients after each sample.
 
-    Stop at row ``end``, or after a row at which axes must be fitted to ``state.curves``. Return the next row and these
-    axes as a bit set.
+    Rows ``start`` to ``end`` of the buffer are processed. If axes must be fitted after a row, the function stops and
+    copies the curves of these axes to ``state.curves``. It returns the next row and the bit set of the axes to fit.
     """
     w = cut_arrays(buffers.ints, buffers.floats, buffers.missing, buffers.taus)
     curves, output, maps, ages = state
     ints, floats, missing, taus, window = buffers
-    # local names, because each access to a field in a loop counts a reference
+    # Local names, because each access to a field in a loop changes a reference count.
     counters, phase, scaling, terms, slope = w.state, w.phase, w.scaling, curves.terms, curves.slope
     used, free, misfit, theta, status = maps.used, maps.free, output.misfit, output.theta, output.status
     right, valid, m = np.empty((AXES, 5)), np.empty(AXES, np.bool_), terms.shape[1]
@@ -237,13 +237,13 @@ def _follow(
 
 @compiled
 def _copy_curve(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, axis: int, length: int) -> None:
-    """Copy the curve of one axis and the slopes that its τ see from the window."""
+    """Copy the Allan variances and the slopes of one axis from the window."""
     for i in range(curves.avar.shape[1]):
         at = i * LANES + axis
         total, count = w.sums[at] + w.rest[at], w.terms[at]
         curves.terms[axis, i] = count
         scale.inverse[axis, i] = 1.0 / (scale.unit[axis, i] * count)
-        # as in AllanWindow.avar, a constant axis has no noise
+        # As in AllanWindow.avar, a constant axis has no noise.
         curves.avar[axis, i] = total * scale.inverse[axis, i] if total > count else 0.0
         bend = mean_second_difference(w.phase, w.missing, w.state[NEWEST], length, w.factors[i], axis)
         curves.slopes[axis, i] = bend / w.scaling[axis]
@@ -253,7 +253,7 @@ def _copy_curve(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, a
 def _project(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, maps: SolutionMaps, right: Floats) -> None:
     """Compute r = Xᵀ V⁻¹ y [axes, NOISES] of the current curve."""
     lanes = np.uintp(LANES)  # unsigned, because checks for negative indices would cost as much as the arithmetic
-    # local names, because each access to a field in a loop counts a reference
+    # Local names, because each access to a field in a loop changes a reference count.
     sums, rest, counts, terms, slope = w.sums, w.rest, w.terms, curves.terms, curves.slope
     unit, inverse, used = scale.unit, scale.inverse, maps.used
     rows, ramp, twist = maps.rows, maps.ramp, maps.twist
@@ -276,9 +276,10 @@ def _project(w: WindowArrays, scale: SumsToVariances, curves: CurvesOfAxes, maps
 
 @inlined
 def _apply_maps(right: Floats, slope: Floats, maps: SolutionMaps, output: FitOutput, valid: NDArray[np.bool_]) -> None:
-    """Compute θ [axes, 5] from the maps, and whether the maps are still valid [axes].
+    """Compute θ [axes, 5] from the linear maps, and store in ``valid`` [axes] whether the maps are still valid.
 
-    If another set of terms is now positive, θ is solved again with the same weights. Without maps, θ is not changed.
+    If the set of positive terms has changed, the normal equations are solved again with the same weights. For an axis
+    without a map, θ is not changed.
     """
     normal, inverse, whole, low, high = maps.normal, maps.inverse, maps.whole, maps.low, maps.high
     used, free, straight, theta, entered = maps.used, maps.free, maps.straight, output.theta, output.entered
@@ -302,7 +303,7 @@ def _apply_maps(right: Floats, slope: Floats, maps: SolutionMaps, output: FitOut
                 allowed = x > 0.0 or (free[axis] and a == Q)
                 same = same and allowed
                 theta[axis, a] = x if allowed else 0.0  # a new fit starts with the weights of this θ
-            # False for NaN, too; only a term that is not zero can be added
+            # The comparison is False for NaN. Only a term that is not zero can be added.
             limit = high[axis, NOISES + a] if there else np.inf
             holds = holds and low[axis, NOISES + a] <= u <= limit
         for a in range(np.uintp(NOISES)):

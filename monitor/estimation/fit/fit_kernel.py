@@ -1,10 +1,10 @@
-"""Compiled kernel of the fit: weights and a non-negative solution, one axis after another.
+"""Compiled kernel of the fit, which computes the weights and the non-negative solution of each axis.
 
-All quantities are in units of one sample, see ``fit_arrays``. The results are written to arrays of the caller with one
-row per axis.
+All quantities are in units of one sample, as described in ``fit_arrays``. The caller allocates the arrays for the
+results, with one row per axis.
 
-For given weights, the solution is linear in the curve. The rows of this linear map are stored together with the limits
-within which they are as good as a new fit. ``continuous_refit`` applies them to the curve after every sample.
+For given weights, the coefficients are a linear function of the Allan variances. This linear map is stored with the
+limits within which it is as good as a new fit. ``continuous_refit`` applies the map after every sample.
 """
 
 from typing import Final
@@ -42,17 +42,20 @@ from monitor.estimation.fit.term_selection import (
 )
 
 MIN_ROWS: Final = NOISES + 1
-"""Minimum number of τ. With fewer τ, a fit has no degree of freedom left to be contradicted."""
+"""Minimum number of τ. With fewer τ, a fit of four terms has no degree of freedom left for a test."""
 COLD_PASSES: Final = 3
-"""Number of re-weightings from scratch. More passes move no coefficient by a tenth of its standard deviation."""
+"""Number of passes with new weights, without a previous fit. More passes change no coefficient by a tenth of σ."""
 WARM_PASSES: Final = 1
-"""Number of re-weightings from the coefficients of a recent fit."""
+"""Number of passes with new weights, starting from the coefficients of a recent fit."""
 MISFIT_SIGMA: Final = 4.0
-"""Distance in σ from which a short τ contradicts the fit."""
+"""Residual in σ above which a short τ contradicts the fit."""
 REPEATED_MISFIT_SIGMA: Final = 2.5
-"""Same threshold after a contradiction, so that the remaining effect of a band limit does not bias N."""
+"""Residual in σ above which a short τ contradicts a fit with a negative Q².
+
+The limit is lower, so that the remaining effect of a band limit does not bias N.
+"""
 TOTAL_MISFIT_SIGMA: Final = 6.0
-"""Standard deviations of χ² per τ beyond which the five terms do not describe the curve."""
+"""Number of standard deviations of χ² beyond which the five terms do not explain the curve."""
 SHORT_ROWS: Final = 4
 """Number of shortest τ in use that are tested for a contradiction."""
 FILTER_MEMORY: Final = 16
@@ -136,7 +139,7 @@ def _fit_axis(
 
 @compiled
 def _prepare_rows(axis: int, shared: SharedInputs, curves: CurvesOfAxes, problem: LeastSquares) -> Ints:
-    """Return the τ in use, and compute the curve without the line of the measured slope."""
+    """Return the indices of the τ in use, and subtract the contribution of the slope from the Allan variances."""
     curve, terms, slope = curves.avar[axis], curves.terms[axis], curves.slope[axis]
     rows, count = np.empty(curve.size, np.int64), 0
     for i in range(curve.size):
@@ -153,9 +156,9 @@ def _prepare_rows(axis: int, shared: SharedInputs, curves: CurvesOfAxes, problem
 def _fit_or_fall_back(
     axis: int, rows: Ints, problem: LeastSquares, curve: Floats, ask: bool, options: FitOptions, output: FitOutput
 ) -> tuple[int, bool]:
-    """Fit with the requested weights, or with variances alone if the covariances do not suit the curve.
+    """Fit with the requested weights, or with the variances alone if the misfit is too large.
 
-    Return the number of shortest τ left out, and whether Q² was allowed to be negative.
+    Return how many of the shortest τ were left out, and whether Q² was allowed to be negative.
     """
     full, theta = options.full, output.theta[axis]
     while True:
@@ -163,7 +166,7 @@ def _fit_or_fall_back(
         scatter, limit = _misfit(problem, rows[first:], theta)
         if not full or scatter <= limit:
             break
-        full = False  # covariances of noise that the curve does not have make the fit miss all of its points
+        full = False  # with the wrong covariances, a fit to other noise than the five terms may miss all points
     output.left_out[axis], output.scatter[axis] = first, scatter
     output.misfit[axis] = scatter if scatter > limit else 1.0
     return first, free
@@ -171,7 +174,7 @@ def _fit_or_fall_back(
 
 @compiled
 def _draw(axis: int, rows: Ints, columns: Floats, noise: float, variance: Floats, output: FitOutput) -> None:
-    """Compute the fitted model, NaN for τ left out, and the degrees of freedom of the curve under it."""
+    """Compute the Allan variance of the fitted model, and the degrees of freedom of the curve under this model."""
     theta = output.theta[axis]
     for k in range(rows.size):
         i = rows[k]
@@ -180,7 +183,7 @@ def _draw(axis: int, rows: Ints, columns: Floats, noise: float, variance: Floats
             model += columns[i, a] * theta[a]
             positive += columns[i, a] * max(theta[a], 0.0)
         output.fitted[axis, i] = model if k >= output.left_out[axis] and model > 0.0 else np.nan
-        # the product of a ramp with the noise of the mean second difference adds 4 R² (m²/2)² Var(slope)
+        # The product of a ramp with the noise of the mean second difference adds 4 R² (m²/2)² Var(slope).
         variance[i] += 4.0 * theta[R] * columns[i, R] ** 2 * noise
         output.edf[axis, i] = 2.0 * positive * positive / variance[i]
 
@@ -191,7 +194,7 @@ def _fit_terms(
 ) -> tuple[int, bool]:
     """Fit Q N B K with re-weighting.
 
-    Return the number of shortest τ left out, and whether Q² was allowed to be negative.
+    Return how many of the shortest τ were left out, and whether Q² was allowed to be negative.
     """
     first, free = 0, False
     warm = warm and theta[N] > 0.0
@@ -215,7 +218,7 @@ def _fit_terms(
             free = True
         elif used.size > MIN_ROWS and problem.columns[used[0], N] * FILTER_MEMORY >= 1.0:
             first += 1
-        else:  # not a filter, but a spectral line, motion, or another effect outside the five terms
+        else:  # The cause is not a filter but a spectral line, motion, or another effect outside the five terms.
             first, free, ask = 0, False, False
     compute_normal_equations(problem, used)
     solve_nonnegative(problem.normal, problem.right, free, theta)
@@ -224,9 +227,9 @@ def _fit_terms(
 
 @compiled
 def _misfit(problem: LeastSquares, rows: Ints, theta: Floats) -> tuple[float, float]:
-    """Return the variance of the curve about the fit relative to noise of the five terms, and its limit by chance.
+    """Return the mean square of the residuals in σ, and the limit of the mean square for noise of the five terms.
 
-    Beyond the limit, intervals are widened accordingly (Birge 1932).
+    Above the limit, the confidence intervals are widened accordingly (Birge 1932).
     """
     level, columns, variance = problem.level, problem.columns, problem.variance
     total, freedom = 0.0, rows.size
@@ -246,7 +249,10 @@ def _misfit(problem: LeastSquares, rows: Ints, theta: Floats) -> tuple[float, fl
 
 @compiled
 def _is_contradicted(problem: LeastSquares, rows: Ints, theta: Floats, limit: float) -> bool:
-    """Return True if a row is more than ``limit`` σ off. The cube root makes χ² normal (Wilson & Hilferty 1931)."""
+    """Return True if any residual exceeds ``limit`` σ.
+
+    The residuals are computed from the cube root of χ², which is approximately normal (Wilson & Hilferty 1931).
+    """
     columns = problem.columns
     for i in rows:
         model = 0.0

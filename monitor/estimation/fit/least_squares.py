@@ -1,7 +1,7 @@
-"""Small weighted least-squares problems in compiled loops: five columns, non-negative, correlated observations.
+"""Compiled solver for small weighted least-squares problems with correlated observations and non-negative solutions.
 
-``fit_arrays.LeastSquares`` holds a problem of all τ, and ``rows`` lists the τ in use. The code uses loops because they
-compile several times faster than array expressions.
+``fit_arrays.LeastSquares`` contains the problem for all τ, and ``rows`` lists the indices of the τ in use. The code
+uses loops, because loops compile several times faster than array expressions.
 """
 
 from typing import Final
@@ -23,18 +23,8 @@ Q, N, B, K, R = range(5)
 
 
 @compiled
-def allan_covariance(theta: Floats, c: Floats) -> float:
-    """Return the covariance of two Allan variances, Σ_ab θ_a θ_b C^ab.
-
-    A negative Q² stands for a band limit and adds nothing.
-
-    Parameters
-    ----------
-    theta : ndarray of float64, shape (5,)
-        Squared coefficients in units of one sample.
-    c : ndarray of float64, shape (10,)
-        Entry C of ``CovarianceTable.covariance``.
-    """
+def _allan_covariance(theta: Floats, c: Floats) -> float:
+    """Return the covariance Σ_ab θ_a θ_b C^ab of two Allan variances. A negative Q², a band limit, counts as zero."""
     q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
     return float(
         q * (q * c[0] + 2.0 * (n * c[1] + b * c[2] + k * c[3]))
@@ -53,13 +43,13 @@ def compute_observation_variances(problem: LeastSquares, rows: Ints, theta: Floa
     problem : LeastSquares
         Problem. Its ``variance`` is overwritten.
     rows : ndarray of int64
-        Rows in use.
+        Indices of the τ in use.
     theta : ndarray of float64, shape (5,)
         Squared coefficients of the model.
     """
     for i in rows:
         stretch = problem.stretch[i]
-        problem.variance[i] = allan_covariance(theta, problem.covariance[i, i]) * stretch * stretch
+        problem.variance[i] = _allan_covariance(theta, problem.covariance[i, i]) * stretch * stretch
 
 
 @compiled
@@ -71,7 +61,7 @@ def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full: bool
     problem : LeastSquares
         Problem. Its ``variance`` and ``weighted`` are overwritten.
     rows : ndarray of int64
-        Rows in use.
+        Indices of the τ in use.
     theta : ndarray of float64, shape (5,)
         Squared coefficients of the model.
     full : bool
@@ -88,15 +78,15 @@ def compute_weights(problem: LeastSquares, rows: Ints, theta: Floats, full: bool
 
 @compiled
 def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
-    """Compute V⁻¹ X by Cholesky decomposition; return False if the correlations are not positive definite."""
-    # local names, because each access to a field in a loop counts a reference
+    """Compute V⁻¹ X by Cholesky decomposition. Return False if the correlation matrix is not positive definite."""
+    # Local names, because each access to a field in a loop changes a reference count.
     m, variance, stretch, blind = rows.size, problem.variance, problem.stretch, problem.blind
     covariance, columns, weighted = problem.covariance, problem.columns, problem.weighted
     factor, column = np.empty((m, m)), np.empty(m)
     for k in range(m):
         for j in range(k + 1):
             i, h = rows[k], rows[j]
-            x = allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
+            x = _allan_covariance(theta, covariance[i, h]) * stretch[i] * stretch[h] + blind[i] * blind[h]
             factor[k, j] = x / np.sqrt(variance[i] * variance[h])
     if not _factorize(factor, m, SINGULAR_COVARIANCE):
         return False
@@ -111,14 +101,16 @@ def _whiten(problem: LeastSquares, rows: Ints, theta: Floats) -> bool:
 
 @compiled
 def compute_normal_equations(problem: LeastSquares, rows: Ints) -> None:
-    """Compute Xᵀ V⁻¹ X and Xᵀ V⁻¹ y. A column of zeros is a term that is not fitted, and its solution is zero.
+    """Compute Xᵀ V⁻¹ X and Xᵀ V⁻¹ y.
+
+    A column of zeros represents a term that is not fitted. The solution for this term is zero.
 
     Parameters
     ----------
     problem : LeastSquares
         Problem with its weights. Its ``normal`` and ``right`` are overwritten.
     rows : ndarray of int64
-        Rows in use.
+        Indices of the τ in use.
     """
     normal, right, weighted = problem.normal, problem.right, problem.weighted
     level, columns = problem.level, problem.columns
@@ -216,7 +208,10 @@ def solve_on_subset(normal: Floats, right: Floats, subset: int, solution: Floats
 
 @compiled
 def _factorize(matrix: Floats, n: int, singular: float) -> bool:
-    """Replace the lower triangle of a correlation matrix [n, n] by its Cholesky factor; return False if singular."""
+    """Replace the lower triangle of a correlation matrix [n, n] by the Cholesky factor.
+
+    Return False if it is singular.
+    """
     for k in range(n):
         for j in range(k + 1):
             x = matrix[k, j]
@@ -233,7 +228,7 @@ def _factorize(matrix: Floats, n: int, singular: float) -> bool:
 
 @compiled
 def _substitute(factor: Floats, n: int, x: Floats) -> None:
-    """Replace the right-hand side x [n] by the solution, with the Cholesky factor of the matrix."""
+    """Replace the right-hand side x [n] by the solution of the equations, given the Cholesky factor of the matrix."""
     for k in range(n):
         y = x[k]
         for c in range(k):

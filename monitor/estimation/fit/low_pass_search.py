@@ -1,15 +1,15 @@
-"""Search for the low-pass of the sensor that explains the Allan variance at the shortest τ, and the fit with it.
+"""Search for the low-pass filter of a sensor, and fit of the coefficients with this filter.
 
-A sensor with a bandwidth below half the sample rate has less noise at the shortest τ than N²/τ. In a recording of a
-day, the Allan variance at the shortest τ is known to 0.04 %, so a model error of 1 % biases N. In this module, the
-column of N is white noise behind a Butterworth low-pass of order 1 to 4, either digital at the sample rate or analogue
-before sampling. The cutoff and the order with the smallest misfit are used. The uncertainty of the cutoff is projected
-out of the fit, so that no interval becomes too narrow. If no low-pass explains the Allan variance, the result of
-``fit`` without the shortest τ is kept.
+If the bandwidth of a sensor is below half the sample rate, the Allan variance at the shortest τ is smaller than N²/τ. A
+recording of a day determines this Allan variance to 0.04 %, so a model error of 1 % biases N. In this module, the
+column of N is the Allan variance of white noise after a Butterworth low-pass filter of order 1 to 4. The filter is
+either a digital filter at the sample rate or an analogue filter before sampling. The cutoff and the order with the
+smallest misfit are used. The fit allows for the uncertainty of the cutoff, so that no interval becomes too narrow. If
+no low-pass filter explains the Allan variance, the result of ``fit`` without the shortest τ is kept.
 
-All these filters have a flat passband, so N is the level of the white noise in the passband. Q is only bounded, because
+The filters have a flat passband, so N is the level of the white noise in the passband. Q is only bounded, because
 almost any filter together with Q explains almost any Allan variance. A filter must also be visible in the spectrum. If
-the spectrum does not fall beyond the cutoff, the deviation from N²/τ has another cause.
+the spectrum does not decrease above the cutoff, the deviation from N²/τ has another cause.
 """
 
 from collections.abc import Generator, Sequence
@@ -37,19 +37,19 @@ FAMILIES: Final[tuple[tuple[Kind, int], ...]] = tuple(
 CUTOFFS: Final = np.geomspace(0.005, 0.49, 56)
 """Grid of cutoff frequencies, as shares of the sample rate."""
 SPECTRUM_BINS: Final = 1 << 13
-"""Number of bins of the squared response from zero to half the sample rate. It limits the memory of a filter."""
+"""Number of bins of the squared response from zero to half the sample rate, which limits the memory of a filter."""
 REFINED_FAMILIES: Final = 3
-"""Number of families whose cutoff is refined. They are those with the smallest misfit on the grid."""
+"""Number of families with the smallest misfit on the grid, for which the cutoff is refined."""
 CUTOFFS_PER_STEP: Final = 8
 """Number of grid cutoffs tried in one step of a search."""
 REFINED_CUTOFFS_PER_STEP: Final = 10
-"""Number of cutoffs between those of the grid tried in one step. Each needs its own spectrum."""
+"""Number of refined cutoffs tried in one step of a search. They take longer, because their spectra are not cached."""
 CUTOFF_TOLERANCE: Final = 1e-4
 """Tolerance of the logarithm of the cutoff at the end of a search."""
 ALIASES: Final = 8
 """Number of aliases on each side that are added to the response of a sampled analogue filter."""
 MAX_SCATTER: Final = 2.0
-"""Largest variance about the fit, relative to that of noise, with which a filter explains a curve."""
+"""Largest variance about the fit, relative to the variance from noise, with which a filter explains a curve."""
 POWER_BINS: Final = 1024
 """Number of bins of the measured spectrum from zero to half the sample rate."""
 MAX_STRETCHES: Final = 64
@@ -57,15 +57,15 @@ MAX_STRETCHES: Final = 64
 MIN_STRETCHES: Final = 4
 """Minimum number of stretches for a spectrum."""
 STOPBAND_START: Final = 1.2
-"""Frequency, as a multiple of the cutoff, from which on the spectrum must have fallen."""
+"""Start of the stopband, as a multiple of the cutoff."""
 MAX_STOPBAND_RATIO: Final = 2.0
 """Largest ratio of the measured to the expected stopband level."""
 MAX_STOPBAND_SHARE: Final = 0.05
 """Share of the passband level that is added to the limit of the stopband level."""
 CUTOFF_STEP: Final = 1.01
-"""Factor of the cutoff in the numerical derivative with respect to it."""
+"""Relative step of the cutoff for the numerical derivative."""
 LOG_CUTOFF_SIGMA: Final = 3.0
-"""Prior standard deviation of the logarithm of the cutoff. It is wide enough to allow any cutoff."""
+"""Prior standard deviation of the logarithm of the cutoff, which is large enough to allow any cutoff."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,9 +77,9 @@ class LowPass:
     cutoff: float  # as a share of the sample rate
 
     def avar(self, factors: Ints) -> Floats:
-        """Return the Allan variance [m] of unit white noise behind the filter, τ0 = 1.
+        """Return the Allan variance [m] of filtered white noise with N = 1 in the passband, at τ0 = 1.
 
-        With V(m) the variance of a sum of m samples, computed from their autocovariance, σ² = (4 V(m) − V(2m)) / 2m².
+        If V(m) is the variance of a sum of m samples, the Allan variance is (4 V(m) − V(2m)) / 2m².
 
         >>> LowPass("digital", 2, 0.1).avar(np.array([1, 1000])).round(6).tolist()
         [0.024355, 0.000998]
@@ -106,12 +106,15 @@ def _squared_response(kind: Kind, order: int, cutoff: float, bins: int = SPECTRU
 
 @lru_cache(1024)
 def _column(low_pass: LowPass, factors: bytes) -> Floats:
-    """Return the cached Allan variance of a low-pass; ``factors`` is the buffer of an int64 array."""
+    """Return the Allan variance of a low-pass filter from a cache; ``factors`` contains the bytes of an int64 array."""
     return low_pass.avar(np.frombuffer(factors, np.int64))
 
 
 def _autocovariance_sums(kind: Kind, order: int, cutoff: float) -> tuple[Floats, Floats]:
-    """Return Σ r over |k| < n, and Σ |k| r, for n = 1, 2, …; the white noise in the passband has Σ r = 1."""
+    """Return the sums of r(k) and |k| r(k) over |k| < n for n = 1, 2, …, with the autocovariance r.
+
+    The filtered white noise is scaled so that the sum of all r is 1.
+    """
     r = np.fft.irfft(_squared_response(kind, order, cutoff))[:SPECTRUM_BINS]
     both = np.where(np.arange(SPECTRUM_BINS) > 0, 2.0, 1.0) * r
     level, first = np.cumsum(both), np.cumsum(both * np.arange(SPECTRUM_BINS))
@@ -119,9 +122,9 @@ def _autocovariance_sums(kind: Kind, order: int, cutoff: float) -> tuple[Floats,
 
 
 def power_spectrum(rates: Floats) -> Floats:
-    """Return the spectrum [POWER_BINS + 1] of one axis [n] in arbitrary units, or an empty array without enough data.
+    """Return the spectrum [POWER_BINS + 1] of one axis [n] in arbitrary units, or an empty array if n is too small.
 
-    The spectrum is the mean over stretches that are spread over the samples and have few missing ones.
+    The spectrum is the mean over stretches with few missing samples, spread over the axis.
     """
     rows = 2 * POWER_BINS
     begins = np.unique(np.linspace(0, len(rates) - rows, MAX_STRETCHES).astype(np.int64))
@@ -137,9 +140,9 @@ def power_spectrum(rates: Floats) -> Floats:
 
 
 def is_seen_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
-    """Return True if a spectrum falls beyond the cutoff as expected behind the filter.
+    """Return True if a measured spectrum decreases above the cutoff as expected for the filter.
 
-    Medians are compared, so that spectral lines do not matter.
+    Medians of the passband and the stopband are compared, so that spectral lines have no effect.
 
     Parameters
     ----------
@@ -163,20 +166,20 @@ def is_seen_in_spectrum(low_pass: LowPass, power: Floats) -> bool:
 def apply_low_passes(
     design: Design, table: CovarianceTable, measured: MeasuredCurve, found: Fit, filters: Sequence[LowPass | None]
 ) -> tuple[Fit, list[LowPass | None]]:
-    """Replace the fit of each contradicted axis by a fit with its low-pass, if the low-pass explains the curve.
+    """Replace the fit of each axis that the five terms do not explain by a fit with a low-pass filter.
 
     Parameters
     ----------
     design : Design
         Columns that were passed to ``fit``.
-    table : Table
+    table : CovarianceTable
         Covariances that were passed to ``fit``.
     measured : MeasuredCurve
         Measured curve that was passed to ``fit``.
     found : Fit
         Result of ``fit``.
     filters : sequence of LowPass or None
-        Candidate of each axis from ``find_low_pass``, or None.
+        Filter of each axis from ``find_low_pass``, or None. A filter is accepted if the fit explains the curve.
 
     Returns
     -------
@@ -197,7 +200,7 @@ def apply_low_passes(
 
 
 def _bound_q(design: Design, found: Fit, measured: MeasuredCurve) -> None:
-    """Bound Q of a single-axis fit by the whole first point, because a fit with a filter cannot determine it."""
+    """Bound Q by the first measured Allan variance, because a fit with a filter cannot determine Q."""
     c, first = found.coefficients, int(np.argmax(measured.avar[:, 0] > 0.0))
     most = upper_limit(measured.avar[first, 0], found.edf[first, 0], UPPER_BOUND_Z) / design.columns[first, Q]
     if np.isfinite(most):
@@ -205,7 +208,7 @@ def _bound_q(design: Design, found: Fit, measured: MeasuredCurve) -> None:
 
 
 def is_contradicted(found: Fit, axis: int) -> bool:
-    """Return True if the shortest or other τ of an axis contradict the five terms.
+    """Return True if the five terms do not explain the curve of an axis.
 
     Parameters
     ----------
@@ -218,13 +221,13 @@ def is_contradicted(found: Fit, axis: int) -> bool:
 
 
 def find_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurve, power: Floats) -> LowPass | None:
-    """Return the low-pass with the smallest misfit for a single axis, or None if none explains its curve.
+    """Return the low-pass filter with the smallest misfit for one axis, or None if no filter explains the curve.
 
     Parameters
     ----------
     design : Design
         Columns for the cluster sizes of the curve.
-    table : Table
+    table : CovarianceTable
         Covariances for the window length.
     measured : MeasuredCurve
         Measured curve of a single axis.
@@ -243,20 +246,9 @@ def find_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurv
 def search_low_pass(
     design: Design, table: CovarianceTable, measured: MeasuredCurve, power: Floats
 ) -> Generator[None, None, LowPass | None]:
-    """Search as ``find_low_pass`` in steps of a few milliseconds, for callers that must not block.
+    """Do the search of ``find_low_pass`` in steps of a few milliseconds, for callers that must not block.
 
-    The generator yields after each step and returns the low-pass or None.
-
-    Parameters
-    ----------
-    design : Design
-        Columns for the cluster sizes of the curve.
-    table : Table
-        Covariances for the window length.
-    measured : MeasuredCurve
-        Measured curve of a single axis.
-    power : ndarray of float64
-        Spectrum of the axis, from ``power_spectrum``.
+    The parameters are those of ``find_low_pass``. The generator yields after each step and returns the filter or None.
     """
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     grids: list[list[float]] = []
@@ -289,7 +281,7 @@ def search_low_pass(
 def _yield_after_several_steps(
     search: Generator[None, None, tuple[float, float]],
 ) -> Generator[None, None, tuple[float, float]]:
-    """Run a search and yield after every ``REFINED_CUTOFFS_PER_STEP`` of its steps."""
+    """Run a search, and yield after every ``REFINED_CUTOFFS_PER_STEP`` steps."""
     steps = 0
     while True:
         try:
@@ -308,14 +300,14 @@ def _fit_columns(design: Design, table: CovarianceTable, measured: MeasuredCurve
 
 
 def _with_noise_column(design: Design, column: Floats) -> Design:
-    """Return the design with another column for N and without Q."""
+    """Return the design with the given column for N, and with a column of zeros for Q."""
     columns = design.columns.copy()
     columns[:, N], columns[:, Q] = column, 0.0
     return replace(design, columns=columns)
 
 
 def _fit_low_pass(design: Design, table: CovarianceTable, measured: MeasuredCurve, low_pass: LowPass) -> Fit:
-    """Return the fit with this filter, with the direction of a change of its cutoff projected out."""
+    """Return the fit with a filter. The fit ignores changes of the curve that a change of the cutoff would cause."""
     factors = np.ascontiguousarray(design.factors, np.int64).tobytes()
     up, down = (
         _column(replace(low_pass, cutoff=low_pass.cutoff * by), factors) for by in (CUTOFF_STEP, 1.0 / CUTOFF_STEP)

@@ -1,8 +1,7 @@
 """Selection of significant terms, their confidence intervals, and the limits within which a solution stays valid.
 
-The unconstrained solution û has the variance v(t) = c0 + c1 t + c2 t² if the true θ_a is t, from the covariances of
-``uncertainty``. All decisions in this module are based on this variance; see the docstring of ``coefficient_fit``. The
-functions are compiled.
+All decisions in this compiled module use the unconstrained solution û. If the true squared coefficient is t, the
+variance of û is v(t) = c0 + c1 t + c2 t². The docstring of ``coefficient_fit`` describes the method.
 """
 
 from typing import Final
@@ -36,12 +35,12 @@ from monitor.estimation.fit.least_squares import (
 )
 
 MAX_THETA_CHANGE: Final = 0.4
-"""The linear maps are recomputed when a θ has moved by this share and by more than its own scatter.
+"""Relative change of θ above which the linear map is recomputed, if the change also exceeds ``MAX_THETA_SIGMA``.
 
-A coefficient has then moved by a fifth.
+A change of 0.4 is a change of the coefficient by a fifth.
 """
 MAX_THETA_SIGMA: Final = 1.0
-"""Distance in σ that a θ may move before the maps are recomputed, if this is more than the share ``MAX_THETA_CHANGE``.
+"""Change of θ in standard deviations up to which the linear map is not recomputed.
 """
 DETECTABLE_SIGMA: Final = 3.0
 """Size in σ at which an absent term would be detected."""
@@ -51,18 +50,18 @@ DETECTABLE_SIGMA: Final = 3.0
 def select_terms(
     problem: LeastSquares, rows: Ints, options: FitOptions, straight: bool, misfit: float, terms: TermResults
 ) -> TermTests:
-    """Select the terms and compute their intervals; see the docstring of ``coefficient_fit``.
+    """Select the significant terms, and compute confidence intervals and bounds (see ``coefficient_fit``).
 
     Parameters
     ----------
     problem : LeastSquares
         Problem with its weights and normal equations.
     rows : ndarray of int64
-        Rows in use.
+        Indices of the τ in use.
     options : FitOptions
         Thresholds to add and to drop a term.
     straight : bool
-        True if the line of the slope has been subtracted.
+        True if the contribution of the slope has been subtracted.
     misfit : float
         Factor by which variances are widened.
     terms : TermResults
@@ -97,33 +96,34 @@ def _select_term(
     low = interval_end(estimate, c0, c1, c2, Z95)
     high = interval_end(estimate, c0, c1, c2, -Z95)
     if terms.theta[a] > 0.0 and not low < np.sqrt(terms.theta[a]) < high:
-        # other terms were held at zero, so θ differs from û: include the interval of θ
+        # Other terms are fixed at zero, so θ differs from û. The interval must also cover the interval of θ.
         low = min(low, interval_end(terms.theta[a], c0, c1, c2, Z95))
         high = max(high, interval_end(terms.theta[a], c0, c1, c2, -Z95))
-    # an absent term stays out while its interval includes zero
+    # A term that is not in the fit is not added while the interval includes zero.
     seen = terms.entered[a] or low > 0.0
     terms.entered[a] = seen and a != R and terms.theta[a] > 0.0 and estimate > threshold * np.sqrt(c0)
     if terms.entered[a]:
         terms.status[a], terms.lo[a], terms.hi[a] = 2, low, high
     else:
-        # a bound tighter than the one from an estimate of zero would claim more than the curve supports
+        # The bound is never tighter than the bound from an estimate of zero.
         terms.status[a], terms.lo[a] = 1, 0.0
         terms.hi[a] = interval_end(max(estimate, 0.0), c0, c1, c2, -UPPER_BOUND_Z)
 
 
 @compiled
 def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: TermTests, terms: TermResults) -> None:
-    """Recompute the bounds of absent terms with weights that suit a term just large enough to be detected.
+    """Recompute the bounds of absent terms with better weights.
 
-    Weights for an absent term use the τ where the term has no effect. For K, for example, they give so little weight to
-    the few long τ that the scatter of K itself dominates. The bound is then very large or infinite.
+    The weights of the fit assume that the term is absent. For K, these weights make little use of the few long τ, where
+    K has most effect, and the bound becomes very large or infinite. The bounds are therefore computed with weights for
+    a term that is just large enough to be detected.
 
     Parameters
     ----------
     problem : LeastSquares
         Problem of the axis.
     rows : ndarray of int64
-        Rows in use.
+        Indices of the τ in use.
     misfit : float
         Factor by which variances are widened.
     tests : TermTests
@@ -153,7 +153,7 @@ def tighten_bounds(problem: LeastSquares, rows: Ints, misfit: float, tests: Term
 
 @compiled
 def _estimate(gain: Floats, problem: LeastSquares, rows: Ints) -> float:
-    """Return û from one row of the linear map."""
+    """Return the unconstrained estimate of one term from the row of the linear map for this term."""
     estimate, stretch, level = 0.0, problem.stretch, problem.level
     for k in range(rows.size):
         estimate += gain[k] / stretch[rows[k]] * level[rows[k]]
@@ -162,7 +162,10 @@ def _estimate(gain: Floats, problem: LeastSquares, rows: Ints) -> float:
 
 @compiled
 def _map_to_term(a: int, problem: LeastSquares, rows: Ints, gain: Floats) -> bool:
-    """Compute the row of the linear map from curve to û_a, as if each τ had all terms; return False if none exists."""
+    """Compute the row of the linear map from the Allan variances to the unconstrained estimate of term a.
+
+    The row is for a window without gaps. Return False if the terms cannot be distinguished.
+    """
     unit, solution, weighted = np.zeros(5), np.empty(5), problem.weighted
     unit[a] = 1.0
     if not solve_on_subset(problem.normal, unit, (2**NOISES - 1) | (1 << a), solution):
@@ -177,9 +180,10 @@ def _map_to_term(a: int, problem: LeastSquares, rows: Ints, gain: Floats) -> boo
 
 @compiled
 def _variance_forms(first: int, end: int, gain: Floats, rows: Ints, theta: Floats, covariance: Floats) -> Floats:
-    """Return c0 c1 c2 [end - first, 3] of the variance c0 + c1 t + c2 t² of û, for each term from ``first``.
+    """Return the coefficients c0, c1, c2 of the variance of û, for the terms first ≤ a < end.
 
-    One pass over the pairs of τ serves all terms. The ramp has no noise and only has c0.
+    One loop over the pairs of τ computes the coefficients of all terms. For the ramp, which adds no noise, c1 and c2
+    are zero.
     """
     q, n, b, k = max(theta[0], 0.0), theta[1], theta[2], theta[3]
     forms, bent, own = np.zeros((end - first, 3)), np.zeros(5), np.zeros(5)
@@ -215,7 +219,9 @@ def _variance_forms(first: int, end: int, gain: Floats, rows: Ints, theta: Float
 def select_ramp(
     slope: float, slope_variance: Floats, options: FitOptions, terms: TermResults
 ) -> tuple[float, float, bool]:
-    """Include R if the slope is larger than noise explains with K at the upper end of its interval.
+    """Include R if the slope is too large to be caused by noise.
+
+    The noise is computed with K at the upper end of the confidence interval.
 
     Parameters
     ----------
@@ -250,7 +256,7 @@ def select_ramp(
     status[R] = 2 if terms.entered[R] else 1
     terms.lo[R] = max(abs(slope) - Z95 * np.sqrt(most), 0.0) if terms.entered[R] else 0.0
     terms.hi[R] = abs(slope) + (Z95 if terms.entered[R] else UPPER_BOUND_Z) * np.sqrt(most)
-    # K is only bounded, and the other terms do not explain the slope
+    # True if K is only bounded and the other terms do not explain the slope.
     others = noise - max(theta[K], 0.0) * slope_variance[K]
     either = status[K] == 1 and status[R] == 1 and slope * slope > options.enter**2 * others
     return noise, most, bool(either)
@@ -265,9 +271,9 @@ def store_linear_map(
     Parameters
     ----------
     axis : int
-        Row of the records.
+        Row of the arrays.
     rows : ndarray of int64
-        Rows in use.
+        Indices of the τ in use.
     problem : LeastSquares
         Problem with its weights and normal equations.
     curves : CurvesOfAxes
@@ -283,7 +289,7 @@ def store_linear_map(
         False if the solution cannot be stored as a linear map.
     """
     if rows[-1] - rows[0] != rows.size - 1:
-        return False  # a τ without terms between others, which only a gap nearly as long as the window can cause
+        return False  # A τ between others has no terms. Only a gap nearly as long as the window can cause this.
     for a in range(5):
         for b in range(5):
             maps.normal[axis, a, b] = problem.normal[a, b]
@@ -328,7 +334,7 @@ def compute_map_validity_limits(
         sigma = np.sqrt(tests.absent_variance[a])
         reach = max(MAX_THETA_CHANGE * abs(terms.theta[a]), MAX_THETA_SIGMA * sigma)
         low[a], high[a] = terms.theta[a] - reach, terms.theta[a] + reach
-        # limits of û, at which the term would be added or dropped
+        # The limits of û are the values at which the term would be added or dropped.
         low[NOISES + a], high[NOISES + a] = -np.inf, np.inf
         if terms.entered[a]:
             low[NOISES + a] = options.leave * sigma

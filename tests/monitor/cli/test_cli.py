@@ -774,8 +774,8 @@ def test_motion_is_told_and_struck_out_on_demand(call: Call, recording: Path) ->
     [motion] = left["motions"]
     assert (motion["axis"], struck["motions"]) == ("gx", [motion])
     assert motion["t"] == pytest.approx(89.75, abs=0.3)
-    assert "the sensor moved once, 3 s in all: left in; --rest strikes it out" in left["notes"]
-    assert "the sensor moved once, 3 s in all: struck out" in struck["notes"]
+    assert "the sensor moved once, 3 s in all: not removed; --rest removes the samples in motion" in left["notes"]
+    assert "the sensor moved once, 3 s in all: removed" in struck["notes"]
     n = [one["axes"]["gx"]["coefficients"]["N"]["value"] for one in (left, struck)]
     whole = json.loads(call("analyze", str(recording), "--json", "-").out)["axes"]["gx"]["coefficients"]["N"]["value"]
     assert n[1] == pytest.approx(whole, rel=0.03)

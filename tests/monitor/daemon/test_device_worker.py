@@ -553,7 +553,7 @@ def test_the_window_is_held_against_the_model_in_force(tmp_path):
     assert rig.caught.gaps[0][1].axes == {}  # too few yet
     assert look.agrees == dict.fromkeys(look.axes, True)
     assert len(look.axes) == 6
-    assert not any(one.exceeds_threshold for one in look.axes.values())
+    assert not any(one.gap > one.threshold for one in look.axes.values())
     assert rig.caught.events == []
 
 

@@ -36,7 +36,7 @@ def test_holes_stay_in_their_places(rate, rows):
     values = white(8000)
     grid, found, notes = resample_to_grid(recorded_blocks(index[kept] / 100, values[kept], rows), rate)
     assert found == 100.0
-    assert notes == ["124 samples are missing in 2 places; terms that touch them are left out"]
+    assert notes == ["124 samples are missing in 2 places; differences that contain them are left out"]
     expected = np.where(kept[:, None], values, np.nan)
     assert np.array_equal(grid, expected, equal_nan=True)
 
@@ -45,7 +45,7 @@ def test_a_very_long_pause_is_not_counted_among_the_short_holes():
     index = np.concatenate([np.arange(3000), 3000 + 2 * MAX_GAP_SAMPLES + np.arange(3000)])
     index = np.delete(index, [1000, 1001, 1002])
     _, _, notes = resample_to_grid(recorded_blocks(index / 100, white(5997)), 100.0)
-    assert "3 samples are missing in 1 place; terms that touch them are left out" in notes
+    assert "3 samples are missing in 1 place; differences that contain them are left out" in notes
 
 
 def test_a_very_long_pause_costs_no_memory_and_no_term_reaches_across():
@@ -53,7 +53,7 @@ def test_a_very_long_pause_costs_no_memory_and_no_term_reaches_across():
     values = white(6000)
     values[3000:] += 1.0  # a step that would show in every term across
     found = analyze(recorded_blocks(t, values), 100.0)
-    assert any("too long to keep in place" in note for note in found.notes)
+    assert any("too long to be kept" in note for note in found.notes)
     assert found.estimate.curve.n == 6001
     assert np.nanmax(found.estimate.curve.avar) < 2e-6
 
@@ -134,7 +134,7 @@ def test_too_few_averaging_times_for_a_fit_are_said():
 
 def test_times_that_contradict_the_stated_rate_are_said():
     found = analyze(recorded_blocks(np.arange(6000) / 50), 100.0)
-    assert "the rate used is 100 Hz, but the times step by 0.02 s, 50 Hz" in found.notes
+    assert "the rate used is 100 Hz, but the times increase in steps of 0.02 s, 50 Hz" in found.notes
 
 
 # --- what happened in it ---------------------------------------------------------------------------
@@ -155,11 +155,11 @@ def test_motion_is_told_and_left_in_unless_it_is_to_be_struck_out():
     told = detect_events(left)
     [motion] = told.motions
     assert 5900 <= motion.since < 6000
-    assert "the sensor moved once, 3 s in all: left in; --rest strikes it out" in told.notes
+    assert "the sensor moved once, 3 s in all: not removed; --rest removes the samples in motion" in told.notes
     assert any(note.startswith(f"at {motion.since / 100:.1f} s: moved for 3.0 s: gx") for note in told.notes)
     struck = detect_events(analyze(blocks, 100.0, remove_motion=True))
     assert struck.motions == told.motions
-    assert sum("struck out" in note for note in struck.notes) == 1
+    assert sum("s in all: removed" in note for note in struck.notes) == 1
     assert np.isnan(struck.values[motion.since : motion.until]).all()
     assert not np.isnan(struck.values[: motion.since]).any()
     assert left.estimate.curve.avar[0, 0] > 1.5 * struck.estimate.curve.avar[0, 0]
@@ -183,7 +183,10 @@ def test_changes_are_told_with_time_and_size():
     assert found.notes[0] == "of the file"
     [note] = [one for one in found.notes if "angle random walk" in one]
     assert re.fullmatch(r"at (399|400)\.\d s: gz angle random walk rose by [78]\d % \(\d+\.\d σ\)", note)
-    assert "one curve of the whole recording mixes before and after; --window S shows them apart" in found.notes
+    assert (
+        "the curve of the whole recording mixes the noise before and after; --window S shows the noise over time"
+        in found.notes
+    )
 
 
 def test_a_sensor_that_never_rests_is_an_answer():

@@ -32,8 +32,8 @@ def test_the_sensor_s_own_bandwidth_is_told_once_for_axes_alike():
     curve, fit = departing()
     [note] = analysis_notes.of_unexplained_curve(curve, fit, axes, RATE_HZ)
     assert note == (
-        "gx, gy, ax, ay, az: white noise ends below half the sample rate, as behind a first-order low-pass at about "
-        "25 Hz; N is the level below it"
+        "gx, gy, ax, ay, az: white noise ends below half the sample rate, as after a first-order low-pass at about "
+        "25 Hz; N is the level below this frequency"
     )
 
 
@@ -53,7 +53,9 @@ def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
     known = analysis_notes.replace_guessed_causes(["first", *found.notes], curve, found.fit, told)
     assert known[0] == "first"
     [known] = [one for one in known if "departs" in one]
-    assert known == note.replace("vibration, motion or temperature may be why", "the line at 0.4999 Hz shows there")
+    assert known == note.replace(
+        "vibration, motion or temperature may be the cause", "the likely cause is the line at 0.4999 Hz"
+    )
     assert analysis_notes.of_lines_and_outliers(told, np.zeros(6)) == ["a line at 0.4999 Hz: gy 0.11 °/s"]
 
 
@@ -80,11 +82,10 @@ def line(axis, hz, amplitude=1.0, wide=False):
 
 def test_axes_that_depart_alike_share_a_note():
     curve, fit = departing((9.0, 36.0, 1.0, 16.0, 4.0, 1.0), at=(2, 2, 2, 2, 6, 2))
-    text = "vibration, motion or temperature may be why; intervals are widened accordingly"
+    text = "vibration, motion or temperature may be the cause; intervals are widened accordingly"
     assert analysis_notes.of_misfit(curve, fit) == [
-        "gx, gy, ax: the curve departs from every sum of the five terms (scatter 3 to 6 times wider), most at "
-        f"τ = 0.04 s: {text}",
-        f"ay: the curve departs from every sum of the five terms (scatter 2 times wider), most at τ = 0.64 s: {text}",
+        f"gx, gy, ax: the five terms do not explain the curve (scatter 3 to 6 times wider), most at τ = 0.04 s: {text}",
+        f"ay: the five terms do not explain the curve (scatter 2 times wider), most at τ = 0.64 s: {text}",
     ]
 
 
@@ -94,8 +95,8 @@ def test_motion_left_in_is_one_note_that_points_to_rest():
         analysis_notes.of_misfit(curve, fit), curve, fit, [line(0, 9.0)], moved=True
     )
     assert notes == [
-        "gx, gy, gz, ax, ay, az: the curve departs from every sum of the five terms (scatter 2 to 3 times wider): the "
-        "sensor moved, which may be why; --rest strikes it out; intervals are widened accordingly"
+        "gx, gy, gz, ax, ay, az: the five terms do not explain the curve (scatter 2 to 3 times wider): "
+        "motion of the sensor may be the cause; --rest removes the samples in motion; intervals are widened accordingly"
     ]
     assert analysis_notes.replace_guessed_causes(["other"], *departing(), [], moved=True) == ["other"]
 
@@ -106,17 +107,17 @@ def test_a_line_is_blamed_only_where_it_shows():
     found = [line(0, 9.0), line(1, 9.03), line(2, 0.05, 0.1), line(3, 9.0)]
     notes = analysis_notes.of_misfit(curve, fit, found)
     assert [note.split(":")[0] for note in notes] == ["gx, gy", "gz"]
-    assert "the line at 9 Hz shows there" in notes[0]
-    assert "may be why" in notes[1]
+    assert "the likely cause is the line at 9 Hz" in notes[0]
+    assert "may be the cause" in notes[1]
 
 
 def test_what_is_left_out_is_one_note_with_the_line_that_is_told():
     curve, fit = departing(left_out=(4, 3, 0, 0, 0, 1))
     assert analysis_notes.of_misfit(curve, fit, [line(0, 9.0, wide=True), line(1, 9.0)]) == [
-        "gx, gy: the fit leaves out τ up to 0.08, 0.04 s, which no sum of the five terms follows: the resonance about "
-        "9 Hz shows there",
-        "az: the fit leaves out τ up to 0.01 s, which no sum of the five terms follows: the sensor's bandwidth or a "
-        "vibration shows there",
+        "gx, gy: the fit leaves out τ up to 0.08, 0.04 s, which the five terms do not explain: the likely cause is "
+        "the resonance about 9 Hz",
+        "az: the fit leaves out τ up to 0.01 s, which the five terms do not explain: the likely cause is the "
+        "bandwidth of the sensor or a vibration",
     ]
 
 
@@ -134,7 +135,7 @@ def test_a_drift_in_a_short_record_is_k_or_r():
     found = analyzed(values)
     assert found.fit.k_or_r.tolist() == [False, False, True, False, False, False]
     assert [one for one in found.notes if "K or R" in one] == [
-        "gz: K or R: the record drifts by more than Q, N and B make, and is too short to tell a ramp from "
+        "gz: K or R: the recording drifts by more than Q, N and B explain, and is too short to distinguish a ramp from "
         "rate random walk"
     ]
 
@@ -147,7 +148,7 @@ def test_with_samples_missing_no_slope_tells_them_apart():
     [note] = [one for one in found.notes if "K or R" in one]  # one for all axes that have it
     axes = ", ".join(np.array(AXES)[found.fit.k_or_r])
     assert "gx, gy" in axes
-    assert note == f"{axes}: K or R: samples are missing, so that no slope tells a ramp from rate random walk"
+    assert note == f"{axes}: K or R: too many samples are missing to distinguish a ramp from rate random walk"
 
 
 def motion(since):
@@ -160,7 +161,7 @@ def change(kind="noise_changed"):
 
 def test_many_events_are_counted_rather_than_listed():
     notes = analysis_notes.of_motions([motion(100 * i) for i in range(14)], RATE_HZ, removed=True)
-    assert notes[0] == "the sensor moved 14 times, 7 s in all: struck out"
+    assert notes[0] == "the sensor moved 14 times, 7 s in all: removed"
     assert notes[1] == "at 0.0 s: moved for 0.5 s: gx up to 5.7 °/s"
     assert notes[-1] == "and 4 more motions"
     assert len(notes) == 1 + analysis_notes.MAX_NOTES + 1

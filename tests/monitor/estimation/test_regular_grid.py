@@ -16,7 +16,7 @@ def test_holes_stay_in_their_places(rate, rows):
     values = white(8000)
     grid, found, notes = resample_to_grid(recorded_blocks(index[kept] / 100, values[kept], rows), rate)
     assert found == 100.0
-    assert notes == ["124 samples are missing in 2 places; terms that touch them are left out"]
+    assert notes == ["124 samples are missing in 2 places; differences that contain them are left out"]
     assert np.array_equal(grid, np.where(kept[:, None], values, np.nan), equal_nan=True)
 
 
@@ -24,7 +24,7 @@ def test_a_very_long_pause_is_one_missing_sample():
     index = np.concatenate([np.arange(3000), 3000 + 2 * MAX_GAP_SAMPLES + np.arange(3000)])
     grid, _, notes = resample_to_grid(recorded_blocks(index / 100), 100.0)
     assert len(grid) == 6001
-    assert any("too long to keep in place" in note for note in notes)
+    assert any("too long to be kept" in note for note in notes)
 
 
 @pytest.mark.parametrize("rows", [17, 1000, 10**6])
@@ -59,14 +59,14 @@ def test_more_than_ten_notes_are_counted():
 def test_steady_times_that_contradict_the_stated_rate():
     _, rate, notes = resample_to_grid(recorded_blocks(np.arange(6000) / 50), 100.0)
     assert rate == 100.0
-    assert "the rate used is 100 Hz, but the times step by 0.02 s, 50 Hz" in notes
+    assert "the rate used is 100 Hz, but the times increase in steps of 0.02 s, 50 Hz" in notes
 
 
 def test_unsteady_times_that_contradict_the_stated_rate():
     """A host that stamps in bursts: only the mean tells."""
     t = np.ceil(np.arange(20000) / 99.32 / 0.043) * 0.043 + np.tile([0.0, 0.001, 0.002, 0.003], 5000)
     _, _, notes = resample_to_grid(recorded_blocks(np.sort(t)), 80.0)
-    assert any(note.startswith("the rate used is 80 Hz, but by the times 99.3") for note in notes)
+    assert any(note.startswith("the rate used is 80 Hz, but the times give a mean of 99.3") for note in notes)
     assert not any("rate used" in note for note in resample_to_grid(recorded_blocks(np.sort(t)), 99.4)[2])
 
 
@@ -76,8 +76,8 @@ def test_a_stated_rate_is_contradicted_from_a_fifth_of_a_percent_on(off, told, j
     t = np.arange(17000) / (250.0 * (1.0 - off)) + jitter_s * np.random.default_rng(2).random(17000)
     _, rate, notes = resample_to_grid(recorded_blocks(t), 250.0)
     assert rate == 250.0
-    [*said] = [float(note.split("by the times ")[1].split()[0]) for note in notes if "by the times" in note]
-    steps = [note for note in notes if "times step by" in note]
+    [*said] = [float(note.split("give a mean of ")[1].split()[0]) for note in notes if "give a mean of" in note]
+    steps = [note for note in notes if "increase in steps of" in note]
     assert bool(said or steps) == told
     assert said == pytest.approx([250.0 * (1.0 - off)] * len(said), rel=1e-4)
 
@@ -96,13 +96,13 @@ def test_short_or_jittery_times_accuse_no_rate(seed):
 def test_a_coarse_resolution_of_times_is_told(unit_s, said):
     t = np.floor(np.arange(8000) / 5.0 / unit_s + 1e-9) * unit_s
     _, _, notes = resample_to_grid(recorded_blocks(t), None)
-    assert notes == [f"times have a resolution of {said} s; samples are taken to be even"]
+    assert notes == [f"times have a resolution of {said} s; equal time steps are assumed"]
 
 
 def test_uneven_times_without_a_unit_are_told_as_such():
     t = np.cumsum(np.random.default_rng(3).exponential(0.01, 8000))
     _, _, notes = resample_to_grid(recorded_blocks(t), None)
-    assert any(note.startswith("times step unevenly: by 0.0") for note in notes)
+    assert any(note.startswith("time steps are uneven: median 0.0") for note in notes)
 
 
 def test_both_counts_of_missing_and_late_are_told():
@@ -116,9 +116,9 @@ def test_both_counts_of_missing_and_late_are_told():
     assert rate == 100.0
     assert np.flatnonzero(np.isnan(grid[:, 0])) == pytest.approx([8089, 9780, 29_187], abs=10)
     late, missing = notes
-    assert missing == "3 samples are missing in 3 places; terms that touch them are left out"
-    assert late.startswith("a sample came late by a period or more 29")
-    assert late.endswith("later ones made good for it, so that none is missing there")
+    assert missing == "3 samples are missing in 3 places; differences that contain them are left out"
+    assert late.startswith("a sample was late by a period or more 29")
+    assert late.endswith("later times show that no sample is missing there")
 
 
 def test_values_as_coarse_as_their_noise_are_told_by_kind_and_size():
@@ -127,12 +127,12 @@ def test_values_as_coarse_as_their_noise_are_told_by_kind_and_size():
     values[:, 4] = np.round(values[:, 4] / 4e-4) * 4e-4
     values[:, 5] = np.round(values[:, 5] / 2e-3) * 2e-3
     gyros, az = resample_to_grid(recorded_blocks(np.arange(20_000) / 100, values), None)[2]
-    size, times = gyros.removesuffix(" the noise from sample to sample: quantization shapes the shortest τ").split(
+    size, times = gyros.removesuffix(" the noise from sample to sample; quantization affects the shortest τ").split(
         "), "
     )
-    assert size == "values come in steps of 0.057 °/s (gx, gy, gz"
+    assert size == "values have steps of 0.057 °/s (gx, gy, gz"
     assert all(float(one) == pytest.approx(0.97, abs=0.05) for one in times.removesuffix(" times").split(" to "))
-    assert az.startswith("values come in steps of 0.2 mg (az), ")
+    assert az.startswith("values have steps of 0.2 mg (az), ")
     assert float(az.split("(az), ")[1].split()[0]) == pytest.approx(1.9, abs=0.3)
 
 
@@ -146,8 +146,8 @@ def test_stale_rows_are_told_and_kept(fraction, step):
         values[row] = values[row - 1]
     grid, _, notes = resample_to_grid(recorded_blocks(np.arange(20000) / 100, values), None)
     assert np.array_equal(grid, values)
-    (note,) = [one for one in notes if "in steps of" not in one]
-    assert note.endswith("the sensor updates slower than it is read; they are kept")
+    (note,) = [one for one in notes if "have steps of" not in one]
+    assert note.endswith("the sensor updates more slowly than it is read; these rows are kept")
     assert float(note.split()[0]) == pytest.approx(100 * fraction, rel=0.1)
 
 
@@ -162,7 +162,7 @@ def test_a_boat_s_bus_adapter_is_late_and_loses_five():
 
     blocks = list(iter_blocks(load_samples(recordings() / "can-boat/moored-5min.npz")))
     grid, _, notes = resample_to_grid(blocks, None)
-    assert "5 samples are missing in 5 places; terms that touch them are left out" in notes
+    assert "5 samples are missing in 5 places; differences that contain them are left out" in notes
     at_s = np.flatnonzero(np.isnan(grid[:, 0])) / 100
     assert at_s == pytest.approx([80.9, 97.8, 98.8, 101.8, 291.9], abs=0.4)  # its clock runs slow by 0.08 %
 

@@ -311,14 +311,14 @@ def test_nothing_known_names_nothing():
 def test_learned_after_its_time():
     detector = ChangeDetector(100.0)
     detector.update(white(int(LEARN_S * 100) - TICK_SAMPLES))
-    assert not detector.learned_axes.any()
+    assert not detector.watched_octaves[0].any()
     detector.update(white(4 * TICK_SAMPLES))
-    assert detector.learned_axes.all()
+    assert detector.watched_octaves[0].all()
     assert detector.watched_octaves[:, 0].sum() >= 6
     detector.restart(GZ)
-    assert detector.learned_axes.tolist() == [True, True, False, True, True, True]
+    assert detector.watched_octaves[0].tolist() == [True, True, False, True, True, True]
     detector.restart()
-    assert not detector.learned_axes.any()
+    assert not detector.watched_octaves[0].any()
 
 
 @pytest.mark.parametrize(("rate", "alarms"), [(0.0, 1.0), (float("nan"), 1.0), (100.0, 0.0), (100.0, -1.0)])

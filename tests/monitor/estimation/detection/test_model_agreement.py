@@ -41,8 +41,8 @@ def test_a_gap_that_stays_is_told_once_with_where_and_how_much() -> None:
     (event,) = looks.see(STEP, gz=6.0, gx=2.0)
     assert (event.kind, event.axis, event.sigma) == (KIND, "gz", 6.0)
     assert event.text == (
-        "gz disagrees with its model at τ 0.08 to 0.32 s: deviation 1.5 times the model's, "
-        "6 σ apart where chance stays below 4.0"
+        "gz disagrees with its model at τ 0.08 to 0.32 s: the deviation is 1.5 times the deviation of the model, "
+        "a gap of 6 σ with a threshold of 4.0 σ"
     )
     assert event.values == {
         "model": {"agrees": False, "gap": 6.0, "threshold": 4.0, "ratio": 1.5, "tau_lo": 0.08, "tau_hi": 0.32}
@@ -77,7 +77,7 @@ def test_it_agrees_again_only_below_the_lower_limit() -> None:
     assert looks.see(HOLD, gz=1.5) == []
     (event,) = looks.see(STEP, gz=1.5)
     assert (event.kind, event.values["model"]["agrees"]) == (KIND, True)
-    assert event.text == "gz agrees with its model again: 1.5 σ apart at most"
+    assert event.text == "gz agrees with its model again: the largest gap is 1.5 σ"
     assert looks.agreement.decisions == {"gz": True}
     assert len(looks.see(2 * HOLD, gz=6.0)) == 1
 
