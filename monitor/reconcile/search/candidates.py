@@ -116,7 +116,7 @@ def fit_correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
     best = _most_likely(
         axis, effects, [ExponentiallyCorrelated(sigma=initial_size(axis), correlation_time=float(t)) for t in times_s]
     )
-    found = refine_shape(axis, (*effects, best), -1, ["correlation_time"], 2.0)[-1]
+    found = refine_shape(axis, effects, best, "correlation_time", 2.0)
     assert isinstance(found, ExponentiallyCorrelated)
     return [found] if shortest <= found.correlation_time <= longest else []
 
@@ -129,12 +129,11 @@ def propose_resonances(whitened: WhitenedAxis) -> list[Effect]:
             Narrowband(sigma=initial_size(axis), frequency=middle, bandwidth=float(width * factor))
             for factor in (0.3, 0.6, 1.0, 1.8)
         ]
-        effects = (*whitened.effects, _most_likely(axis, whitened.effects, trials))
-        effects = refine_shape(axis, effects, -1, ["bandwidth"], 2.5)
-        peak = effects[-1]
+        peak = _most_likely(axis, whitened.effects, trials)
+        peak = refine_shape(axis, whitened.effects, peak, "bandwidth", 2.5)
         assert isinstance(peak, Narrowband)
-        effects = refine_shape(axis, effects, -1, ["frequency"], 1.0 + 0.7 * peak.bandwidth / peak.frequency)
-        found.append(refine_shape(axis, effects, -1, ["bandwidth"], 1.5)[-1])
+        peak = refine_shape(axis, whitened.effects, peak, "frequency", 1.0 + 0.7 * peak.bandwidth / peak.frequency)
+        found.append(refine_shape(axis, whitened.effects, peak, "bandwidth", 1.5))
     return found
 
 
@@ -211,7 +210,7 @@ def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
     found: list[Effect] = []
     for order in FILTER_ORDERS:
         best = _most_likely(axis, whitened.effects, [BandwidthLimit(cutoff=float(f), order=order) for f in cutoffs])
-        refined = refine_shape(axis, (*whitened.effects, best), -1, ["cutoff"], 1.4)[-1]
+        refined = refine_shape(axis, whitened.effects, best, "cutoff", 1.4)
         assert isinstance(refined, BandwidthLimit)
         if refined.cutoff < 0.99 * nyquist:
             found.append(refined)
@@ -252,11 +251,11 @@ def propose_temperature_effects(whitened: WhitenedAxis) -> list[Effect]:
 
 
 def _best_time_constant(
-    whitened: WhitenedAxis, trials: Sequence[TurnOnTransient | TemperatureLag], reach: float, shortest_s: float
+    whitened: WhitenedAxis, trials: Sequence[TurnOnTransient | TemperatureLag], search_factor: float, shortest_s: float
 ) -> list[Effect]:
     """Return the best effect with a refined time constant, or nothing if the time constant is out of range."""
     best = _most_likely(whitened.axis, whitened.effects, trials)
-    refined = refine_shape(whitened.axis, (*whitened.effects, best), -1, ["time_constant"], reach)[-1]
+    refined = refine_shape(whitened.axis, whitened.effects, best, "time_constant", search_factor)
     assert isinstance(refined, (TurnOnTransient, TemperatureLag))
     longest_s = MAX_TIME_CONSTANT_FRACTION * whitened.axis.length_s
     return [refined] if shortest_s < refined.time_constant <= longest_s else []

@@ -145,7 +145,7 @@ def _expected_gain(fit: AxisFit, effect: Effect) -> float:
     """Return the gain in nats of a deterministic effect of a given size beside the noise of a fit: ½ Σ (β R)²/v."""
     half = fit.axis
     columns = half.regressor_transforms(effect)
-    weight = half.bins.spread(half.used_bins / fit.whittle.variance)
+    weight = half.bins.expand_to_coefficients(half.used_bins / fit.whittle.variance)
     if isinstance(effect, Sinusoidal):
         return 0.5 * effect.amplitude**2 * float((columns[0] ** 2 * weight).sum())
     quadratic = getattr(effect, "quadratic", None)

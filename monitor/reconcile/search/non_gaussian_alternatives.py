@@ -190,7 +190,9 @@ def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | 
     compared = compare_poisson_with_random_walk(series, tau0_s, rest, excess)
     gain, whole = compared.gain, walk.log_likelihood + compared.gain
     if steps:
-        compared = compare_poisson_with_single_steps(series, tau0_s, rest, excess, most=max(steps, MIN_FITTED_STEPS))
+        compared = compare_poisson_with_single_steps(
+            series, tau0_s, rest, excess, max_single_steps=max(steps, MIN_FITTED_STEPS)
+        )
         gain = compared.gain + STEP_PENALTY_NATS * max(compared.single_steps - MAX_FREE_STEPS, 0)
     rate, height = (float(compared.parameters[name].value) for name in ("rate", "height"))
     found = (*effects[hypothesis.given_count :], PoissonSteps(rate=rate, height=height))
