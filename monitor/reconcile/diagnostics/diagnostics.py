@@ -107,7 +107,7 @@ def diagnose_lines(whitened: WhitenedAxis) -> Finding:
     return Finding(gain, Location(frequency=(f_hz - half, f_hz + half)))
 
 
-def find_line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[float, float]]:
+def find_line_peaks(white: Floats, rate_hz: float, max_peaks: int) -> list[tuple[float, float]]:
     """Return the largest separate peaks of the periodogram, strongest first.
 
     Parameters
@@ -116,7 +116,7 @@ def find_line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[floa
         Whitened series.
     rate_hz : float
         Sample rate in Hz.
-    most : int
+    max_peaks : int
         Largest number of peaks.
 
     Returns
@@ -127,7 +127,7 @@ def find_line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[floa
     power = periodogram(white)
     size = 2 * (power.size - 1)
     found = []
-    for _ in range(most):
+    for _ in range(max_peaks):
         at = int(np.argmax(power))
         if power[at] <= 0.0:
             break
