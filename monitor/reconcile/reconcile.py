@@ -78,20 +78,6 @@ class RecordingContext:
     regressors: RegressorCache
     map_function: MapFunction  # distributes the work on axes and simulated recordings
 
-    def build_repaired_axes(self, recording: Recording, effects: Mapping[str, Effects], seed: int) -> dict[str, Axis]:
-        """Return the repaired axes of the measured recording, or of a simulated recording with the same temperature.
-
-        Parameters
-        ----------
-        recording : Recording
-            Measured or simulated recording.
-        effects : mapping of str to tuple of Effect
-            Effects of each axis.
-        seed : int
-            Seed of the replacement samples.
-        """
-        return build_repaired_axes(recording, effects, self.regressors, np.random.default_rng(seed))
-
 
 @dataclass(frozen=True, slots=True)
 class _AxesSearchResult:
@@ -176,7 +162,9 @@ def reconcile(
 
 def fit_five_terms(run: RecordingContext) -> NoiseModel:
     """Fit the terms Q, N, B, K and R to each axis and keep the significant terms."""
-    axes = run.build_repaired_axes(run.recording, dict.fromkeys(run.recording.values, ()), run.seed)
+    axes = build_repaired_axes(
+        run.recording, dict.fromkeys(run.recording.values, ()), run.regressors, np.random.default_rng(run.seed)
+    )
     return NoiseModel({name: _fit_terms(axis) for name, axis in axes.items()}, run.recording.rate_hz)
 
 
@@ -216,7 +204,7 @@ def _diagnose_simulations(
     def diagnose(seed: int) -> dict[str, Findings]:
         drawn = model.simulate(template.samples, template.rate_hz, seed, template.temperature_c)
         simulated = replace(template, values={axis: drawn[:, AXES.index(axis)] for axis in template.values})
-        axes = run.build_repaired_axes(simulated, effects, seed)
+        axes = build_repaired_axes(simulated, effects, run.regressors, np.random.default_rng(seed))
         return {
             name: run_diagnostics(whiten_axis(fit_with_fixed_noise(axes[name], effects[name]).fit)) for name in names
         }
@@ -232,7 +220,7 @@ def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str
     and leaks from the other axis are not tried.
     """
     effects = _effects_by_axis(model, run.recording)
-    axes = run.build_repaired_axes(run.recording, effects, run.seed)
+    axes = build_repaired_axes(run.recording, effects, run.regressors, np.random.default_rng(run.seed))
     error = detect_sample_rate_error(axes, effects)
     if error is not None:
         ratio = float(error.ratio.value)

@@ -26,7 +26,6 @@ from monitor.reconcile.result import (
 )
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
-"""Name and version of the JSON schema."""
 _JSON_ENCODER: Final = msgspec.json.Encoder()
 
 

@@ -36,9 +36,7 @@ from monitor.reconcile.result import Location
 MAX_LAG_SAMPLES: Final = 64
 """Largest lag of the autocorrelation, in samples."""
 TRANSIENT_TIME_FRACTIONS: Final = 0.3 / 3.0 ** np.arange(6)
-"""Time constants of transients, as fractions of the recording."""
 TEMPERATURE_DELAYS_S: Final = (10.0, 30.0, 90.0, 270.0, 810.0)
-"""Time constants of delayed temperature effects, in seconds."""
 STEP_MARGIN_FRACTION: Final = 0.001
 """Fraction of the recording at each end in which no step is detected, because the ends of a recording affect the
 spectrum.

@@ -29,7 +29,6 @@ FALSE_ALARM_PROBABILITY: Final = 0.01
 UPPER_QUANTILE: Final = 0.25
 """Fraction of the gains, from the largest downwards, whose distribution is modelled as exponential."""
 EXCESS_RANGE_NATS: Final = (1.0, 1.3)
-"""Limits of the mean excess in nats."""
 AXIS_MARGIN_NATS: Final = 3.0
 """Margin in nats above the largest simulated gain of an axis."""
 

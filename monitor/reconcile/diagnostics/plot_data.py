@@ -20,7 +20,6 @@ from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import PlotData
 
 SPECTRUM_POINTS: Final = 240
-"""Approximate number of points of a spectrum."""
 TIME_BLOCKS: Final = 240
 TEMPERATURE_BINS: Final = 24
 LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}

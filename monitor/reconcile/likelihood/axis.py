@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Effect, Leak, Transform
+from monitor.noise.effect import Effect, Leak, Source, Transform
 from monitor.noise.effects import (
     TRANSFORM_ORDER,
     AngleRandomWalk,
@@ -31,7 +31,6 @@ from monitor.reconcile.likelihood.effect_terms import (
     NOISE_SIZE_PARAMETERS,
     size,
     unit_regressors,
-    unit_spectrum,
     with_regressor_factors,
     with_size,
 )
@@ -48,11 +47,9 @@ MIN_STOP_BAND_FRACTION: Final = 0.02
 coefficient, which may be weak by chance.
 """
 MAX_CACHE_BYTES: Final = 1 << 28
-"""Largest memory of the cached regressors, in bytes."""
 MIN_CACHED_SERIES: Final = 16
 """Smallest number of cached series, for recordings of any length. The diagnostics use 16 series."""
 MAX_CACHED_PRODUCTS: Final = 4096
-"""Largest number of cached sums over bins for each axis."""
 INITIAL_FLOOR_RATIO: Final = 1e-3
 """Starting value of the noise floor after a low-pass filter, relative to the total power."""
 INITIAL_EXTRA_RATIO: Final = 1e-2
@@ -264,8 +261,9 @@ class Axis:
                 if isinstance(other, NoiseStep):
                     later = 1.0 - min(other.time * self.rate_hz / self.n, 1.0)
                     factor *= 1.0 + later * (other.ratio**2 - 1.0)  # mean variance over the recording
-        tau0_s = 1.0 / self.rate_hz
-        source = Spectrum(lambda f: factor * unit_spectrum(effect, f, tau0_s), None, tau0_s)
+        tau0_s, unit = 1.0 / self.rate_hz, with_size(effect, 1.0)
+        assert isinstance(unit, Source)
+        source = Spectrum(lambda f: factor * unit.psd(f, tau0_s), None, tau0_s)
         density = _density_after(transforms, source, self.bins) - _density_after(transforms, None, self.bins)
         return np.asarray(density / tau0_s)
 

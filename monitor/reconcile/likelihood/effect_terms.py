@@ -104,27 +104,6 @@ def with_size(effect: Effect, value: float) -> Effect:
     return replace(effect, **{name: abs(value) if unsigned else value})  # type: ignore[type-var]
 
 
-def unit_spectrum(effect: Effect, f_hz: Floats, tau0_s: float) -> Floats:
-    """Return the two-sided spectral density of a noise effect with size one, before any transform.
-
-    Parameters
-    ----------
-    effect : Effect
-        Noise effect.
-    f_hz : ndarray of float64, shape (m,)
-        Frequencies in Hz.
-    tau0_s : float
-        Sample period in seconds.
-
-    Returns
-    -------
-    ndarray of float64, shape (m,)
-        Spectral density in unit²/Hz.
-    """
-    assert isinstance(effect, Source)
-    return np.asarray(with_size(effect, 1.0).psd(f_hz, tau0_s))  # type: ignore[attr-defined]
-
-
 def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
     """Return the regressors of a deterministic effect.
 

@@ -28,7 +28,6 @@ MAX_BLOCKS: Final = 1 << 15
 TARGET_BLOCKS: Final = 200.0
 """Smallest number of blocks in a recording with sufficiently many samples."""
 MIN_BLOCKS: Final = 16
-"""Smallest number of blocks."""
 INITIAL_VARIANCE_RATIO: Final = 100.0
 """Prior variance of the first level relative to the variance of the data. This prior is effectively flat."""
 FLICKER_TIME_RATIO: Final = 10.0

@@ -22,9 +22,7 @@ from monitor.reconcile.result import ParameterInterval
 RESIZE_PENALTY_NATS: Final = 5.0
 """Log-likelihood gain in nats that justifies a change of the size of a noise effect of the model."""
 GOLDEN: Final = 0.6180339887498949
-"""Inverse of the golden ratio."""
 SHAPE_ITERATIONS: Final = 12
-"""Number of iterations of the search for a shape parameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,9 +58,14 @@ class Hypothesis:
         return sum(at < self.given_count for at in self.fit.fitted_noise)
 
     @property
+    def resize_penalty(self) -> float:
+        """Penalty for the fitted sizes of the model, in nats."""
+        return RESIZE_PENALTY_NATS * self.refitted_size_count
+
+    @property
     def score(self) -> float:
         """Log-likelihood less the penalties for fitted sizes of the model, in nats."""
-        return self.fit.log_likelihood - RESIZE_PENALTY_NATS * self.refitted_size_count
+        return self.fit.log_likelihood - self.resize_penalty
 
     def refit_with_added_effects(self, added: Sequence[Effect]) -> "Hypothesis":
         """Return the fit of the same model with the given added effects, by ``fit_with_fewest_changes``."""

@@ -43,9 +43,7 @@ START_WIDTHS: Final = np.array([1.3, 1.6, 2.0, 2.6, 3.4, 5.0, 8.0, 15.0, 40.0, 2
 NEIGHBOUR_SAMPLES: Final = 4
 """Largest distance in samples of two outliers that count as neighbours."""
 STUDENT_FREEDOMS: Final = np.geomspace(1.0, 300.0, 40)
-"""Degrees of freedom of Student's t that are tried."""
 MIN_MIXTURE_GAIN_NATS: Final = 0.01
-"""Smallest gain in nats of a second Gaussian."""
 MAX_Z: Final = 37.0
 """Value of z for a probability that underflows in 64 bits."""
 

@@ -44,7 +44,6 @@ Together, the hypotheses cover five times N/K. If they cover 1.3 times N/K, the 
 they cover 2.7 times N/K, the estimated rate is 5 to 10 % too low.
 """
 MIN_HYPOTHESIS_PROBABILITY: Final = 1e-6
-"""Probability below which a hypothesis is dropped."""
 MAX_START_JUMPS: Final = 2.0
 """Largest number of jumps in the time N/K at the start of a search. More frequent jumps cannot be resolved."""
 START_RATES: Final = 6

@@ -33,7 +33,6 @@ from monitor.reconcile.likelihood.event_process_comparison import (
 )
 
 TIMES_PER_BLOCK: Final = 8
-"""Number of times that are tried within a block."""
 
 
 class _SingleStepsFit(NamedTuple):

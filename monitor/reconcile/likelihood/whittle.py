@@ -27,7 +27,6 @@ from monitor.common.compiled import compiled
 MAX_FIT_ITERATIONS: Final = 200
 MAX_STEP_HALVINGS: Final = 12
 CONVERGENCE_NATS: Final = 1e-5
-"""Gain in nats below which the iteration stops."""
 MIN_VARIANCE_RATIO: Final = 1e-20
 """Lower limit of a variance, relative to the largest power of a bin."""
 

@@ -13,7 +13,6 @@ from monitor.noise.model import NoiseModel
 MIN_SAMPLES: Final = 4096
 """Smallest number of samples. A spectrum and a spectrogram need at least this number."""
 MIN_VALID_FRACTION: Final = 0.5
-"""Smallest fraction of the samples of an axis that must be valid."""
 TEMPERATURE_SMOOTHING_FRACTION: Final = 0.001
 """Length of the moving average of the temperature, as a fraction of the recording. The temperature of a sensor changes
 slowly, and thermometers are noisy.

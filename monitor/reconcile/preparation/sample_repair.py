@@ -29,7 +29,6 @@ MAX_VARIANCE_RATIO: Final = 1.01
 too wide.
 """
 MAX_WIDTH_TEST_SAMPLES: Final = 20_000
-"""Number of samples at which the widths are compared."""
 DONOR_RANGE_SAMPLES: Final = 1024
 """Number of good samples on each side among which the donor is chosen."""
 LONG_GAP_SAMPLES: Final = 100
@@ -39,7 +38,6 @@ MIN_WANDER_INTERVALS: Final = 16
 CLIP_LEVEL_SAMPLES: Final = 64
 """Number of samples on each side that determine the level of clipped samples."""
 MAX_CLIP_ITERATIONS: Final = 50
-"""Largest number of iterations between the level and the clipped samples."""
 CLIP_TOLERANCE_SIGMA: Final = 1e-2
 """Largest change of a sample, in standard deviations, that ends the iterations."""
 

@@ -31,7 +31,6 @@ from monitor.estimation.detection.resolution import GRID_TOLERANCE, SIGMA_PER_ME
 Mask = NDArray[np.bool_]
 
 MIN_SAMPLES: Final = 16
-"""Smallest number of samples for any statistic."""
 GRID_SEARCH_SAMPLES: Final = 4096
 """Number of samples in which a grid is searched. All samples are then checked against the grid."""
 MIN_STEP_TO_ROUNDING: Final = 25.0
@@ -49,13 +48,11 @@ levels changes the probability of a repeat by less than exp(−π²·0.8) = 4·1
 CHANCE_RELATIVE_ERROR: Final = 0.01
 """Relative uncertainty of the expected share of equal neighbours, because the noise is only approximately Gaussian."""
 MIN_EXPECTED_COINCIDENCES: Final = 1e-3
-"""Lower limit of the expected number of coincidences."""
 TEXT_UNITS: Final = (1.0, DEGREE, DEGREE / HOUR_S, G0)
 """Units in which a text may contain the values: SI, °/s, °/h and g."""
 MIN_DISTINCT_DECIMALS: Final = 8
 """Number of different decimal numbers above which agreement with a text is not due to chance."""
 PREDICTOR_TAPS: Final = 8
-"""Number of neighbours on each side that predict a sample."""
 
 
 @dataclass(frozen=True, slots=True)

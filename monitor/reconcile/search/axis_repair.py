@@ -25,9 +25,7 @@ from monitor.reconcile.preparation.value_statistics import detect_clipping, dete
 CLIP_RELATIVE_TOLERANCE: Final = 1e-9
 """Relative distance to the limit below which a sample counts as clipped."""
 MAX_SIGMA_ITERATIONS: Final = 40
-"""Largest number of iterations that restore the clipped samples."""
 SIGMA_RELATIVE_TOLERANCE: Final = 5e-4
-"""Relative change of the standard deviation that ends the iterations."""
 
 
 def build_repaired_axes(

@@ -76,7 +76,6 @@ MIN_DELAY_FRACTION: Final = 0.002
 """Shortest temperature delay as a fraction of the recording. The noise of the thermometer hides shorter delays."""
 MAX_PEAKS: Final = 2
 FILTER_ORDERS: Final = (1, 2, 3, 4)
-"""Orders of the low-pass filters that are tried."""
 
 CandidateFunction = Callable[[WhitenedAxis], list[Effect]]
 """Function that proposes effects of one kind."""

@@ -92,7 +92,7 @@ def cross_validate(
 
 
 def _fit_half(half: Axis, hypothesis: Hypothesis) -> AxisFit:
-    """Fit the effects of a hypothesis to one half of the axis."""
+    """Fit the effects of a hypothesis to one half. Sizes that are fixed in the hypothesis stay fixed."""
     return half.fit(hypothesis.effects, hypothesis.fit.fixed_noise)
 
 

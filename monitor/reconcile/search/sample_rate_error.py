@@ -32,9 +32,7 @@ also the largest loss of a single feature, because a feature with a larger loss 
 SAME_FEATURE_RATIO: Final = 1.01
 """Largest ratio of two frequencies, on any axes, that belong to the same feature."""
 MAX_TRIAL_RATIOS: Final = 12
-"""Number of ratios at which all axes are fitted."""
 SAMPLE_RATE_PENALTY_NATS: Final = 12.0
-"""Penalty in nats for the ratio and for the choice of features."""
 SEARCH_ITERATIONS: Final = 18
 RATIO_EXPONENTS: Final[Mapping[str, float]] = {
     "Q": 1.0,

@@ -21,7 +21,6 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtrc
 
-from drivers.sample import Floats
 from monitor.noise.effect import Effect, Leak
 from monitor.noise.effects import (
     AngleRandomWalk,
@@ -36,9 +35,8 @@ from monitor.noise.effects import (
     ScaleFactor,
 )
 from monitor.reconcile.diagnostics.diagnostics import STEP_MARGIN_FRACTION
-from monitor.reconcile.likelihood.axis import Axis, Effects
+from monitor.reconcile.likelihood.axis import Effects
 from monitor.reconcile.likelihood.hypothesis import (
-    RESIZE_PENALTY_NATS,
     Hypothesis,
     find_maximum_by_golden_section,
     noise_indices,
@@ -59,9 +57,7 @@ UNNAMED: Final = "power_law"
 RETUNE: Final = "retuned"
 """Name of a trial that adds no effect and changes sizes of the model."""
 EXPONENTS: Final = (0.5, 1.5, 2.5, 3.0)
-"""Exponents of the power laws that are tried."""
 MIN_RESIZE_GAIN_NATS: Final = 1.0
-"""Smallest gain in nats of changed sizes."""
 SCALE_FACTOR_MARGIN_NATS: Final = 3.0
 """Gain in nats by which separately fitted sizes may exceed a common factor, which has fewer parameters."""
 SCALE_SEARCH_ITERATIONS: Final = 16
@@ -72,7 +68,6 @@ MIN_LEAK_PROBABILITY: Final = 1e-5
 vibration acts on both axes.
 """
 QUADRATIC_PENALTY_NATS: Final = 2.5
-"""Penalty in nats for a quadratic term."""
 MIN_STUDENT_GAIN_NATS: Final = 2.0
 """Smallest gain in nats of outliers over Student's t."""
 MAX_OUTLIER_Z: Final = 4.0
@@ -112,7 +107,7 @@ def trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Iterator[lis
         Axis whitened by ``hypothesis``.
     """
     yield _value_trials(whitened)
-    yield _sample_trials(hypothesis, whitened)
+    yield _best_first(_outlier_trial(hypothesis, whitened) + _noise_step_trial(whitened))
     deterministic, noises = _deterministic_trials(hypothesis, whitened), _noise_trials(hypothesis, whitened)
     # with a wrong spectrum, the residuals contain apparent steps and slopes; a much better noise effect is tried first
     if deterministic and deterministic[0].score_without_slow_noise > noises[0].score - NOISE_PRIORITY_NATS:
@@ -133,13 +128,9 @@ def alternatives_to_resizing(hypothesis: Hypothesis, whitened: WhitenedAxis) -> 
     whitened : WhitenedAxis
         Axis whitened by ``hypothesis``.
     """
-    found = [
-        one
-        for one in _deterministic_trials(hypothesis, whitened)
-        if one.score_without_slow_noise > 0.0 and one.score > 0.0
-    ]
-    noises = [_noise_trial(hypothesis, effect) for effect in propose_correlated_noise(whitened)]
-    return _best_first(found + [one for one in noises if one.score > 0.0])
+    trials = [one for one in _deterministic_trials(hypothesis, whitened) if one.score_without_slow_noise > 0.0]
+    trials += [_noise_trial(hypothesis, effect) for effect in propose_correlated_noise(whitened)]
+    return _best_first([one for one in trials if one.score > 0.0])
 
 
 def _best_first(trials: Sequence[Trial]) -> list[Trial]:
@@ -167,11 +158,6 @@ def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
     return _best_first(found)
 
 
-def _sample_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Try outliers and a step of the noise."""
-    return _best_first(_outlier_trial(hypothesis, whitened) + _noise_step_trial(whitened))
-
-
 def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
     """Try outliers. The list is empty if another cause of heavy tails is as likely."""
     far = whitened.outliers
@@ -189,11 +175,8 @@ def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
     """Try a step of the noise. The list is empty if the variance changes in another way."""
     changes, length_s = whitened.variance_changes, whitened.axis.length_s
     step = changes.step
-    margin_s = STEP_MARGIN_FRACTION * length_s
-    if (
-        AngleRandomWalk not in whitened.types
-        or not margin_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s
-    ):
+    inside = STEP_MARGIN_FRACTION * length_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s
+    if AngleRandomWalk not in whitened.types or not inside:
         return []
     if step.gain <= max(changes.largest_alternative_gain, _band_gain(whitened)) - ALTERNATIVE_MARGIN_NATS:
         return []
@@ -244,9 +227,7 @@ def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]
     found = [Trial(RETUNE, None, resized.score - hypothesis.score - MIN_RESIZE_GAIN_NATS)]
     found += [_noise_trial(hypothesis, effect) for propose in NOISE_CANDIDATES for effect in propose(whitened)]
     found = _best_first([*found, _scale_factor_trial(hypothesis, resized)])
-    value = (
-        max(_power_law_score(hypothesis, exponent) for exponent in EXPONENTS) - hypothesis.score - PENALTY_NATS[UNNAMED]
-    )
+    value = max(_score_with_power_law(hypothesis, hypothesis.effects, one) for one in EXPONENTS) - hypothesis.score
     if value > max(found[0].score, 0.0) + UNNAMED_MARGIN_NATS and found[0].name in POWER_LAW_RIVALS:
         return [Trial(UNNAMED, None, value), *found]
     return found
@@ -278,15 +259,14 @@ def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> lis
     if not kept:
         return []
     slow_noises = _slow_noise_scores(hypothesis)
-    without = max(
-        hypothesis.refit_with_added_effects(hypothesis.added).score,
-        *(score(hypothesis.effects) for score in slow_noises),
-    )
+    resized = hypothesis.refit_with_added_effects(hypothesis.added)
+    without = max(resized.score, *(score(hypothesis.effects) for score in slow_noises))
     trials = []
     for effect in kept:
         alone = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).score
         gain = max(alone, *(score((*hypothesis.effects, effect)) for score in slow_noises)) - without
-        penalty = PENALTY_NATS[effect.name] + _quadratic_penalty(effect)
+        quadratic = getattr(effect, "quadratic", None) is not None
+        penalty = PENALTY_NATS[effect.name] + (QUADRATIC_PENALTY_NATS if quadratic else 0.0)
         trials.append(Trial(effect.name, effect, gain - penalty, alone - hypothesis.score - penalty))
     trials = _best_first(trials)
     curved = _curved_drift_score(hypothesis) - without
@@ -312,20 +292,9 @@ def _has_flat_coefficient(whitened: WhitenedAxis, leak: Leak) -> bool:
 
 def _curved_drift_score(hypothesis: Hypothesis) -> float:
     """Return the score with an additional drift that is a quadratic function of time, less the penalty."""
-    bent = hypothesis.axis.fit(
-        (*hypothesis.effects, RateRamp(R=initial_size(hypothesis.axis))), hypothesis.fit.fixed_noise, curvature=True
-    )
-    return (
-        bent.log_likelihood
-        - RESIZE_PENALTY_NATS * hypothesis.refitted_size_count
-        - PENALTY_NATS["rate_ramp"]
-        - QUADRATIC_PENALTY_NATS
-    )
-
-
-def _quadratic_penalty(effect: Effect) -> float:
-    """Return the penalty for the quadratic term of an effect, or 0 if the effect has no quadratic term."""
-    return QUADRATIC_PENALTY_NATS if getattr(effect, "quadratic", None) is not None else 0.0
+    effects = (*hypothesis.effects, RateRamp(R=initial_size(hypothesis.axis)))
+    fit = hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise, curvature=True)
+    return fit.log_likelihood - hypothesis.resize_penalty - PENALTY_NATS["rate_ramp"] - QUADRATIC_PENALTY_NATS
 
 
 def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float]]:
@@ -335,14 +304,13 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
     are not changed.
     """
     axis, small = hypothesis.axis, initial_size(hypothesis.axis)
-    fixed_noise, cost = hypothesis.fit.fixed_noise, RESIZE_PENALTY_NATS * hypothesis.refitted_size_count
+    fixed_noise, cost = hypothesis.fit.fixed_noise, hypothesis.resize_penalty
 
     def with_noise(noise: Effect) -> Callable[[Effects], float]:
         return lambda effects: axis.fit((*effects, noise), fixed_noise).log_likelihood - cost - PENALTY_NATS[noise.name]
 
     def with_power_law(exponent: float) -> Callable[[Effects], float]:
-        row = _power_law(axis, exponent)
-        return lambda effects: axis.fit(effects, fixed_noise, row).log_likelihood - cost - PENALTY_NATS[UNNAMED]
+        return lambda effects: _score_with_power_law(hypothesis, effects, exponent)
 
     times_s = np.geomspace(10.0 / axis.rate_hz, 0.1 * axis.length_s, 8)
     noises: list[Effect] = [ExponentiallyCorrelated(sigma=small, correlation_time=float(t)) for t in times_s]
@@ -351,15 +319,12 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
     return [*(with_noise(one) for one in noises), *(with_power_law(exponent) for exponent in EXPONENTS)]
 
 
-def _power_law_score(hypothesis: Hypothesis, exponent: float) -> float:
-    """Return the score with an additional power-law noise."""
-    fit = hypothesis.axis.fit(hypothesis.effects, hypothesis.fit.fixed_noise, _power_law(hypothesis.axis, exponent))
-    return fit.log_likelihood - RESIZE_PENALTY_NATS * hypothesis.refitted_size_count
-
-
-def _power_law(axis: Axis, exponent: float) -> Floats:
-    """Return the variance basis, shape (1, m), of power-law noise."""
-    return np.asarray((axis.bins.f_hz / axis.bins.f_hz[0]) ** -exponent)[None, :]
+def _score_with_power_law(hypothesis: Hypothesis, effects: Effects, exponent: float) -> float:
+    """Return the score of the effects with an additional power-law noise."""
+    f_hz = hypothesis.axis.bins.f_hz
+    basis = np.asarray((f_hz / f_hz[0]) ** -exponent)[None, :]
+    fit = hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise, basis)
+    return fit.log_likelihood - hypothesis.resize_penalty - PENALTY_NATS[UNNAMED]
 
 
 def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:

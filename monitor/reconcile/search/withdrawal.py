@@ -28,9 +28,7 @@ from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings
 from monitor.reconcile.likelihood.axis import Effects
 
 MIN_COMB_LINES: Final = 4
-"""Smallest number of lines that form a harmonic comb."""
 MAX_HARMONIC: Final = 60
-"""Highest harmonic that is considered."""
 DIFFERENCE_DIVISORS: Final = (1, 2, 3)
 """Divisors of the frequency difference of two lines. The quotients are tried as fundamental frequency."""
 HARMONIC_TOLERANCE: Final = 2e-4
@@ -38,7 +36,6 @@ HARMONIC_TOLERANCE: Final = 2e-4
 RESONANCE_REACH_HALF_WIDTHS: Final = 2.0
 """Range of a resonance to each side, in half widths. Another feature in this range overlaps with the resonance."""
 LINE_REACH_HZ: Final = 0.1
-"""Range of a line to each side, in Hz."""
 MAX_REMAINING_SHARE: Final = 0.1
 """Largest remaining gain relative to the gain that an effect should explain. The limit allows an inexact shape."""
 MAX_REMAINING_LEAK_SHARE: Final = 0.5
@@ -46,7 +43,6 @@ MAX_REMAINING_LEAK_SHARE: Final = 0.5
 MAX_FOREIGN_RATIO: Final = 100.0
 """Largest gain of the ``NON_SPECTRAL_DIAGNOSTICS`` relative to the gain that a smooth spectrum should explain."""
 SMOOTH_SPECTRA: Final = (BandwidthLimit, ExponentiallyCorrelated)
-"""Effects with a smooth spectrum."""
 NON_SPECTRAL_DIAGNOSTICS: Final = ("tails", "variance", "other_axes")
 """Diagnostics of departures that no stationary Gaussian spectrum explains."""
 FREQUENCY_DIAGNOSTICS: Final = ("psd", "lines", "spectrogram")

@@ -6,8 +6,8 @@ Two recordings show the same effect if the effects have the same name, the same 
 ``absence`` explains why the other recordings do not show the effect. A sample rate error belongs to all axes of a
 recording.
 
-The resulting model is the model under test with the common effects. Single effects are not added to the model, because
-they may be properties of one recording and not of the sensor.
+The common effects are added to the model under test. Single effects are not added, because a single effect may be a
+property of one recording and not of the sensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -161,7 +161,7 @@ def _with_pooled_parameters(effect: Effect, matched: MatchedEffect) -> Effect:
 
 
 def _compare_axis(axis: str, runs: Sequence[NamedResult]) -> AxisComparison:
-    """Return the common and the single effects of one axis."""
+    """Match the effects of one axis between the recordings."""
     results = {run.name: run.result.axes[axis] for run in runs if axis in run.result.axes}
     groups: list[dict[str, AddedOrResizedEffect]] = []
     for run in runs:
@@ -189,13 +189,8 @@ def _sample_rate_steps(run: NamedResult) -> list[AddedOrResizedEffect]:
 
 def _sample_rate_axis(runs: Sequence[NamedResult]) -> str:
     """Return the first axis on which any recording shows a sample rate error, or ""."""
-    shown = {
-        axis
-        for run in runs
-        for axis, one in run.result.axes.items()
-        if any(s.effect == SAMPLE_RATE_EFFECT for s in one.steps)
-    }
-    return next((axis for axis in AXES if axis in shown), "")
+    results = [(axis, run.result.axes.get(axis)) for axis in AXES for run in runs]
+    return next((axis for axis, one in results if one and any(s.effect == SAMPLE_RATE_EFFECT for s in one.steps)), "")
 
 
 def _add_to_group(

@@ -16,7 +16,6 @@ from monitor.reconcile.result import AddedOrResizedEffect
 from monitor.reconcile.several_recordings.comparison import AxisComparison, Comparison, MatchedEffect, NamedResult
 
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
-"""Name and version of the JSON schema."""
 
 
 def encode_comparison(c: Comparison) -> bytes:
