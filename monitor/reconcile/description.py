@@ -1,4 +1,4 @@
-"""Conversion of a search into readable results: steps with parameters, confidence and a justification."""
+"""Conversion of a search into the result of an axis: effects with parameters, confidence and justification."""
 
 from math import erf, exp, inf, log
 from typing import Final
@@ -18,7 +18,7 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, measure_gaps
-from monitor.reconcile.likelihood.effect_terms import NATURAL_DIAGNOSTIC, SIZE_PARAMETERS, size
+from monitor.reconcile.likelihood.effect_terms import MOST_DIRECT_DIAGNOSTIC, SIZE_PARAMETERS, size
 from monitor.reconcile.likelihood.hypothesis import Hypothesis, shape_interval, size_interval
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
@@ -31,7 +31,7 @@ from monitor.reconcile.result import (
     RunnerUp,
     StepKind,
 )
-from monitor.reconcile.search.search import AxisSearchResult, SearchRound
+from monitor.reconcile.search.search import AxisDiagnostics, AxisSearchResult, SearchRound
 from monitor.reconcile.search.trials import RETUNE, Trial
 
 SHAPE_PARAMETERS: Final[dict[type[Effect], tuple[str, ...]]] = {
@@ -46,9 +46,8 @@ SHAPE_PARAMETERS: Final[dict[type[Effect], tuple[str, ...]]] = {
 }
 """For each effect, the shape parameters that are reported with an interval."""
 MAX_RUNNERS_UP: Final = 3
-"""Number of alternative effects that are reported."""
 MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
-"""Smallest confidence of an alternative effect that is reported."""
+"""Smallest confidence with which an alternative effect is reported."""
 
 
 def describe_axis(search: AxisSearchResult, null: AxisNull, final: AxisNull) -> AxisResult:
@@ -59,28 +58,32 @@ def describe_axis(search: AxisSearchResult, null: AxisNull, final: AxisNull) -> 
     search : AxisSearchResult
         Search on the axis.
     null : AxisNull
-        Null distributions under the model under test, which decided the search.
+        Null distributions under the model under test, for the diagnostics before and during the search.
     final : AxisNull
-        Null distributions under the extended model, which decide which differences are left over.
+        Null distributions under the extended model, which decide whether a remaining difference is significant.
     """
-    looks = [DiagnosticSnapshot(measure_gaps(one.findings, null), one.plots) for one in search.rounds]
-    end = DiagnosticSnapshot(measure_gaps(search.findings, final), search.plots)
-    if search.before is None:
-        looks.append(end)
-    else:
-        plots, findings = search.before
-        looks.append(DiagnosticSnapshot(measure_gaps(findings, null), plots))
+    snapshots = [_snapshot(one.before, null) for one in search.rounds]
+    end = _snapshot(search.final, final)
+    snapshots.append(end if search.before_withdrawal is None else _snapshot(search.before_withdrawal, null))
     steps = tuple(
-        _describe_step(search, search.rounds[at], index, kind, looks[at], looks[at + 1])
+        _describe_step(search, search.rounds[at], index, kind, snapshots[at], snapshots[at + 1])
         for at, index, kind in _remaining_changes(search)
     )
-    left_over = (*(score for score in end.gaps if score.is_significant), *_noise_floor_score(search, end))
+    left_over = (*(gap for gap in end.gaps if gap.is_significant), *_noise_floor_gap(search, end))
     decision = _axis_decision(bool(steps), bool(left_over))
-    return AxisResult(search.hypothesis.axis.name, decision, looks[0], steps, left_over, end)
+    return AxisResult(search.hypothesis.axis.name, decision, snapshots[0], steps, left_over, end)
+
+
+def _snapshot(diagnostics: AxisDiagnostics, null: AxisNull) -> DiagnosticSnapshot:
+    """Return the gaps and the plots of an axis."""
+    return DiagnosticSnapshot(measure_gaps(diagnostics.findings, null), diagnostics.plots)
 
 
 def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKind]]:
-    """Return the changes that remain at the end: the index of the round, the index of the effect, and the kind."""
+    """Return the round, the effect and the kind of each change that remains at the end of the search.
+
+    The round and the effect are indices.
+    """
     hypothesis = search.hypothesis
     found: list[tuple[int, int, StepKind]] = []
     left = list(range(hypothesis.given_count, len(hypothesis.effects)))
@@ -98,35 +101,38 @@ def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKin
     return found
 
 
-def _noise_floor_score(search: AxisSearchResult, look: DiagnosticSnapshot) -> tuple[DiagnosticGap, ...]:
-    """DiagnosticGap the white noise floor after a low-pass filter that was found.
+def _noise_floor_gap(search: AxisSearchResult, end: DiagnosticSnapshot) -> tuple[DiagnosticGap, ...]:
+    """Return the gap of the white noise floor after an added low-pass filter, if the gap is significant.
 
-    No effect produces this noise. A noise floor that is larger than chance is reported as left over. Its gap is the gap
-    that the low-pass filter alone would leave, and at most the gap without a low-pass filter.
+    No effect describes this noise, so a significant noise floor is reported as an unexplained difference. The gap
+    follows from the gain of the noise floor. It is limited to the largest gap of the spectrum during the search.
     """
     hypothesis, axis = search.hypothesis, search.hypothesis.axis
     limit = next((effect for effect in hypothesis.added if isinstance(effect, BandwidthLimit)), None)
     if limit is None or not hypothesis.fit.noise_floor_variance > 0.0:
         return ()
     without = axis.fit(hypothesis.effects, hypothesis.fit.fixed_noise, noise_floor=False)
-    most = max(one.findings["psd"].gain for one in search.rounds)
+    most = max(one.before.findings["psd"].gain for one in search.rounds)
     gain = max(min(hypothesis.fit.log_likelihood - without.log_likelihood, most), 0.0)
-    psd = _score_of("psd", look)
+    psd = _gap_of("psd", end)
     place = Location(frequency=(limit.cutoff, 0.5 * axis.rate_hz))
-    score = DiagnosticGap("psd", place, (2.0 * gain) ** 0.5, psd.null95, psd.threshold)
-    return (score,) if score.is_significant else ()
+    gap = DiagnosticGap("psd", place, (2.0 * gain) ** 0.5, psd.null95, psd.threshold)
+    return (gap,) if gap.is_significant else ()
 
 
-def _score_of(lens: str, look: DiagnosticSnapshot) -> DiagnosticGap:
-    """Return the score of one diagnostic."""
-    return next(score for score in look.gaps if score.lens == lens)
+def _gap_of(lens: str, snapshot: DiagnosticSnapshot) -> DiagnosticGap:
+    """Return the gap of one diagnostic."""
+    return next(gap for gap in snapshot.gaps if gap.lens == lens)
 
 
-def _axis_decision(steps: bool, left: bool) -> Decision:
-    """Return the decision for an axis from the presence of steps and of differences that are left."""
-    if left:
-        return "partly_explained" if steps else "unexplained"
-    return "explained" if steps else "agrees"
+def _axis_decision(changed: bool, left_over: bool) -> Decision:
+    """Return the decision for an axis.
+
+    ``changed`` is True if effects were added or resized. ``left_over`` is True if a significant difference remains.
+    """
+    if left_over:
+        return "partly_explained" if changed else "unexplained"
+    return "explained" if changed else "agrees"
 
 
 def _describe_step(
@@ -137,61 +143,62 @@ def _describe_step(
     before: DiagnosticSnapshot,
     after: DiagnosticSnapshot,
 ) -> AddedOrResizedEffect:
-    """Return the result of one step of the search."""
+    """Return the description of one effect that was added or resized."""
     effect, trial = search.hypothesis.effects[index], done.trials[0]
-    score = _triggering_score(effect, kind, before)
-    later = _score_of(score.lens, after)
+    gap = _triggering_gap(effect, kind, before)
+    later = _gap_of(gap.lens, after)
     confidence, others = _confidence_and_runners_up(effect.name if kind == "added" else RETUNE, done.trials)
-    if kind == "retuned" and trial.name != RETUNE:  # the size changed together with an added effect
+    if kind == "retuned" and trial.name != RETUNE:  # an effect was added in the same round
         confidence, others = _resize_confidence(search.hypothesis, index), ()
-    held_out_before, held_out_after = _held_out_scores(done, score, later)
+    held_out_before, held_out_after = _held_out_gaps(done, gap, later)
     return AddedOrResizedEffect(
         kind=kind,
         effect=effect.name,
         parameters=_parameters_with_bounds(search.hypothesis, index, trial, kind),
         confidence=confidence,
         runners_up=others,
-        before=score,
+        before=gap,
         after=later,
         held_out_before=held_out_before,
         held_out_after=held_out_after,
         held_out_reason=done.validation.reason,
-        because=_justification(effect, kind, score, later, others, trial),
+        because=_justification(effect, kind, gap, later, others, trial),
         snapshot_after=after,
     )
 
 
-def _held_out_scores(
-    done: SearchRound, score: DiagnosticGap, later: DiagnosticGap
+def _held_out_gaps(
+    done: SearchRound, gap: DiagnosticGap, later: DiagnosticGap
 ) -> tuple[DiagnosticGap | None, DiagnosticGap | None]:
-    """Return the scores of the cross-validation before and after a step, or None without cross-validation."""
+    """Return the gaps of the cross-validation before and after a round, or None without cross-validation."""
     validation = done.validation
     if validation.reason:
         return None, None
     return (
-        DiagnosticGap(score.lens, score.where, validation.before, score.null95, score.threshold),
-        DiagnosticGap(score.lens, score.where, validation.after, later.null95, later.threshold),
+        DiagnosticGap(gap.lens, gap.where, validation.before, gap.null95, gap.threshold),
+        DiagnosticGap(gap.lens, gap.where, validation.after, later.null95, later.threshold),
     )
 
 
-def _triggering_score(effect: Effect, kind: StepKind, before: DiagnosticSnapshot) -> DiagnosticGap:
-    """Return the score that led to an effect.
+def _triggering_gap(effect: Effect, kind: StepKind, before: DiagnosticSnapshot) -> DiagnosticGap:
+    """Return the gap that led to an effect.
 
-    This is the natural diagnostic of the effect if it passes its threshold, otherwise the strongest diagnostic.
+    If the most direct diagnostic of the effect has a significant gap, this gap is returned. Otherwise, the result is
+    the gap that is largest relative to its threshold.
     """
-    passing = [score for score in before.gaps if score.is_significant] or list(before.gaps)
-    natural = NATURAL_DIAGNOSTIC.get(effect.name) if kind == "added" else "psd"
-    for score in passing:
-        if score.lens == natural:
-            return score
-    return max(passing, key=lambda score: score.gap / max(score.threshold, 1e-9))
+    significant = [gap for gap in before.gaps if gap.is_significant] or list(before.gaps)
+    most_direct = MOST_DIRECT_DIAGNOSTIC.get(effect.name) if kind == "added" else "psd"
+    for gap in significant:
+        if gap.lens == most_direct:
+            return gap
+    return max(significant, key=lambda gap: gap.gap / max(gap.threshold, 1e-9))
 
 
 def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[RunnerUp, ...]]:
-    """Return the probability of an effect and of its alternatives.
+    """Return the probability of an effect and of the most probable alternatives.
 
-    The probabilities follow from the log-likelihood gains less the penalties of the effects. One alternative is that
-    there is no effect.
+    The probabilities are proportional to the exponentials of the trial scores. One alternative is the absence of any
+    effect, with the score 0.
     """
     best: dict[str, float] = {"": 0.0}
     for trial in trials:
@@ -209,21 +216,21 @@ def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[fl
 
 
 def _resize_confidence(hypothesis: Hypothesis, index: int) -> float:
-    """Return the probability that the size of an effect differs from its size in the model.
+    """Return the probability that the true size of an effect differs from the size in the model.
 
-    It follows from the distance of the logarithms of the two sizes, in standard errors.
+    The probability follows from the difference of the logarithms of both sizes, in standard errors.
     """
     now, before = size(hypothesis.effects[index]), size(hypothesis.model[index])
     error = hypothesis.fit.size_error(index)
     if not (now > 0.0 and before > 0.0 and error > 0.0):
-        return 1.0  # the effect vanished, or the model had none
+        return 1.0  # one of the sizes is zero
     return erf(abs(log(now / before)) * now / error / 2.0**0.5)
 
 
 def _parameters_with_bounds(
     hypothesis: Hypothesis, index: int, trial: Trial, kind: StepKind
 ) -> dict[str, ParameterInterval]:
-    """Return the parameters of an effect with their 95 % intervals."""
+    """Return the parameters of an effect with 95 % intervals."""
     effect = hypothesis.effects[index]
     if kind == "added" and trial.intervals and trial.name == effect.name:
         return dict(trial.intervals)
@@ -242,14 +249,14 @@ def _parameters_with_bounds(
     if isinstance(effect, BandwidthLimit):
         found["order"] = ParameterInterval(float(effect.order))
     if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
-        # fitting the frequency as well doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
+        # the frequency is fitted too, which doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
         error = 2.0 * Z95 * hypothesis.fit.size_error(index) / effect.amplitude
         found["phase"] = ParameterInterval(effect.phase, effect.phase - error, effect.phase + error)
     return found
 
 
 def _quadratic_bounds(hypothesis: Hypothesis, index: int) -> ParameterInterval:
-    """Return the quadratic temperature coefficient with its 95 % interval."""
+    """Return the quadratic temperature coefficient with the 95 % interval."""
     fitted = hypothesis.fit.whittle
     column = next(place for at, place in hypothesis.fit.regressor_slices if at == index).start + 1
     value = float(fitted.beta[column])
@@ -275,14 +282,14 @@ EVIDENCE_TEXT: Final = {
 def _justification(
     effect: Effect,
     kind: StepKind,
-    score: DiagnosticGap,
+    gap: DiagnosticGap,
     after: DiagnosticGap,
     others: tuple[RunnerUp, ...],
     trial: Trial,
 ) -> str:
-    """Return the sentences that justify a step."""
-    gaps = f"the gap is {score.gap:.1f}, and a true model stays below {score.threshold:.1f}"
-    sentences = [f"{EVIDENCE_TEXT[score.lens]}{_location_text(score)}: {gaps}."]
+    """Return the sentences that justify an effect."""
+    gaps = f"the gap is {gap.gap:.1f}, and a true model stays below {gap.threshold:.1f}"
+    sentences = [f"{EVIDENCE_TEXT[gap.lens]}{_location_text(gap)}: {gaps}."]
     if kind == "retuned":
         sentences.append(f"With another size of {effect.name}, which the model has, the gap is {after.gap:.1f}.")
         return " ".join(sentences)
@@ -300,15 +307,15 @@ def _comparison_phrase(confidence: float) -> str:
     return "nearly as well" if confidence > 0.2 else "less well" if confidence > 0.01 else "clearly less well"
 
 
-def _location_text(score: DiagnosticGap) -> str:
-    """Return a phrase for the location of a score, or an empty string."""
-    place = score.where
+def _location_text(gap: DiagnosticGap) -> str:
+    """Return a phrase for the location of a gap, or an empty string."""
+    place = gap.where
     if place.frequency is not None:
         lo, hi = place.frequency
         middle, wide = 0.5 * (lo + hi), hi - lo
         return f" at {middle:.5g} Hz" if wide < 0.05 * middle else f" from {lo:.3g} to {hi:.3g} Hz"
     if place.source is not None:
         return f" ({place.source})"
-    if place.time is not None and score.lens in ("level", "variance") and place.time[1] - place.time[0] < 1e3:
+    if place.time is not None and gap.lens in ("level", "variance") and place.time[1] - place.time[0] < 1e3:
         return f" near {0.5 * (place.time[0] + place.time[1]):.5g} s"
     return ""

@@ -2,12 +2,13 @@
 
 The procedure has these steps:
 
-1. Simulate recordings from the model and run all diagnostics on them, which gives the thresholds.
+1. Simulate recordings of the model and run all diagnostics on them. The results give the thresholds.
 2. Run the same diagnostics on the measured recording.
-3. On each axis that disagrees, try candidate effects and keep the best one, until nothing is left or no effect helps.
-4. Simulate the extended model and compare once more.
+3. On each axis with a significant difference, try candidate effects and keep the best one. Repeat this until no
+   significant difference remains or no candidate is accepted.
+4. Simulate the extended model and compare the recording with the new thresholds.
 
-The axes are independent of each other, except for the sample rate, which is common to all axes.
+Each axis has its own search. Only the sample rate error is common to all axes.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -63,45 +64,31 @@ SIMULATED_RECORDINGS: Final = 6
 MIN_TERM_GAIN_NATS: Final = 3.0
 """Log-likelihood gain in nats that a term of the first fit must reach to be kept."""
 ProgressCallback = Callable[[str], None]
-"""Function that is called with the name of each stage."""
+"""Function that receives the name of each stage."""
 MapFunction = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 """Function with the signature of ``map``, such as the ``map`` method of a thread pool."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingContext:
-    """Recording, with the seed and the cached regressors of one reconciliation."""
+    """Recording that is reconciled, with the seed, the cached regressors and the worker threads."""
 
     recording: Recording
     seed: int
     regressors: RegressorCache
-    map_function: MapFunction  # distributes work over axes and simulated recordings
-
-    def build_repaired_axes(self, recording: Recording, effects: Mapping[str, Effects], seed: int) -> dict[str, Axis]:
-        """Return the prepared axes of the measured recording or of a simulated one with the same temperature.
-
-        Parameters
-        ----------
-        recording : Recording
-            Recording to prepare.
-        effects : mapping of str to tuple of Effect
-            Effects of each axis.
-        seed : int
-            Seed of the draws that replace missing samples.
-        """
-        return build_repaired_axes(recording, effects, self.regressors, np.random.default_rng(seed))
+    map_function: MapFunction  # distributes the work on axes and simulated recordings
 
 
 @dataclass(frozen=True, slots=True)
 class _AxesSearchResult:
-    """Results of the search on all axes of one recording."""
+    """Result of the search on all axes of one recording."""
 
     searches: dict[str, AxisSearchResult]
     sample_rate_error: SampleRateErrorEstimate | None
 
     @property
     def searches_that_changed_model(self) -> dict[str, AxisSearchResult]:
-        """Searches that changed the model."""
+        """Results of the searches that changed the model."""
         return {name: search for name, search in self.searches.items() if search.rounds}
 
 
@@ -119,23 +106,23 @@ def reconcile(
     recording : Recording
         Recording with at least ``MIN_SAMPLES`` samples for each axis.
     model : NoiseModel or None
-        Model under test. If None, the five classic terms are fitted first.
+        Model under test. If None, the five terms Q, N, B, K and R are fitted first.
     seed : int
         Seed of all simulations and random draws. The same seed gives the same result.
     map_function : callable, optional
-        Function with the signature of ``map`` that distributes work over axes and simulated recordings.
+        Function with the signature of ``map`` that distributes the work on axes and simulated recordings.
     report_stage : callable, optional
         Function that is called with the name of each stage.
 
     Returns
     -------
     Reconciliation
-        Decision, effects and remaining differences of each axis.
+        Decision, added and resized effects, and remaining differences of each axis.
 
     Raises
     ------
     NotReady
-        If there are too few samples or no axis can be compared with the model.
+        If the recording has too few samples or no axis that can be compared with the model.
     """
     recording, notes = select_usable_axes(recording, model)
     regressors = RegressorCache(recording.samples, recording.rate_hz, recording.temperature_c)
@@ -174,13 +161,15 @@ def reconcile(
 
 
 def fit_five_terms(run: RecordingContext) -> NoiseModel:
-    """Fit the terms Q, N, B, K and R to each axis and keep the terms that the data support."""
-    axes = run.build_repaired_axes(run.recording, dict.fromkeys(run.recording.values, ()), run.seed)
+    """Fit the terms Q, N, B, K and R to each axis and keep the significant terms."""
+    axes = build_repaired_axes(
+        run.recording, dict.fromkeys(run.recording.values, ()), run.regressors, np.random.default_rng(run.seed)
+    )
     return NoiseModel({name: _fit_terms(axis) for name, axis in axes.items()}, run.recording.rate_hz)
 
 
 def _fit_terms(axis: Axis) -> Effects:
-    """Fit the classic terms to one axis and drop each term that gains too little likelihood."""
+    """Fit the five terms to one axis and drop each term whose log-likelihood gain is too small."""
     best = axis.fit([with_size(effect, axis.rms) for effect in UNIT_SOURCES[:4]])
     with_ramp = axis.fit((*best.effects, RateRamp(R=axis.rms)))
     if with_ramp.log_likelihood - best.log_likelihood > PENALTY_NATS["rate_ramp"]:
@@ -195,10 +184,7 @@ def _fit_terms(axis: Axis) -> Effects:
 
 
 def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effects]:
-    """Return the effects of each recorded axis without constant biases.
-
-    A constant bias is not compared, because the mean of each axis is always free.
-    """
+    """Return the effects of each recorded axis without constant biases, because the mean of an axis is always free."""
     return {
         axis: tuple(effect for effect in model.effects.get(axis, ()) if not isinstance(effect, Bias))
         for axis in recording.values
@@ -208,9 +194,9 @@ def _effects_by_axis(model: NoiseModel, recording: Recording) -> dict[str, Effec
 def _diagnose_simulations(
     model: NoiseModel, run: RecordingContext, first_seed: int, names: Collection[str]
 ) -> dict[str, list[Findings]]:
-    """Run the diagnostics on simulations of a model that have the axes, length and temperature of the recording.
+    """Return, for each of the named axes, the findings on each of several simulated recordings of a model.
 
-    The result has, for each of the named axes, the findings of each simulated recording.
+    The simulations have the axes, the length and the temperature of the measured recording.
     """
     template = run.recording
     effects = _effects_by_axis(model, template)
@@ -218,7 +204,7 @@ def _diagnose_simulations(
     def diagnose(seed: int) -> dict[str, Findings]:
         drawn = model.simulate(template.samples, template.rate_hz, seed, template.temperature_c)
         simulated = replace(template, values={axis: drawn[:, AXES.index(axis)] for axis in template.values})
-        axes = run.build_repaired_axes(simulated, effects, seed)
+        axes = build_repaired_axes(simulated, effects, run.regressors, np.random.default_rng(seed))
         return {
             name: run_diagnostics(whiten_axis(fit_with_fixed_noise(axes[name], effects[name]).fit)) for name in names
         }
@@ -230,11 +216,11 @@ def _diagnose_simulations(
 def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str, AxisNull]) -> _AxesSearchResult:
     """Search every axis for missing effects.
 
-    The sample rate is tested first. If two axes each seem to leak into the other, the search is repeated on one of them
-    without that source.
+    The sample rate is tested first. If two axes appear to leak into each other, the search is repeated on one of them,
+    and leaks from the other axis are not tried.
     """
     effects = _effects_by_axis(model, run.recording)
-    axes = run.build_repaired_axes(run.recording, effects, run.seed)
+    axes = build_repaired_axes(run.recording, effects, run.regressors, np.random.default_rng(run.seed))
     error = detect_sample_rate_error(axes, effects)
     if error is not None:
         ratio = float(error.ratio.value)
@@ -255,7 +241,7 @@ def _search_all_axes(run: RecordingContext, model: NoiseModel, null: Mapping[str
 def _reversed_leak_sources(
     found: Mapping[str, AxisSearchResult], null: Mapping[str, AxisNull]
 ) -> dict[str, frozenset[str]]:
-    """Return, for each axis, the sources of leaks that in fact have the opposite direction."""
+    """Return, for each axis, the sources of leaks whose true direction is the opposite."""
     gains = {
         (name, effect.source): step.trials[0].score
         for name, one in found.items()
@@ -266,7 +252,7 @@ def _reversed_leak_sources(
     for (name, source), gain in gains.items():
         if source not in found:
             continue
-        finding = found[source].findings["other_axes"]
+        finding = found[source].final.findings["other_axes"]
         suspected = finding.where.source == name and finding.gain > null[source]["other_axes"].threshold
         if suspected or gains.get((source, name), np.inf) < gain:
             back[source] = back.get(source, frozenset()) | {name}
@@ -274,7 +260,7 @@ def _reversed_leak_sources(
 
 
 def _add_found_effects(model: NoiseModel, found: _AxesSearchResult) -> NoiseModel:
-    """Return the model with all effects that were found."""
+    """Return the model with the added and resized effects of all axes."""
     error = found.sample_rate_error
     ratio = float(error.ratio.value) if error else 1.0
     effects = dict(model.effects)
@@ -291,7 +277,7 @@ def _add_found_effects(model: NoiseModel, found: _AxesSearchResult) -> NoiseMode
 def _add_sample_rate_step(
     axes: Mapping[str, AxisResult], error: SampleRateErrorEstimate, null: Mapping[str, AxisNull]
 ) -> dict[str, AxisResult]:
-    """Return the results with a step for the wrong sample rate, on the axis that shows the error most clearly."""
+    """Add the sample rate error to the result of the axis that shows the error most clearly."""
     result = axes[error.axis]
     stated, observed = error.frequency
     margin = 0.01 * abs(observed - stated)

@@ -1,13 +1,13 @@
 """JSON report of a reconciliation: ``report.json``, schema imu-monitor/reconcile/1.
 
-The same reconciliation always gives the same bytes. Numbers are in SI units of their axis, and times are in seconds
-from the start of the recording. A number that is not finite becomes null, because JSON cannot represent it. A parameter
-that names an axis has a value and no interval.
+Equal reconciliations give equal bytes. Numbers are in SI units, and times are in seconds from the start of the
+recording. A number that is not finite becomes null, because JSON cannot represent it. A parameter that names an axis
+has a value and no interval.
 
-In each step, ``found`` holds the location and the threshold that the difference passed, under the model before the
-step. ``gap`` holds the same diagnostic before and after the step. Its ``null95`` and ``threshold`` belong to the model
-after the step and decide whether a difference is left over. ``scores`` holds all diagnostics: for an axis, the
-comparison with the first model; for a step, the comparison after the step.
+``steps`` contains one entry for each effect that was added or resized. In each entry, ``found`` is the difference that
+led to the step, with the threshold of the model before the step. ``gap`` contains the gap of the same diagnostic before
+and after the step, with the threshold of the model after the step. ``scores`` contains all diagnostics. For an axis,
+``scores`` is the comparison with the model under test. For a step, ``scores`` is the comparison after the step.
 """
 
 from math import isfinite
@@ -26,7 +26,6 @@ from monitor.reconcile.result import (
 )
 
 SCHEMA: Final = "imu-monitor/reconcile/1"
-"""Name and version of the JSON schema."""
 _JSON_ENCODER: Final = msgspec.json.Encoder()
 
 
@@ -50,16 +49,16 @@ def _axis_entry(result: AxisResult) -> dict[str, Any]:
     return {
         "verdict": result.verdict,
         "steps": [_step_entry(step) for step in result.steps],
-        "left_over": [_score_entry(score) for score in result.left_over],
-        "scores": [_score_entry(score) for score in result.start.gaps],
+        "left_over": [_gap_and_location_entry(gap) for gap in result.left_over],
+        "scores": [_gap_and_location_entry(gap) for gap in result.start.gaps],
     }
 
 
 def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
-    """Return the report entry of one step."""
+    """Return the report entry of one effect that was added or resized."""
     held_out = _gap_entry(step.held_out_before, step.held_out_after)
     return {
-        "found": _score_entry(step.before),
+        "found": _gap_and_location_entry(step.before),
         "kind": step.kind,
         "effect": step.effect,
         "parameters": {name: parameter_entry(bounds) for name, bounds in step.parameters.items()},
@@ -69,7 +68,7 @@ def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
         "held_out_gap": held_out,
         **({} if held_out else {"held_out_reason": step.held_out_reason}),
         "because": step.because,
-        "scores": [_score_entry(score) for score in step.snapshot_after.gaps],
+        "scores": [_gap_and_location_entry(gap) for gap in step.snapshot_after.gaps],
     }
 
 
@@ -85,21 +84,23 @@ def _gap_entry(before: DiagnosticGap | None, after: DiagnosticGap | None) -> dic
     }
 
 
-def _score_entry(score: DiagnosticGap) -> dict[str, Any]:
-    """Return the report entry of one score."""
+def _gap_and_location_entry(gap: DiagnosticGap) -> dict[str, Any]:
+    """Return the report entry of one gap of a diagnostic."""
     return {
-        "lens": score.lens,
-        "where": _where_entry(score.where),
-        "gap": finite_or_none(score.gap),
-        "null95": finite_or_none(score.null95),
-        "threshold": finite_or_none(score.threshold),
+        "lens": gap.lens,
+        "where": _where_entry(gap.where),
+        "gap": finite_or_none(gap.gap),
+        "null95": finite_or_none(gap.null95),
+        "threshold": finite_or_none(gap.threshold),
     }
 
 
 def _where_entry(where: Location) -> dict[str, Any]:
     """Return the report entry of a location."""
-    found = where.resolved_dimensions().items()
-    return {name: place if isinstance(place, str) else [finite_or_none(end) for end in place] for name, place in found}
+    return {
+        name: place if isinstance(place, str) else [finite_or_none(end) for end in place]
+        for name, place in where.resolved_dimensions().items()
+    }
 
 
 def parameter_entry(bounds: ParameterInterval) -> dict[str, Any]:
@@ -110,5 +111,5 @@ def parameter_entry(bounds: ParameterInterval) -> dict[str, Any]:
 
 
 def finite_or_none(value: float | None) -> float | None:
-    """Return a Python float, because the encoder does not accept NumPy scalars, or None if the value is not finite."""
+    """Return the value as a Python float, which the encoder accepts, or None if the value is not finite."""
     return None if value is None or not isfinite(value) else float(value)

@@ -6,7 +6,7 @@ difference that remains. All values are in SI units. Times are in seconds from t
 """
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 from drivers.sample import Floats
@@ -15,12 +15,12 @@ from monitor.noise.model import NoiseModel
 Decision = Literal["agrees", "explained", "partly_explained", "unexplained"]
 """Decision for an axis or a recording."""
 StepKind = Literal["added", "retuned"]
-"""Kind of a step: an effect was added, or the size of a known effect was changed."""
+"""Kind of a change of the model: an effect was added, or the size of an effect was changed."""
 
 
 @dataclass(frozen=True, slots=True)
 class Location:
-    """Location of a difference. A dimension that the diagnostic does not resolve is None."""
+    """Location of a difference in up to six dimensions. None: the diagnostic does not resolve the dimension."""
 
     frequency: tuple[float, float] | None = None  # Hz
     tau: tuple[float, float] | None = None  # s
@@ -30,30 +30,29 @@ class Location:
     source: str | None = None  # another axis
 
     def resolved_dimensions(self) -> dict[str, tuple[float, float] | str]:
-        """Return the dimensions that are known, by name."""
-        names = ("frequency", "tau", "time", "temperature", "value", "source")
-        return {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        """Return the dimensions that are not None, by name."""
+        return {name: place for name, place in asdict(self).items() if place is not None}
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticGap:
-    """Difference between measurement and model in one diagnostic, and the location of its maximum."""
+    """Difference between measurement and model in one diagnostic, with the location of the largest difference."""
 
-    lens: str
+    lens: str  # name of the diagnostic
     where: Location
-    gap: float  # 0 = perfect agreement
-    null95: float  # 95 of 100 recordings of a true model stay below this gap in this diagnostic
-    threshold: float  # 99 of 100 recordings of a true model stay below it in all diagnostics, at all places and axes
+    gap: float  # size of the difference in standard deviations
+    null95: float  # gap that 95 of 100 recordings of a true model do not exceed in this diagnostic on one axis
+    threshold: float  # gap that 99 of 100 recordings of a true model do not exceed in any diagnostic on any axis
 
     @property
     def is_significant(self) -> bool:
-        """True if the difference is larger than chance allows."""
+        """True if the gap exceeds the threshold."""
         return self.gap > self.threshold
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterInterval:
-    """Value of a parameter with its 95 % interval. The name of a source axis has no interval."""
+    """Value of a parameter with the 95 % interval. The ends are None for a parameter without an interval."""
 
     value: float | str
     lo: float | None = None
@@ -62,7 +61,7 @@ class ParameterInterval:
 
 @dataclass(frozen=True, slots=True)
 class RunnerUp:
-    """Alternative effect that was tried for the same difference."""
+    """Alternative effect for the same difference."""
 
     effect: str
     confidence: float
@@ -70,9 +69,9 @@ class RunnerUp:
 
 @dataclass(frozen=True, slots=True)
 class PlotData:
-    """Plot data of one axis for one diagnostic."""
+    """Plot of one axis: the measurement and the expectation of a model."""
 
-    lens: str
+    lens: str  # name of the diagnostic
     x_name: str  # quantity on the x axis: "frequency", "averaging time", "time", …
     x_unit: str
     y_name: str
@@ -81,13 +80,13 @@ class PlotData:
     x: Floats  # [k]
     measured: Floats  # [k]
     expected: Floats  # [k] expectation of the model
-    lo: Floats  # [k] lower limit of the pointwise band that holds 95 of 100 simulated recordings
-    hi: Floats  # [k] upper limit of the same band
+    lo: Floats  # [k] lower limit of the pointwise 95 % band of a true model
+    hi: Floats  # [k] upper limit of the pointwise 95 % band of a true model
 
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticSnapshot:
-    """Scores and plot data of an axis, compared with one model."""
+    """Comparison of an axis with one model in all diagnostics."""
 
     gaps: tuple[DiagnosticGap, ...]  # one for each diagnostic
     plots: tuple[PlotData, ...]  # one for each diagnostic that has a plot
@@ -95,20 +94,20 @@ class DiagnosticSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class AddedOrResizedEffect:
-    """Effect that was added, or an effect of the model whose size was changed."""
+    """Effect that was added to the model, or effect of the model whose size was changed."""
 
     kind: StepKind
     effect: str
     parameters: Mapping[str, ParameterInterval]
     confidence: float
     runners_up: tuple[RunnerUp, ...]
-    before: DiagnosticGap  # difference that led to this step
-    after: DiagnosticGap
+    before: DiagnosticGap  # difference that led to the change of the model
+    after: DiagnosticGap  # the same diagnostic after the change
     held_out_before: DiagnosticGap | None
     held_out_after: DiagnosticGap | None
-    held_out_reason: str  # why there is no held-out gap; empty if there is a held-out gap
-    because: str  # one sentence of justification that a person can check
-    snapshot_after: DiagnosticSnapshot  # comparison after the step
+    held_out_reason: str  # reason why no held-out gap exists, or empty
+    because: str  # justification in sentences
+    snapshot_after: DiagnosticSnapshot
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,10 +116,10 @@ class AxisResult:
 
     axis: str
     verdict: Decision
-    start: DiagnosticSnapshot  # comparison with the given model, or with the five terms
+    start: DiagnosticSnapshot  # comparison with the model under test
     steps: tuple[AddedOrResizedEffect, ...]
-    left_over: tuple[DiagnosticGap, ...]
-    end: DiagnosticSnapshot  # comparison with the model that contains everything that was found
+    left_over: tuple[DiagnosticGap, ...]  # significant differences that remain
+    end: DiagnosticSnapshot  # comparison with the extended model
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,14 +128,14 @@ class Reconciliation:
 
     verdict: Decision
     axes: Mapping[str, AxisResult]  # in AXES order
-    baseline: NoiseModel  # the model that was given, or the five terms fitted first
-    model: NoiseModel  # with everything that was found
-    fitted_first: bool  # True if no model was given and the five terms were fitted
+    baseline: NoiseModel  # model under test
+    model: NoiseModel  # extended model
+    fitted_first: bool  # True if the model under test was fitted to this recording
     rate_hz: float
     samples: int
     duration_s: float
     seed: int
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
 
 def combine_decisions(verdicts: Iterable[Decision]) -> Decision:

@@ -1,9 +1,10 @@
 """Diagnostics: functions that measure how far an axis differs from a model.
 
 Measured and simulated recordings pass through the same diagnostics. Each diagnostic takes a ``WhitenedAxis`` and tests
-one kind of departure from white noise. Each diagnostic returns the largest gain in log-likelihood, in nats, that a
-departure at one location explains, and this location. The gains of a true model are nearly the same for every model and
-every length of the recording. The thresholds in ``null_distribution`` rely on this.
+one kind of departure from white noise. The result is a ``Finding``: the location of the strongest departure, and the
+log-likelihood gain of a model with this departure over white noise. If the model is true, the gains have nearly the
+same distribution for every model and every length of the recording. The thresholds in ``null_distribution`` require
+this.
 
 The diagnostics are deterministic and do not change their input.
 """
@@ -28,19 +29,16 @@ from monitor.noise.effects import (
     TemperatureLag,
     TurnOnTransient,
 )
-from monitor.reconcile.likelihood.variance_history import LeastConstantTiles, find_least_constant_tiles
-from monitor.reconcile.likelihood.whitening import WhitenedAxis, noise_deviation_over_time
+from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.preparation.cosine_bins import frequency_bins, inverse_cosine_transform
 from monitor.reconcile.result import Location
 
 MAX_LAG_SAMPLES: Final = 64
-"""Number of lags of the autocorrelation, in samples."""
+"""Largest lag of the autocorrelation, in samples."""
 TRANSIENT_TIME_FRACTIONS: Final = 0.3 / 3.0 ** np.arange(6)
-"""Time constants of transients, as fractions of the recording."""
 TEMPERATURE_DELAYS_S: Final = (10.0, 30.0, 90.0, 270.0, 810.0)
-"""Time constants of delayed temperature effects, in seconds."""
 STEP_MARGIN_FRACTION: Final = 0.001
-"""Fraction of the recording at each end in which no step is sought, because the ends of a recording affect the
+"""Fraction of the recording at each end in which no step is detected, because the ends of a recording affect the
 spectrum.
 """
 CURVE_PENALTY_NATS: Final = 1.0
@@ -58,13 +56,13 @@ class Finding:
 NO_FINDING: Final = Finding(0.0, Location())
 """Finding of a diagnostic that has nothing to test."""
 Diagnostic = Callable[[WhitenedAxis], Finding]
-"""Function that measures one kind of departure."""
+"""Function that detects one kind of departure."""
 
 
 def diagnose_psd(whitened: WhitenedAxis) -> Finding:
-    """Find the range of frequency bins, of any width, whose power differs most from its expectation."""
+    """Find the range of frequency bins, of any width, whose power differs most from the expected power."""
     bins = frequency_bins(whitened.axis.n, whitened.axis.rate_hz)  # the same bins for recordings with and without peaks
-    power = np.concatenate([[0.0], np.cumsum(bins.sums(whitened.coefficients**2))])
+    power = np.concatenate([[0.0], np.cumsum(bins.sum_over_bins(whitened.coefficients**2))])
     count = np.concatenate([[0.0], np.cumsum(bins.count)])
     best, place = 0.0, (0, 1)
     width = 1
@@ -81,14 +79,14 @@ def diagnose_psd(whitened: WhitenedAxis) -> Finding:
 
 
 def free_variance_gain_nats(ratio: Floats, count: Floats) -> Floats:
-    """Return the log-likelihood gain of a free variance: n/2 (ρ − 1 − ln ρ).
+    """Return the log-likelihood gain of a fitted variance over the variance one: n/2 (ρ − 1 − ln ρ).
 
     Parameters
     ----------
     ratio : ndarray of float64, shape (k,)
-        Mean square of the coefficients.
+        Mean square ρ of the coefficients.
     count : ndarray of float64, shape (k,)
-        Number of coefficients.
+        Number n of coefficients.
 
     Returns
     -------
@@ -100,15 +98,15 @@ def free_variance_gain_nats(ratio: Floats, count: Floats) -> Floats:
 
 
 def diagnose_lines(whitened: WhitenedAxis) -> Finding:
-    """Find a steady oscillation: the largest value of the periodogram at twice the usual resolution."""
+    """Find a steady oscillation at the largest value of the periodogram."""
     found = find_line_peaks(whitened.series, whitened.axis.rate_hz, 1)
     gain, f_hz = found[0]
     half = whitened.axis.rate_hz / whitened.axis.n
     return Finding(gain, Location(frequency=(f_hz - half, f_hz + half)))
 
 
-def find_line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[float, float]]:
-    """Return the largest peaks of the periodogram, strongest first and separated from each other.
+def find_line_peaks(white: Floats, rate_hz: float, max_peaks: int) -> list[tuple[float, float]]:
+    """Return the largest separate peaks of the periodogram, strongest first.
 
     Parameters
     ----------
@@ -116,7 +114,7 @@ def find_line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[floa
         Whitened series.
     rate_hz : float
         Sample rate in Hz.
-    most : int
+    max_peaks : int
         Largest number of peaks.
 
     Returns
@@ -127,7 +125,7 @@ def find_line_peaks(white: Floats, rate_hz: float, most: int) -> list[tuple[floa
     power = periodogram(white)
     size = 2 * (power.size - 1)
     found = []
-    for _ in range(most):
+    for _ in range(max_peaks):
         at = int(np.argmax(power))
         if power[at] <= 0.0:
             break
@@ -154,7 +152,7 @@ def periodogram(white: Floats) -> Floats:
 def diagnose_level_change(whitened: WhitenedAxis) -> Finding:
     """Find a change of the level: a step at any time, a slope, or a transient after the start.
 
-    If the model itself contains jumps, a change of the level is no evidence, because whitening does not remove jumps.
+    If the model contains jumps, nothing is reported, because whitening does not remove jumps of the model.
     """
     if any(isinstance(effect, (PoissonSteps, RandomTelegraph)) for effect in whitened.effects):
         return NO_FINDING
@@ -176,10 +174,11 @@ def diagnose_level_change(whitened: WhitenedAxis) -> Finding:
 
 
 def level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats]:
-    """Return the gain of a step at each time, by two Fourier transforms.
+    """Return the gain of a step of the level at each time.
 
-    The coefficients of a step at sample s are −√(2/n) sin(πks/n)/(2 sin(πk/2n)). Their weighted sum of squares is Σ W_k
-    (1 − cos(2πks/n))/(4n sin²(πk/2n)), which is one Fourier transform. Their product with the data is a running sum.
+    A unit step at sample s has the coefficients X_k = −√(2/n) sin(πks/n)/(2 sin(πk/2n)). With the weights W_k, the
+    weighted sum of squares is Σ W_k X_k² = Σ W_k (1 − cos(2πks/n))/(4n sin²(πk/2n)), which a Fourier transform computes
+    for all s. The weighted sum of the products of X_k and the data is a running sum of the data over time.
 
     Returns
     -------
@@ -203,7 +202,7 @@ def level_step_gains(whitened: WhitenedAxis) -> tuple[Floats, Floats]:
 
 
 def _regressor_gain(whitened: WhitenedAxis, columns: list[Floats]) -> float:
-    """Return the log-likelihood gain in nats of regressors, each of shape (n − 1,), with free sizes."""
+    """Return the log-likelihood gain in nats of regressors, each of shape (n − 1,), with fitted sizes."""
     stacked = np.stack([column * whitened.weights for column in columns])
     normal, right = stacked @ stacked.T, stacked @ whitened.coefficients
     scale = np.sqrt(np.maximum(np.diag(normal), 1e-300))
@@ -212,7 +211,7 @@ def _regressor_gain(whitened: WhitenedAxis, columns: list[Floats]) -> float:
 
 
 def diagnose_autocorrelation(whitened: WhitenedAxis) -> Finding:
-    """Find the lag at which the whitened series is most strongly correlated with itself."""
+    """Find the lag with the strongest autocorrelation of the whitened series."""
     gains = 0.5 * autocorrelation(whitened.series) ** 2 * whitened.axis.n
     at = int(np.argmax(gains))
     lag_s = (at + 1) / whitened.axis.rate_hz
@@ -258,23 +257,16 @@ def diagnose_other_axes(whitened: WhitenedAxis) -> Finding:
 def diagnose_variance(whitened: WhitenedAxis) -> Finding:
     """Find a variation of the noise variance in time: a step, a trend, a period or a slow random variation."""
     found = whitened.variance_changes
-    gain = max(found.step.gain, found.trend, found.periodic, found.wander)
+    gain = max(found.step.gain, found.largest_alternative_gain)
     return Finding(gain, Location(time=(found.step.time.lo, found.step.time.hi)))
 
 
 def diagnose_spectrogram(whitened: WhitenedAxis) -> Finding:
-    """Find the rectangle of time and frequency, or the frequency range, whose power is least constant in time."""
-    found = least_constant_tiles(whitened)
+    """Find the tile or the row of the spectrogram whose power is least constant in time."""
+    found = whitened.least_constant_tiles
     if found.gain >= found.row_gain:
         return Finding(found.gain, Location(time=found.time, frequency=found.frequency))
     return Finding(found.row_gain, Location(frequency=found.row))
-
-
-def least_constant_tiles(whitened: WhitenedAxis) -> LeastConstantTiles:
-    """Return the least constant parts of the spectrogram, corrected for the noise steps of the axis."""
-    return find_least_constant_tiles(
-        whitened.series / noise_deviation_over_time(whitened.fit), 1.0 / whitened.axis.rate_hz
-    )
 
 
 def diagnose_tails(whitened: WhitenedAxis) -> Finding:
@@ -284,8 +276,7 @@ def diagnose_tails(whitened: WhitenedAxis) -> Finding:
 
 
 def diagnose_quantization_clipping_repeats(whitened: WhitenedAxis) -> Finding:
-    """Find quantization, clipping or repeats in the measured values that the model does not contain."""
-    have = {type(effect) for effect in whitened.effects}
+    """Find quantization, clipping or repeats of the measured values, if the model does not contain this effect."""
     statistics = whitened.axis.value_statistics
     best = NO_FINDING
     for kind, found in (
@@ -293,7 +284,7 @@ def diagnose_quantization_clipping_repeats(whitened: WhitenedAxis) -> Finding:
         (Saturation, statistics.clipping),
         (RandomSampleHold, statistics.repeats),
     ):
-        if found is not None and kind not in have and found.gain > best.gain:
+        if found is not None and kind not in whitened.types and found.gain > best.gain:
             best = Finding(found.gain, Location())
     if best.gain and statistics.clipping is not None and best.gain == statistics.clipping.gain:
         return Finding(best.gain, Location(value=(statistics.clipping.limit.lo, statistics.clipping.limit.hi)))

@@ -1,14 +1,15 @@
 """Null distributions of the diagnostics from simulations of the model, and scores of the measured recording.
 
-The gap of a diagnostic is √(2 × gain). It is the size of the strongest departure in standard deviations. The null
-distribution of the gain comes from recordings that are simulated from the model under test. The gains of a true model
-are nearly pivotal, that is, the same for all axes and models. The gains of all axes are therefore pooled. Above their
-upper quartile q, the distribution decreases as exp(−(g − q)/s). The scale s is the mean excess over q, limited to [1,
-1.3] as for the tails of maxima of χ²/2.
+The gap of a diagnostic is √(2 × gain). It is the size of the strongest departure in standard deviations. Recordings
+that are simulated from the model under test give the null distribution of the gain. For a true model, the distribution
+of the gain is nearly the same on all axes and for all models. The gains of all axes are therefore pooled. Let q be the
+upper quartile of the pooled gains. Above q, the density of a gain g is modelled as proportional to exp(−(g − q)/s). The
+scale s is the mean of g − q of the gains above q. The scale is limited to the range from 1 to 1.3, which is typical of
+the maximum of many χ²/2 values.
 
-On a true model, one of 100 recordings exceeds ``threshold`` on any axis in any diagnostic. ``null95`` refers to one
-diagnostic on one axis. If the simulated gains of an axis lie above the pooled threshold (coarse or clipped values), the
-threshold of this axis is the largest of these gains plus a margin.
+With a true model, one of 100 recordings exceeds ``threshold`` in any diagnostic on any axis. ``null95`` refers to one
+diagnostic on one axis. Coarse or clipped values may cause larger gains on one axis. If a simulated gain of an axis
+comes close to the pooled threshold, the threshold of this axis is the largest simulated gain of the axis plus a margin.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,11 +25,10 @@ from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.result import DiagnosticGap
 
 FALSE_ALARM_PROBABILITY: Final = 0.01
-"""Fraction of the recordings of a true model that pass a threshold in any diagnostic on any axis."""
+"""Fraction of the recordings of a true model that exceed a threshold in any diagnostic on any axis."""
 UPPER_QUANTILE: Final = 0.25
-"""Fraction of the gains above which their distribution is modelled as exponential."""
+"""Fraction of the gains, from the largest downwards, whose distribution is modelled as exponential."""
 EXCESS_RANGE_NATS: Final = (1.0, 1.3)
-"""Limits of the mean excess in nats."""
 AXIS_MARGIN_NATS: Final = 3.0
 """Margin in nats above the largest simulated gain of an axis."""
 
@@ -54,16 +54,10 @@ def run_diagnostics(whitened: WhitenedAxis) -> Findings:
 
 
 def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> dict[str, AxisNull]:
-    """Return the null distributions of each axis.
-
-    Parameters
-    ----------
-    simulated : mapping of str to sequence of Findings
-        For each axis, the findings of the simulated recordings.
-    """
+    """Return the null distributions of each axis from the findings on simulated recordings of the axis."""
     found: dict[str, dict[str, NullDistribution]] = {axis: {} for axis in simulated}
     for lens in DIAGNOSTICS:
-        gains = {axis: np.array([one[lens].gain for one in seen]) for axis, seen in simulated.items()}
+        gains = {axis: np.array([one[lens].gain for one in findings]) for axis, findings in simulated.items()}
         pooled = _tail_quantiles(np.concatenate(list(gains.values())), len(simulated))
         for axis, own in gains.items():
             largest = float(own.max(initial=0.0))
@@ -75,7 +69,7 @@ def estimate_null_distributions(simulated: Mapping[str, Sequence[Findings]]) -> 
 
 
 def _tail_quantiles(gains: Floats, axis_count: int) -> NullDistribution:
-    """Return the quantiles of the null distribution from pooled gains."""
+    """Return the null distribution of one diagnostic from the pooled gains of all axes."""
     quartile = float(np.quantile(gains, 1.0 - UPPER_QUANTILE)) if gains.size else 0.0
     beyond = gains[gains > quartile] - quartile
     scale = float(np.clip(beyond.mean() if beyond.size else EXCESS_RANGE_NATS[0], *EXCESS_RANGE_NATS))
@@ -84,7 +78,7 @@ def _tail_quantiles(gains: Floats, axis_count: int) -> NullDistribution:
 
 
 def measure_gaps(findings: Findings, null: AxisNull) -> tuple[DiagnosticGap, ...]:
-    """Return the scores of an axis, in the order of the diagnostics.
+    """Return the gaps of an axis, in the order of the diagnostics.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Plot data of an axis and a model: the measurement, the expectation and the 95 % band.
 
-At each point, the band contains 95 of 100 simulated recordings. The band is calculated from the spectrum of the model,
-without simulation. A plot has a few hundred points.
+If the model is true, the measurement lies in the band in 95 of 100 recordings, at each point separately. The band is
+calculated from the spectrum of the model, without simulation. A plot has at most a few hundred points.
 """
 
 from collections.abc import Callable
@@ -20,13 +20,10 @@ from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import PlotData
 
 SPECTRUM_POINTS: Final = 240
-"""Approximate number of points of a spectrum."""
 TIME_BLOCKS: Final = 240
-"""Number of blocks of a plot over time."""
 TEMPERATURE_BINS: Final = 24
-"""Number of temperature intervals."""
 LEVEL_UNITS: Final = {"g": "rad/s", "a": "m/s²"}
-"""Unit of the level by the first letter of the axis."""
+"""Unit of the samples by the first letter of the axis."""
 
 
 def plot_data(whitened: WhitenedAxis) -> tuple[PlotData, ...]:
@@ -93,9 +90,10 @@ def _density_function(whitened: WhitenedAxis) -> Callable[[Floats], Floats]:
 def _allan_degrees_of_freedom(whitened: WhitenedAxis, m: Ints) -> Floats:
     """Return the degrees of freedom of overlapping Allan variances.
 
-    An Allan variance is a sum Σ a_k Y_k² of squared coefficients with variances v. The degrees of freedom are therefore
-    2 E²/Var = (Σ a v)²/Σ (a v)². The weights are a_k ∝ sin⁴(πfτ)/sin²(πfτ0). If a bin contains more than a period of
-    sin⁴, the mean 3/8 and the mean square 35/128 are used.
+    An Allan variance is a weighted sum Σ a_k Y_k² of squared coefficients Y_k, which have the variances v_k. The
+    weights a_k are proportional to sin⁴(πfτ)/sin²(πfτ0). A variance with the mean E and the variance V has 2 E²/V
+    degrees of freedom, which is (Σ a_k v_k)²/Σ (a_k v_k)². If a bin is wider than a period of sin⁴, the mean of sin⁴
+    (3/8) and the mean square (35/128) are used in place of the value at the centre of the bin.
     """
     bins, variance = whitened.axis.bins, whitened.fit.whittle.variance
     f, count = bins.f_hz, bins.count
@@ -123,7 +121,7 @@ def _plot_level(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
 
 
 def _level_spread(whitened: WhitenedAxis, length_s: float) -> float:
-    """Return half the width of the 95 % band of the mean over a time, in the unit of the axis."""
+    """Return half the width of the 95 % band of the mean over ``length_s`` seconds, in the unit of the axis."""
     bins = whitened.axis.bins
     weight = np.sinc(bins.f_hz * length_s) ** 2
     return Z95 * float(np.sqrt((bins.count * whitened.fit.whittle.variance * weight).sum() / whitened.axis.n))
@@ -143,7 +141,7 @@ def _plot_variance(whitened: WhitenedAxis) -> PlotData:
 
 
 def _plot_tails(whitened: WhitenedAxis) -> PlotData:
-    """Return the plot of the share of samples beyond a distance."""
+    """Return the plot of the share of samples whose magnitude exceeds a limit."""
     magnitudes = np.sort(np.abs(whitened.flat_series))
     n = magnitudes.size
     x = np.linspace(0.5, max(float(magnitudes[-1]), 4.0), 80)
@@ -184,7 +182,7 @@ def _plot_level_over_temperature(whitened: WhitenedAxis, fitted: Floats, tempera
 
 
 def _level_unit(whitened: WhitenedAxis) -> str:
-    """Return the unit of the level of an axis."""
+    """Return the unit of the samples of an axis."""
     return LEVEL_UNITS[whitened.axis.name[0]]
 
 

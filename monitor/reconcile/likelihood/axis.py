@@ -1,9 +1,9 @@
 """Maximum-likelihood fit of effects to one axis of a recording.
 
-An ``Axis`` holds the repaired samples of one axis, the transforms of the axes that may leak into this axis, and the
-temperature. ``Axis.fit`` returns an ``AxisFit`` with the sizes that maximise the Whittle likelihood. Regressors and the
-sums of their products over bins are cached, because most trials of a search use the same ramp, line or delayed
-temperature.
+An ``Axis`` contains the repaired samples of one axis, the transforms of the axes that may leak into this axis, and the
+temperature. ``Axis.fit`` returns an ``AxisFit`` with the sizes that maximise the Whittle likelihood. Most trials of a
+search use the same ramp, line or delayed temperature. The regressors and the sums of products over bins are therefore
+cached.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Effect, Leak, Transform
+from monitor.noise.effect import Effect, Leak, Source, Transform
 from monitor.noise.effects import (
     TRANSFORM_ORDER,
     AngleRandomWalk,
@@ -31,7 +31,6 @@ from monitor.reconcile.likelihood.effect_terms import (
     NOISE_SIZE_PARAMETERS,
     size,
     unit_regressors,
-    unit_spectrum,
     with_regressor_factors,
     with_size,
 )
@@ -40,34 +39,32 @@ from monitor.reconcile.preparation.cosine_bins import Bins, cosine_transform
 from monitor.reconcile.preparation.value_statistics import Clipping, QuantizationGrid, RepeatedSamples
 
 MIN_BIN_POWER_RATIO: Final = 1e-4
-"""Smallest power of a bin relative to the median bin. Weaker bins in the stop band of a filter contain only the effect
-of the ends of the recording.
+"""Smallest power of a bin that is used, relative to the median bin. Weaker bins lie in the stop band of a filter, and
+the ends of the recording determine the power there.
 """
 MIN_STOP_BAND_FRACTION: Final = 0.02
-"""Lowest frequency of a stop band, as a fraction of the sample rate. At lower frequencies, a bin of one coefficient may
-be weak by chance.
+"""Lowest frequency of a stop band, as a fraction of the sample rate. At lower frequencies, a bin may contain a single
+coefficient, which may be weak by chance.
 """
 MAX_CACHE_BYTES: Final = 1 << 28
-"""Largest memory of the cached regressors, in bytes."""
 MIN_CACHED_SERIES: Final = 16
-"""Number of cached series for recordings of any length. The diagnostics use this many series."""
+"""Smallest number of cached series, for recordings of any length. The diagnostics use 16 series."""
 MAX_CACHED_PRODUCTS: Final = 4096
-"""Largest number of cached sums over bins for each axis."""
 INITIAL_FLOOR_RATIO: Final = 1e-3
-"""Starting value of the white noise floor after a low-pass filter, relative to the total power."""
+"""Starting value of the noise floor after a low-pass filter, relative to the total power."""
 INITIAL_EXTRA_RATIO: Final = 1e-2
 """Starting value of an additional variance basis, relative to the total power."""
 Effects = tuple[Effect, ...]
-"""Effects of one axis in a fixed order."""
+"""Effects of one axis, in order."""
 Regressor = tuple[Effect, int]
 """Deterministic effect and the index of one of its one or two regressors."""
 CURVATURE: Final[Regressor] = (Bias(value=1.0), 0)
-"""Marker for the regressor t². As an effect, a constant bias would have no influence."""
+"""Marker for the regressor t². The marker contains a constant bias, which is never a regressor."""
 
 
 @dataclass(frozen=True, slots=True)
 class ValueStatistics:
-    """Statistics of the measured values of an axis: quantization levels, clipping and repeated samples."""
+    """Quantization, clipping and repeated samples of the measured values of an axis. None: not detected."""
 
     quantization: QuantizationGrid | None
     clipping: Clipping | None
@@ -75,7 +72,7 @@ class ValueStatistics:
 
 
 class RegressorCache:
-    """Cached transforms of the regressors that depend on time and temperature.
+    """Cache of the cosine transforms of the regressors that depend on time and temperature.
 
     Parameters
     ----------
@@ -92,22 +89,22 @@ class RegressorCache:
             return [cosine_transform(series) for series in unit_regressors(effect, n, rate_hz, temperature_c)]
 
         self.curvature = cosine_transform(np.linspace(-1.0, 1.0, n) ** 2)
-        """[n − 1] transform of t², a drift that corresponds to no named effect."""
+        """Cosine transform of t², shape (n − 1,)."""
         self.step_power = 0.25 / n / np.sin(0.5 * np.pi * np.arange(1, n) / n) ** 2
-        """[n − 1] mean squares of the coefficients of a unit step, averaged over all step times."""
+        """Mean square of each coefficient of a unit step, averaged over all step times, shape (n − 1,)."""
         self._transform_regressors = lru_cache(max(MIN_CACHED_SERIES, MAX_CACHE_BYTES // (8 * n)))(transform_regressors)
 
     def regressor_transforms(self, effect: Effect) -> list[Floats]:
-        """Return the transforms of the regressors of a deterministic effect with size one, each of shape (n − 1,)."""
+        """Return the cosine transform of each regressor of a deterministic effect, each of shape (n − 1,)."""
         return self._transform_regressors(with_regressor_factors(effect, np.ones(2)))
 
 
 class _NoiseVariances(NamedTuple):
-    """Variances of the coefficients of each bin due to noise effects."""
+    """Contributions of the noise effects to the variance of the coefficients in each bin."""
 
-    free: list[int]  # index of each fitted noise effect
-    bases: list[Floats]  # [m] variance of each fitted noise effect with size one
-    start: list[float]  # starting value of θ for each fitted noise effect
+    fitted: list[int]  # index of each noise effect whose size is fitted
+    bases: list[Floats]  # [m] variance basis of each of these effects
+    start: list[float]  # starting value of θ, the square of the size, for each of these effects
     constant: Floats  # [m] variance that is not fitted
 
 
@@ -128,7 +125,7 @@ class Axis:
     _products: dict[tuple[object, ...], Floats] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
-        power = self.bins.sums(self.coefficients**2) / self.bins.count
+        power = self.bins.sum_over_bins(self.coefficients**2) / self.bins.count
         slow = self.bins.f_hz < MIN_STOP_BAND_FRACTION * self.bins.rate_hz
         self.used_bins = ((power > MIN_BIN_POWER_RATIO * np.median(power)) | slow).astype(np.float64)
 
@@ -153,16 +150,14 @@ class Axis:
         return float(np.sqrt(np.mean(self.coefficients**2)))
 
     def with_samples(self, repaired: Floats) -> "Axis":
-        """Return a copy of the axis with other repaired samples, shape (n,)."""
+        """Return a copy of the axis with the given samples, shape (n,), in place of the repaired samples."""
         return replace(self, repaired=repaired, coefficients=cosine_transform(repaired))
 
     def regressor_transforms(self, effect: Effect) -> list[Floats]:
-        """Return the transforms of the regressors of a deterministic effect with size one, each of shape (n − 1,)."""
-        return (
-            [self.leak_sources[effect.source]]
-            if isinstance(effect, Leak)
-            else self.regressors.regressor_transforms(effect)
-        )
+        """Return the cosine transform of each regressor of a deterministic effect, each of shape (n − 1,)."""
+        if isinstance(effect, Leak):
+            return [self.leak_sources[effect.source]]
+        return self.regressors.regressor_transforms(effect)
 
     def fit(
         self,
@@ -172,7 +167,7 @@ class Axis:
         curvature: bool = False,
         noise_floor: bool = True,
     ) -> "AxisFit":
-        """Return the maximum of the likelihood over all sizes that are not fixed.
+        """Maximise the likelihood over all sizes that are not fixed.
 
         Parameters
         ----------
@@ -181,13 +176,12 @@ class Axis:
         fixed_noise : frozenset of int, optional
             Indices of the noise effects whose size is fixed.
         extra_bases : ndarray of float64, shape (r, m), optional
-            Additional variance bases without an effect.
+            Additional variance bases that belong to no effect.
         curvature : bool, optional
-            If True, t² is an additional regressor without an effect.
+            If True, t² is an additional regressor.
         noise_floor : bool, optional
-            If True and the effects contain a low-pass filter, white noise is added after the filter. A real sensor
-            aliases and its converter is noisy. The null of a digital filter at half the sample rate is therefore never
-            observed.
+            If True and the effects contain a low-pass filter, white noise is added after the filter. Aliasing and the
+            noise of the converter always fill the null that a digital filter has at half the sample rate.
 
         Returns
         -------
@@ -211,19 +205,19 @@ class Axis:
         )
         return AxisFit(
             self,
-            _with_fitted_sizes(effects, noise.free, slices, fitted),
+            _with_fitted_sizes(effects, noise.fitted, slices, fitted),
             fixed_noise,
             fitted.log_likelihood,
             fitted,
-            tuple(noise.free),
+            tuple(noise.fitted),
             slices,
-            float(fitted.theta[len(noise.free)]) if noise_floor else 0.0,
+            float(fitted.theta[len(noise.fitted)]) if noise_floor else 0.0,
         )
 
     def _noise_variances(
         self, effects: Sequence[Effect], fixed_noise: frozenset[int], transforms: Sequence[Transform]
     ) -> _NoiseVariances:
-        """Return the variance bases of the fitted noise effects, and the variance of all other noise."""
+        """Return the variance bases of the noise effects that are fitted, and the variance of all other noise."""
         constant = _density_after(transforms, None, self.bins) / (1.0 / self.rate_hz)
         found = _NoiseVariances([], [], [], constant)
         for at, effect in enumerate(effects):
@@ -233,13 +227,13 @@ class Axis:
             if at in fixed_noise:
                 constant += size(effect) ** 2 * basis
             else:
-                found.free.append(at)
+                found.fitted.append(at)
                 found.bases.append(basis)
                 found.start.append(min(size(effect) ** 2, self._full_power_theta(basis)))
         return found
 
     def binned_sums(self, columns: Sequence[Regressor]) -> BinSums:
-        """Return the sums over bins of the products of the axis and regressors."""
+        """Return the sums over bins of the products of the axis and the regressors."""
         q, m = len(columns), self.bins.count.size
         cross, gram = np.empty((q, m)), np.empty((q, q, m))
         for i, column in enumerate(columns):
@@ -249,7 +243,7 @@ class Axis:
         return BinSums(self._binned_product(None, None), cross, gram)
 
     def _regressors_of(self, effects: Sequence[Effect]) -> tuple[tuple[tuple[int, slice], ...], list[Regressor]]:
-        """Return the regressors of the deterministic effects, and for each effect its index and the slice of β."""
+        """Return the index and the slice of β of each deterministic effect, and all regressors."""
         slices: list[tuple[int, slice]] = []
         columns: list[Regressor] = []
         for at, effect in enumerate(effects):
@@ -260,34 +254,35 @@ class Axis:
         return tuple(slices), columns
 
     def _variance_basis(self, effect: Effect, effects: Sequence[Effect], transforms: Sequence[Transform]) -> Floats:
-        """Return the variance, shape (m,), of the coefficients of each bin for a noise effect with size one."""
+        """Return the variance basis of a noise effect, shape (m,), after the transforms."""
         factor = 1.0
         if isinstance(effect, AngleRandomWalk):
             for other in effects:
                 if isinstance(other, NoiseStep):
                     later = 1.0 - min(other.time * self.rate_hz / self.n, 1.0)
                     factor *= 1.0 + later * (other.ratio**2 - 1.0)  # mean variance over the recording
-        tau0_s = 1.0 / self.rate_hz
-        source = Spectrum(lambda f: factor * unit_spectrum(effect, f, tau0_s), None, tau0_s)
+        tau0_s, unit = 1.0 / self.rate_hz, with_size(effect, 1.0)
+        assert isinstance(unit, Source)
+        source = Spectrum(lambda f: factor * unit.psd(f, tau0_s), None, tau0_s)
         density = _density_after(transforms, source, self.bins) - _density_after(transforms, None, self.bins)
         return np.asarray(density / tau0_s)
 
     def _full_power_theta(self, basis: Floats) -> float:
-        """Return the θ for which a basis would have the total power of the axis."""
+        """Return the θ for which the variance basis times θ has the same total power as the axis."""
         power = self._binned_product(None, None).sum()
         return float(power / max((self.bins.count * self.used_bins * basis).sum(), 1e-300))
 
     def _binned_product(self, a: Regressor | None, b: Regressor | None) -> Floats:
-        """Return the sums over bins of the product of two columns. None means the axis itself."""
+        """Return the sums over bins of the product of two transforms. None selects the transform of the axis."""
         key = (_regressor_key(a), _regressor_key(b))
         if key not in self._products:
             if len(self._products) > MAX_CACHED_PRODUCTS:
                 self._products.clear()
-            self._products[key] = self.bins.sums(self._column(a) * self._column(b)) * self.used_bins
+            self._products[key] = self.bins.sum_over_bins(self._column(a) * self._column(b)) * self.used_bins
         return self._products[key]
 
     def _column(self, regressor: Regressor | None) -> Floats:
-        """Return the transform of a regressor, or of the axis itself for None."""
+        """Return the transform of a regressor. None selects the transform of the axis."""
         if regressor is None:
             return self.coefficients
         return (
@@ -311,19 +306,19 @@ class AxisFit:
     noise_floor_variance: float = 0.0  # variance of a coefficient due to the white noise floor after a low-pass filter
 
     def size_error(self, index: int) -> float:
-        """Return the standard error of the size of the effect with the given index, or NaN if the size was fixed."""
+        """Return the standard error of the size of the effect with the given index, or NaN for a fixed size."""
         if index in self.fitted_noise:
             noise = self.fitted_noise.index(index)
             covariance = np.linalg.pinv(self.whittle.theta_information)
             theta = float(self.whittle.theta[noise])
             return 0.5 * float(np.sqrt(covariance[noise, noise] / theta)) if theta > 0.0 else float("nan")
         for at, place in self.regressor_slices:
-            if at == index:  # the two columns of one effect, a sine and its cosine, have equal errors
+            if at == index:  # the two regressors of a sinusoid have equal errors
                 return float(np.sqrt(np.diag(self.whittle.beta_covariance)[place].mean()))
         return float("nan")
 
     def with_regressor_sizes(self, beta: Floats) -> "AxisFit":
-        """Return the fit with given sizes, shape (q,), of the deterministic effects and unchanged noise."""
+        """Return the fit with the given sizes of the regressors, shape (q,), and the same noise."""
         axis, whittle = self.axis, self.whittle
         sums = axis.binned_sums(
             [(self.effects[at], i) for at, p in self.regressor_slices for i in range(p.stop - p.start)]
@@ -335,7 +330,7 @@ class AxisFit:
         return replace(self, whittle=changed, log_likelihood=value)
 
     def residual_coefficients(self) -> Floats:
-        """Return the coefficients, shape (n − 1,), with all fitted deterministic effects removed."""
+        """Return the coefficients, shape (n − 1,), less all fitted deterministic effects."""
         left = self.axis.coefficients.copy()
         for at, place in self.regressor_slices:
             for factor, column in zip(
@@ -346,9 +341,9 @@ class AxisFit:
 
 
 def _spectral_transforms(effects: Sequence[Effect], statistics: ValueStatistics) -> list[Transform]:
-    """Return the transforms that change the spectrum, in the order in which they act.
+    """Return the transforms that change the spectrum, in the order in which the transforms act.
 
-    Repeated samples at known positions have been replaced and do not change the spectrum.
+    Repeated samples at known positions were replaced, so that they do not change the spectrum.
     """
     replaced = statistics.repeats is not None and bool(statistics.repeats.mask.any())
     found = [
@@ -364,7 +359,7 @@ def _with_fitted_sizes(
 ) -> Effects:
     """Return the effects with their fitted sizes."""
     found = list(effects)
-    for theta, at in zip(fitted.theta, noises, strict=False):  # bases without an effect come last
+    for theta, at in zip(fitted.theta, noises, strict=False):  # additional bases follow the bases of the effects
         found[at] = with_size(found[at], float(theta) ** 0.5)
     for at, place in slices:
         found[at] = with_regressor_factors(found[at], fitted.beta[place])
@@ -372,10 +367,10 @@ def _with_fitted_sizes(
 
 
 def _density_after(transforms: Sequence[Transform], source: Spectrum | None, bins: Bins) -> Floats:
-    """Return the spectral density, shape (m,), of a source, or of no source, after the transforms of an axis.
+    """Return the spectral density, shape (m,), of a source after the transforms of an axis.
 
-    Rounding adds white noise, also if the quantization steps are coarse. Clipped samples have been restored before, so
-    saturation has no influence.
+    If the source is None, the result is the noise that the transforms add. Rounding adds white noise, even if the
+    quantization steps are coarse. Saturation has no influence, because clipped samples were replaced.
     """
     spectrum = source or Spectrum(np.zeros_like, np.zeros_like, 1.0 / bins.rate_hz)
     for transform in transforms:
@@ -387,7 +382,7 @@ def _density_after(transforms: Sequence[Transform], source: Spectrum | None, bin
 
 
 def _regressor_key(regressor: Regressor | None) -> tuple[object, int] | None:
-    """Return the cache key of a regressor, which does not depend on the size of the effect."""
+    """Return the cache key of a regressor, which is the same for all sizes of the effect."""
     if regressor is None or regressor is CURVATURE:
         return regressor
     effect, at = regressor

@@ -1,10 +1,11 @@
 """Role of each effect in the likelihood of an axis: noise variance, regressor or transform.
 
-The **size** of an effect is the parameter that scales the effect. All other parameters are **shape parameters**. The
-variance of a noise effect is proportional to the square of the size, and the spectrum with size one is the variance
-basis. A deterministic effect is a fixed series times the size. The regressor of a deterministic effect is the series
-with size one. The simulation uses the same series, so fit and simulation agree. A ``Leak`` is a deterministic effect
-whose series is another axis. A transform changes the variance bases of all effects before the transform.
+The **size** of an effect is the parameter that scales the effect. All other parameters are **shape parameters**. A
+noise effect adds variance to each frequency bin. The variance is the **variance basis**, which is the variance for size
+one, multiplied by the square of the size. A deterministic effect adds a series. The series is the **regressor**, which
+is the series for size one, multiplied by the size. The simulation uses the same series, so fit and simulation agree.
+The regressor of a ``Leak`` is another axis. A transform, such as a low-pass filter, changes the variance bases of all
+noise effects that act before the transform.
 """
 
 from dataclasses import replace
@@ -64,29 +65,20 @@ SIZE_PARAMETERS: Final = NOISE_SIZE_PARAMETERS | DETERMINISTIC_SIZE_PARAMETERS
 ONE_TIME_EFFECTS: Final = frozenset({"bias_step", "noise_step", "turn_on_transient"})
 """Names of the effects that happen once. One part of a recording contains no information about another part."""
 
-NATURAL_DIAGNOSTIC: Final[dict[str, str]] = {
-    "quantization_noise": "psd",
-    "angle_random_walk": "psd",
-    "bias_instability": "psd",
-    "rate_random_walk": "psd",
-    "exponentially_correlated": "psd",
-    "scale_factor": "psd",
-    "sinusoidal": "lines",
-    "narrowband": "psd",
-    "bandwidth_limit": "psd",
-    "temperature_bias": "temperature",
-    "temperature_lag": "temperature",
-    "g_sensitivity": "other_axes",
-    "cross_axis": "other_axes",
-    "bias_step": "level",
-    "rate_ramp": "level",
-    "turn_on_transient": "level",
-    "outliers": "tails",
-    "noise_step": "variance",
-    "resolution": "values",
-    "saturation": "values",
-    "sample_hold": "values",
+_EFFECTS_BY_DIAGNOSTIC: Final = {
+    "psd": (
+        *("quantization_noise", "angle_random_walk", "bias_instability", "rate_random_walk"),
+        *("exponentially_correlated", "scale_factor", "narrowband", "bandwidth_limit"),
+    ),
+    "lines": ("sinusoidal",),
+    "temperature": ("temperature_bias", "temperature_lag"),
+    "other_axes": ("g_sensitivity", "cross_axis"),
+    "level": ("bias_step", "rate_ramp", "turn_on_transient"),
+    "tails": ("outliers",),
+    "variance": ("noise_step",),
+    "values": ("resolution", "saturation", "sample_hold"),
 }
+MOST_DIRECT_DIAGNOSTIC: Final = {effect: lens for lens, effects in _EFFECTS_BY_DIAGNOSTIC.items() for effect in effects}
 """For each effect, the diagnostic that shows the effect most directly."""
 
 
@@ -96,9 +88,9 @@ def size(effect: Effect) -> float:
 
 
 def with_size(effect: Effect, value: float) -> Effect:
-    """Return the effect with another size.
+    """Return the effect with the given size.
 
-    The size of a noise, of a ramp and of a sinusoid has no sign.
+    The sizes of noise effects, ramps and sinusoids are never negative, so the sign of the value is ignored for them.
 
     Parameters
     ----------
@@ -112,31 +104,11 @@ def with_size(effect: Effect, value: float) -> Effect:
     return replace(effect, **{name: abs(value) if unsigned else value})  # type: ignore[type-var]
 
 
-def unit_spectrum(effect: Effect, f_hz: Floats, tau0_s: float) -> Floats:
-    """Return the two-sided spectral density of a noise effect with size one, before transforms.
-
-    Parameters
-    ----------
-    effect : Effect
-        Noise effect.
-    f_hz : ndarray of float64, shape (m,)
-        Frequencies in Hz.
-    tau0_s : float
-        Sample period in seconds.
-
-    Returns
-    -------
-    ndarray of float64, shape (m,)
-        Spectral density in unit²/Hz.
-    """
-    assert isinstance(effect, Source)
-    return np.asarray(with_size(effect, 1.0).psd(f_hz, tau0_s))  # type: ignore[attr-defined]
-
-
 def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Floats | None) -> list[Floats]:
-    """Return the regressors whose linear combinations give a deterministic effect of any size.
+    """Return the regressors of a deterministic effect.
 
-    Effects with a phase or a quadratic term have two regressors.
+    A sinusoid has one regressor for each of two phases. A quadratic temperature effect has one regressor for the linear
+    term and one for the quadratic term. All other effects have one regressor.
 
     Parameters
     ----------
@@ -157,7 +129,7 @@ def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Float
     Raises
     ------
     TypeError
-        If the effect is a leak, whose series is another axis.
+        If the effect is a leak, because the regressor of a leak is another axis.
     """
     if isinstance(effect, Leak):
         raise TypeError("the series of a leak is another axis")
@@ -175,14 +147,14 @@ def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Float
 
 
 def with_regressor_factors(effect: Effect, factors: Floats) -> Effect:
-    """Return the effect whose regressors have the given factors.
+    """Return the effect with sizes such that the effect is the sum of the regressors times the given factors.
 
     Parameters
     ----------
     effect : Effect
         Deterministic effect.
     factors : ndarray of float64, shape (1,) or (2,)
-        Factor of each regressor.
+        Factor for each regressor.
     """
     if isinstance(effect, Sinusoidal):
         return replace(effect, amplitude=hypot(*factors), phase=atan2(factors[1], factors[0]) % (2.0 * pi))

@@ -1,8 +1,8 @@
-"""Hypotheses about one axis: effects of the model, some of them with another size, and effects that were found.
+"""Hypotheses about one axis: the effects of the model under test, some with a changed size, and added effects.
 
-The sizes in a model are kept unless the data contradict them. The size of a noise effect is fitted only if this gains
-more than ``RESIZE_PENALTY_NATS`` of log-likelihood. A model whose N is 5 % wrong thus gets another N and no new effect.
-A correct K keeps its size although other effects may look like a random walk. The sizes of new effects and of all
+The size of a noise effect of the model is fitted only if this gains more than ``RESIZE_PENALTY_NATS`` nats.
+Otherwise the size in the model is kept. If N in the model is 5 % wrong, N is therefore changed, and no effect is added.
+A correct K is kept although other effects may resemble a random walk. The sizes of added effects and of all
 deterministic effects (lines, slopes, temperature dependence) are always fitted.
 """
 
@@ -20,16 +20,16 @@ from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMET
 from monitor.reconcile.result import ParameterInterval
 
 RESIZE_PENALTY_NATS: Final = 5.0
-"""Log-likelihood gain in nats that justifies another size of a noise effect of the model."""
+"""Log-likelihood gain in nats that justifies a change of the size of a noise effect of the model."""
 GOLDEN: Final = 0.6180339887498949
-"""Inverse of the golden ratio."""
+SHAPE_ITERATIONS: Final = 12
 
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
     """Fitted effects of one axis."""
 
-    model: Effects  # effects of the model under test with their original sizes; they come first in ``effects``
+    model: Effects  # effects of the model under test with the original sizes; the first entries of ``effects``
     fit: AxisFit
 
     @property
@@ -54,23 +54,28 @@ class Hypothesis:
 
     @property
     def refitted_size_count(self) -> int:
-        """Number of noise effects of the model whose size was fitted."""
+        """Number of noise effects of the model whose size was fitted instead of kept."""
         return sum(at < self.given_count for at in self.fit.fitted_noise)
 
     @property
+    def resize_penalty(self) -> float:
+        """Penalty for the fitted sizes of the model, in nats."""
+        return RESIZE_PENALTY_NATS * self.refitted_size_count
+
+    @property
     def score(self) -> float:
-        """Log-likelihood less the penalty for the fitted sizes of the model, in nats."""
-        return self.fit.log_likelihood - RESIZE_PENALTY_NATS * self.refitted_size_count
+        """Log-likelihood less the penalties for fitted sizes of the model, in nats."""
+        return self.fit.log_likelihood - self.resize_penalty
 
     def refit_with_added_effects(self, added: Sequence[Effect]) -> "Hypothesis":
-        """Return the same model with other effects added, as ``fit_with_fewest_changes`` fits them."""
+        """Return the fit of the same model with the given added effects, by ``fit_with_fewest_changes``."""
         return fit_with_fewest_changes(self.axis, added, self.model)
 
 
 def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
-    """Fit the deterministic effects of a model and keep the sizes of its noise effects.
+    """Fit the deterministic effects of a model and keep the sizes of the noise effects.
 
-    The sizes of deterministic effects differ from recording to recording.
+    Deterministic effects are fitted because the sizes differ between recordings.
 
     Parameters
     ----------
@@ -83,7 +88,7 @@ def fit_with_fixed_noise(axis: Axis, model: Effects) -> Hypothesis:
 
 
 def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects) -> Hypothesis:
-    """Fit new effects together with a model and change as few sizes of the model as the data require.
+    """Fit added effects together with a model, and change only those sizes of the model that the data contradict.
 
     Parameters
     ----------
@@ -108,7 +113,7 @@ def fit_with_fewest_changes(axis: Axis, added: Sequence[Effect], model: Effects)
         if better.score <= best.score:
             break
         best, fixed_noise = better, better.fit.fixed_noise
-    # The loop misses the case that two sizes are wrong together.
+    # the loop fits one more size at a time and cannot find two sizes that improve the fit only together
     return free if free.score > best.score else best
 
 
@@ -117,91 +122,70 @@ def noise_indices(effects: Sequence[Effect]) -> frozenset[int]:
     return frozenset(at for at, effect in enumerate(effects) if type(effect) in NOISE_SIZE_PARAMETERS)
 
 
-def refine_shape(axis: Axis, effects: Effects, index: int, names: Sequence[str], reach: float = 1.5) -> Effects:
-    """Maximise the likelihood over shape parameters of one effect with all sizes free.
-
-    The parameters are varied in turn, by golden-section search in their logarithm.
+def refine_shape(axis: Axis, others: Effects, effect: Effect, name: str, search_factor: float = 1.5) -> Effect:
+    """Maximise the likelihood over one shape parameter of an effect, with all sizes fitted.
 
     Parameters
     ----------
     axis : Axis
         Axis to fit.
-    effects : tuple of Effect
-        Effects of the axis.
-    index : int
-        Index of the effect whose shape is varied. A negative index counts from the end.
-    names : sequence of str
-        Names of the shape parameters.
-    reach : float, optional
-        Factor by which the first search extends up and down.
+    others : tuple of Effect
+        Other effects of the axis.
+    effect : Effect
+        Effect whose shape parameter is varied.
+    name : str
+        Name of the shape parameter.
+    search_factor : float, optional
+        Largest factor between the result and the present value, in either direction.
 
     Returns
     -------
-    tuple of Effect
-        Effects with the best shape. Sizes are not changed.
+    Effect
+        The effect with the best shape and the same size.
     """
-    found = effects
-    for turn in range(1 if len(names) == 1 else 3):
-        for name in names:
-            width = log(reach) / (turn + 1)
-            middle = log(getattr(found[index], name))
-            best = _find_best_shape(axis, found, index, name, middle - width, middle + width)
-            found = _with_shape(found, index, name, exp(best))
-    return found
 
+    def with_shape(log_value: float) -> Effect:
+        changed: Effect = replace(effect, **{name: exp(log_value)})  # type: ignore[type-var]
+        return changed
 
-def _with_shape(effects: Effects, index: int, name: str, value: float) -> Effects:
-    """Return the effects with another value of one parameter of the effect with the given index."""
-    index %= len(effects)
-    changed: Any = replace(effects[index], **{name: value})  # type: ignore[type-var]
-    return (*effects[:index], changed, *effects[index + 1 :])
+    middle, width = log(getattr(effect, name)), log(search_factor)
+    best = find_maximum_by_golden_section(
+        lambda x: axis.fit((*others, with_shape(x))).log_likelihood, middle - width, middle + width, SHAPE_ITERATIONS
+    )
+    return with_shape(best)
 
 
 def find_maximum_by_golden_section(function: Callable[[float], float], lo: float, hi: float, iterations: int) -> float:
-    """Return the position of the maximum of a function with one maximum, by golden-section search.
+    """Return the position of the maximum of a function that has a single maximum in an interval.
 
     Parameters
     ----------
     function : callable
         Function to maximise.
     lo, hi : float
-        Ends of the interval to search.
+        Ends of the interval.
     iterations : int
-        Number of iterations. Each one shortens the interval by the golden ratio.
+        Number of iterations. Each iteration calls the function once and shortens the interval by the golden ratio.
     """
-    for _ in range(iterations):
-        a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
-        lo, hi = (lo, b) if function(a) > function(b) else (a, hi)
-    return 0.5 * (lo + hi)
-
-
-def _find_best_shape(axis: Axis, effects: Effects, index: int, name: str, lo: float, hi: float) -> float:
-    """Return the logarithm of the shape parameter with the largest likelihood within an interval.
-
-    Unlike ``find_maximum_by_golden_section``, this search evaluates the likelihood once per iteration.
-    """
-
-    def value(x: float) -> float:
-        return axis.fit(_with_shape(effects, index, name, exp(x))).log_likelihood
-
     a, b = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
-    at_a, at_b = value(a), value(b)
-    for _ in range(12):
+    at_a, at_b = function(a), function(b)
+    for _ in range(iterations):
         if at_a > at_b:
             hi, b, at_b = b, a, at_a
             a = hi - GOLDEN * (hi - lo)
-            at_a = value(a)
+            at_a = function(a)
         else:
             lo, a, at_a = a, b, at_b
             b = lo + GOLDEN * (hi - lo)
-            at_b = value(b)
+            at_b = function(b)
     return 0.5 * (lo + hi)
 
 
 def size_interval(fit: AxisFit, index: int) -> ParameterInterval:
-    """Return the size of an effect with its 95 % interval.
+    """Return the size of an effect with the 95 % interval.
 
-    The logarithm of a standard deviation, and the value of a signed size, is taken as Gaussian.
+    The error of the logarithm is Gaussian for the size of a noise effect. The error of the size itself is Gaussian for
+    a deterministic effect.
 
     Parameters
     ----------
@@ -218,10 +202,16 @@ def size_interval(fit: AxisFit, index: int) -> ParameterInterval:
     return ParameterInterval(value, value * exp(-Z95 * error / value), value * exp(Z95 * error / value))
 
 
-def shape_interval(fit: AxisFit, index: int, name: str) -> ParameterInterval:
-    """Return a shape parameter with its 95 % interval from the profile likelihood.
+def _with_shape(effects: Effects, index: int, name: str, value: float) -> Effects:
+    """Return the effects with a changed parameter of the effect with the given index."""
+    changed: Any = replace(effects[index], **{name: value})  # type: ignore[type-var]
+    return (*effects[:index], changed, *effects[index + 1 :])
 
-    Each end of the interval is the value at which the log-likelihood has fallen by ``HALF_CHI2_95``.
+
+def shape_interval(fit: AxisFit, index: int, name: str) -> ParameterInterval:
+    """Return a shape parameter with the 95 % interval from the profile likelihood.
+
+    At each end of the interval, the log-likelihood is ``HALF_CHI2_95`` below the maximum.
 
     Parameters
     ----------

@@ -1,13 +1,14 @@
 """Detection of outliers among white residuals, and tests against other causes of heavy tails.
 
-Three distributions are fitted to the magnitudes of a white series: a Gaussian, the mixture (1−f) N(0, s²) + f N(0, s² +
-scale²) (Tukey 1960), and Student's t. Outliers have a gain over both the Gaussian and Student's t, and they are equally
-likely at all times. Outliers that are neighbours indicate bursts or jumps. A rate of outliers that varies from hour to
-hour indicates noise with a changing variance. The caller decides whether the gains suffice.
+Three distributions are fitted to the magnitudes of a white series: a Gaussian, a mixture of two Gaussians (Tukey 1960)
+and Student's t. The mixture is (1−f) N(0, s²) + f N(0, s² + scale²) with the fraction f of outliers. True outliers fit
+the mixture better than the other two distributions, and they are equally likely at all times. Outliers in successive
+samples indicate bursts or jumps. A rate of outliers that varies from hour to hour indicates noise with a changing
+variance. The caller decides whether the gains suffice.
 
-The fits use the magnitudes in bins that are narrow enough to lose no information: a fortieth of a standard deviation,
-and three percent far out. Each bin has its own mean square. The computing time of the fits therefore does not grow with
-the recording.
+The magnitudes are collected in bins, so that the computing time of the fits does not grow with the recording. Up to six
+standard deviations, a bin is a fortieth of a standard deviation wide. Wider bins follow, each 3 % wider than the bin
+before. The mean square of each bin is stored, so that the bins lose almost no information.
 """
 
 from dataclasses import dataclass
@@ -23,11 +24,9 @@ from monitor.common.distributions import NORMAL_QUARTILE, Z95
 from monitor.reconcile.preparation.value_statistics import Mask, ValueWithInterval
 
 LINEAR_BINS: Final = 240
-"""Number of bins with equal width."""
 LINEAR_RANGE_SIGMA: Final = 6.0
 """Magnitude, in standard deviations, up to which the bins have equal width."""
 TOTAL_BINS: Final = 1024
-"""Number of all bins."""
 BINS_PER_LOG_UNIT: Final = 34.0
 """Number of bins per natural logarithmic unit beyond the linear range. The last bin ends at 6·10¹⁰ standard
 deviations.
@@ -42,13 +41,11 @@ BIN_EDGES: Final = np.concatenate(
 START_WIDTHS: Final = np.array([1.3, 1.6, 2.0, 2.6, 3.4, 5.0, 8.0, 15.0, 40.0, 200.0, 3000.0])
 """Starting values of the EM algorithm: standard deviation of the wide component relative to the narrow one."""
 NEIGHBOUR_SAMPLES: Final = 4
-"""Distance in samples up to which two outliers are neighbours."""
+"""Largest distance in samples of two outliers that count as neighbours."""
 STUDENT_FREEDOMS: Final = np.geomspace(1.0, 300.0, 40)
-"""Degrees of freedom of Student's t that are tried."""
 MIN_MIXTURE_GAIN_NATS: Final = 0.01
-"""Smallest gain in nats of a second Gaussian."""
 MAX_Z: Final = 37.0
-"""Value of z that is used if the probability underflows in 64 bits."""
+"""Value of z for a probability that underflows in 64 bits."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,13 +54,10 @@ class OutlierFit:
 
     fraction: ValueWithInterval
     scale: ValueWithInterval  # standard deviation of the error that is added to a sample
-    noise: float  # standard deviation of the other samples
     mask: Mask  # [n] True for samples that are more likely outliers than not
     count: int  # number of samples in the mask
     gain: float  # log-likelihood gain over one Gaussian, nats
-    over_student: float  # log-likelihood gain over Student's t, nats; the mixture has one more parameter
-    vuong_z: float  # the gain over Student's t divided by its standard error (Vuong 1989)
-    freedom: float  # degrees of freedom of the best Student's t
+    gain_over_student: float  # log-likelihood gain over Student's t, nats; the mixture has one more parameter
     clustering_z: float  # z of the clustering of outliers, corrected for the number of tests
     misfit_z: float  # z of the misfit between the magnitudes and the mixture
 
@@ -78,7 +72,7 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
 
     Returns
     -------
-    Outliers or None
+    OutlierFit or None
         The best mixture, or None if a single Gaussian fits no worse.
 
     Examples
@@ -87,7 +81,7 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
     >>> w = rng.standard_normal(20_000)
     >>> w[::400] += 8.0 * rng.standard_normal(50)
     >>> found = fit_outliers(w)
-    >>> print(f"{found.fraction.value:.4f} {found.scale.value:.1f} {found.gain > 100.0} {found.over_student > 5.0}")
+    >>> print(f"{found.fraction.value:.4f} {found.scale.value:.1f}", found.gain > 100.0, found.gain_over_student > 5.0)
     0.0023 7.2 True True
     """
     good = np.isfinite(w)
@@ -103,21 +97,16 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
     gain = best - _gaussian_log_likelihood(counts, squares)
     if not (gain > MIN_MIXTURE_GAIN_NATS and wide > narrow):
         return None
-    freedom, student, each_student = _fit_student(counts, squares)
-    each = _mixture_log_density(squares, narrow, wide, share)
     far = _outlier_threshold(narrow, wide, share)
     mask = np.asarray(np.abs(w) > far * unit) & good if np.isfinite(far) else np.zeros(w.size, dtype=np.bool_)
     fraction, scale = _parameter_intervals(counts, squares, narrow, wide, share)
     return OutlierFit(
         fraction=fraction,
         scale=ValueWithInterval(unit * scale.value, unit * scale.lo, unit * scale.hi),
-        noise=unit * float(narrow**0.5),
         mask=mask,
         count=int(mask.sum()),
         gain=float(gain),
-        over_student=float(best - student),
-        vuong_z=_vuong_statistic(counts, each - each_student),
-        freedom=freedom,
+        gain_over_student=float(best - _student_log_likelihood(counts, squares)),
         clustering_z=_clustering_z(np.flatnonzero(mask), w.size),
         misfit_z=_misfit_z(counts, kept, narrow, wide, share),
     )
@@ -125,7 +114,7 @@ def fit_outliers(w: Floats) -> OutlierFit | None:
 
 @compiled
 def _bin_magnitudes(w: Floats, unit: float) -> tuple[Floats, Floats]:
-    """Return the counts of |w|/unit in the bins and their sums of squares."""
+    """Return the number of magnitudes |w|/unit in each bin, and the sum of their squares."""
     counts, squares = np.zeros(TOTAL_BINS), np.zeros(TOTAL_BINS)
     for k in range(w.size):
         x = abs(w[k]) / unit
@@ -142,9 +131,9 @@ def _bin_magnitudes(w: Floats, unit: float) -> tuple[Floats, Floats]:
 
 @compiled
 def _fit_mixture(counts: Floats, squares: Floats, start_widths: Floats) -> tuple[float, float, float, float]:
-    """Return variances, share and log-likelihood of the best mixture.
+    """Return the variances of the two Gaussians, the share of the wide one, and the log-likelihood of the best mixture.
 
-    EM runs for a few steps from every start, and then until convergence from the best result.
+    The EM algorithm runs for 40 steps from every start, and then from the best result until it converges.
     """
     total = counts.sum()
     mean = (counts * squares).sum() / total
@@ -208,11 +197,11 @@ def _mixture_log_density(squares: Floats, narrow: float, wide: float, share: flo
     return np.asarray(np.logaddexp(inside, outside))
 
 
-def _fit_student(counts: Floats, squares: Floats) -> tuple[float, float, Floats]:
-    """Return the degrees of freedom, the log-likelihood and the log-densities of the best Student's t.
+def _student_log_likelihood(counts: Floats, squares: Floats) -> float:
+    """Return the log-likelihood of the best Student's t.
 
-    The scale is found by EM with the weights (ν+1)/(ν + x²/s²) (Lange, Little & Taylor 1989), for all degrees of
-    freedom at once.
+    The EM algorithm fits the scale s with the weights (ν+1)/(ν + x²/s²) (Lange, Little & Taylor 1989). It runs for all
+    degrees of freedom ν at the same time.
     """
     nu = STUDENT_FREEDOMS[:, None]
     scale = np.ones_like(nu)
@@ -231,7 +220,7 @@ def _fit_student(counts: Floats, squares: Floats) -> tuple[float, float, Floats]
     if 0 < best < STUDENT_FREEDOMS.size - 1:  # maximum of the parabola through the best three values
         left, right = top - likes[best - 1], top - likes[best + 1]
         top += 0.125 * float((left - right) ** 2 / (left + right)) if left + right > 0.0 else 0.0
-    return float(STUDENT_FREEDOMS[best]), top, each[best]
+    return top
 
 
 def _outlier_threshold(narrow: float, wide: float, share: float) -> float:
@@ -243,8 +232,9 @@ def _outlier_threshold(narrow: float, wide: float, share: float) -> float:
 def _parameter_intervals(
     counts: Floats, squares: Floats, narrow: float, wide: float, share: float
 ) -> tuple[ValueWithInterval, ValueWithInterval]:
-    """Return fraction and scale with 95 % intervals, from the curvature of the likelihood in ln s, ln scale and logit
-    f.
+    """Return the fraction and the scale of the outliers with 95 % intervals.
+
+    The intervals follow from the curvature of the log-likelihood in ln s, ln scale and logit f.
     """
     at = np.array([0.5 * np.log(narrow), 0.5 * np.log(max(wide - narrow, 1e-12)), np.log(share) - np.log1p(-share)])
 
@@ -268,20 +258,13 @@ def _parameter_intervals(
     return ValueWithInterval(*map(float, f)), ValueWithInterval(*map(float, scale))
 
 
-def _vuong_statistic(counts: Floats, log_density_difference: Floats) -> float:
-    """Return the mean difference of log-densities divided by its standard error."""
-    total = float(counts.sum())
-    mean = float(np.dot(counts, log_density_difference)) / total
-    spread = float(np.dot(counts, (log_density_difference - mean) ** 2)) / total
-    return mean * (total / spread) ** 0.5 if spread > 0.0 else 0.0
-
-
 def _clustering_z(positions: Ints, n: int) -> float:
-    """Return the z of the strongest of several tests for clustering of events.
+    """Return the z value of the strongest of several tests for clustering of events.
 
-    The first test compares the number of pairs at most ``NEIGHBOUR_SAMPLES`` samples apart with a Poisson count. The
-    other tests divide the recording into 4, 8, … parts with at least two events per part on average, and compare the
-    dispersion of their counts with χ² (Cochran 1954). The smallest p is multiplied by the number of tests.
+    The first test counts the pairs of events that are at most ``NEIGHBOUR_SAMPLES`` samples apart. Without clustering,
+    this number has a Poisson distribution. The other tests divide the recording into 4, 8, … parts with at least two
+    events per part on average. They compare the dispersion of the event counts with χ² (Cochran 1954). The smallest
+    probability is multiplied by the number of tests.
     """
     if positions.size < 2:
         return 0.0
@@ -306,14 +289,17 @@ def _clustering_z(positions: Ints, n: int) -> float:
 
 
 def _z_of_probability(probability: float) -> float:
-    """Return the z that a standard Gaussian exceeds with a given probability, or 0 for probabilities above 0.5."""
+    """Return the value that a standard Gaussian exceeds with a given probability, or 0 if it exceeds 0.5."""
     if probability > 0.5:
         return 0.0
     return -float(ndtri(probability)) if probability > 1e-300 else MAX_Z
 
 
 def _misfit_z(counts: Floats, kept: NDArray[np.intp], narrow: float, wide: float, share: float) -> float:
-    """Return the z of χ² between the counts and the mixture, in groups of bins with about equal expectation."""
+    """Return the z value of a χ² test that compares the counts with the mixture.
+
+    The bins are combined into groups with about the same expected count.
+    """
     below = (1.0 - share) * ndtr(BIN_EDGES / narrow**0.5) + share * ndtr(BIN_EDGES / wide**0.5)
     total = counts.sum()
     expected = 2.0 * total * np.diff(below)

@@ -1,11 +1,13 @@
 """Likelihood ratio of Poisson steps and a random walk, which have the same second moments.
 
-Poisson steps are a mixture: each block contains a jump of Gaussian height or no jump. Several later blocks are needed
-to decide whether there was a jump. The filter therefore keeps separate hypotheses by the time since the last jump.
-Hypotheses with the same time are merged into one Gaussian with their mean and covariance (Harrison & Stevens, "Bayesian
-forecasting", J. R. Statist. Soc. B 38, 1976; by run length: Fearnhead & Liu, "On-line inference for multiple
-changepoint problems", ibid. 69, 2007). A random walk is the limit of many small jumps, so Poisson steps never fit much
-worse. The size of the gain indicates jumps, not its sign.
+In the model of Poisson steps, each block contains a jump of Gaussian height or no jump. Several later blocks are needed
+to decide whether a block contains a jump. The filter therefore has one hypothesis for each possible time since the last
+jump (Fearnhead & Liu, "On-line inference for multiple changepoint problems", J. R. Statist. Soc. B 69, 2007).
+Hypotheses with the same time are merged into one Gaussian distribution with the same mean and covariance (Harrison &
+Stevens, "Bayesian forecasting", J. R. Statist. Soc. B 38, 1976).
+
+A random walk is the limit of many small jumps. Poisson steps therefore never fit much worse than a random walk, and
+only a large gain indicates jumps.
 """
 
 from dataclasses import replace
@@ -27,30 +29,28 @@ from monitor.reconcile.likelihood.event_process_comparison import (
     initial_covariance,
     innovation_of_block,
     kalman_log_likelihood,
-    maximise,
+    maximise_log_likelihood,
     predict_block_mean_variance,
     prior_level_variance,
     state_space_noise,
 )
 
 BLOCKS_PER_CROSSING_TIME: Final = 3.0
-"""Number of blocks in N/K, the time at which white noise and random walk are equal."""
+"""Number of blocks in the time N/K. A random walk exceeds white noise at longer times."""
 JUMP_AGES: Final = 16
-"""Number of hypotheses about the block of the last jump. The last hypothesis holds all older jumps.
+"""Number of hypotheses about the block of the last jump. The last hypothesis includes all older jumps.
 
 Together, the hypotheses cover five times N/K. If they cover 1.3 times N/K, the estimated rate is 15 to 25 % too low. If
 they cover 2.7 times N/K, the estimated rate is 5 to 10 % too low.
 """
 MIN_HYPOTHESIS_PROBABILITY: Final = 1e-6
-"""Probability below which a hypothesis is dropped."""
 MAX_START_JUMPS: Final = 2.0
-"""Largest number of jumps in N/K at the start of a search. More frequent jumps are too small to be seen one by one."""
+"""Largest number of jumps in the time N/K at the start of a search. More frequent jumps cannot be resolved."""
 START_RATES: Final = 6
-"""Number of starting rates."""
 
 
 def compare_poisson_with_random_walk(
-    y: Floats, tau0_s: float, rest: BackgroundNoise, K: float
+    y: Floats, tau0_s: float, background: BackgroundNoise, K: float
 ) -> EventProcessComparison:
     """Compare Poisson steps with a random walk.
 
@@ -60,8 +60,8 @@ def compare_poisson_with_random_walk(
         Series in the unit of the axis, without gaps.
     tau0_s : float
         Sample period in seconds.
-    rest : BackgroundNoise
-        Additional noise of the axis. Both alternatives contain a random walk that is part of this noise.
+    background : BackgroundNoise
+        Other noise of the axis. A random walk in this noise is part of both alternatives.
     K : float
         Starting value of the random walk coefficient, in unit/√s, above zero.
 
@@ -73,38 +73,39 @@ def compare_poisson_with_random_walk(
     Raises
     ------
     ValueError
-        If there are too few samples or no white noise.
+        If the series is too short or the background contains no white noise.
     """
-    means, block_s = block_means(y, tau0_s, block_length_s(y.size * tau0_s, rest, K))
-    start, span_s = prior_level_variance(means), means.size * block_s
+    means, block_s = block_means(y, tau0_s, block_length_s(y.size * tau0_s, background, K))
+    level_variance, duration_s = prior_level_variance(means), means.size * block_s
 
     def walk(K: float) -> float:
-        noise = state_space_noise(replace(rest, walk=rest.walk + K * K), block_s, span_s)
-        return float(kalman_log_likelihood(means, noise, start))
+        noise = state_space_noise(replace(background, walk=background.walk + K * K), block_s, duration_s)
+        return float(kalman_log_likelihood(means, noise, level_variance))
 
-    return fit_jumps(means, block_s, rest, K).compare(maximise(walk, (K,))[0])
+    return fit_jumps(means, block_s, background, K).compare_with_effect(maximise_log_likelihood(walk, (K,))[0])
 
 
-def block_length_s(span_s: float, rest: BackgroundNoise, K: float) -> float:
+def block_length_s(duration_s: float, background: BackgroundNoise, K: float) -> float:
     """Return the length of a block in seconds.
 
     Parameters
     ----------
-    span_s : float
+    duration_s : float
         Length of the recording in seconds.
-    rest : BackgroundNoise
+    background : BackgroundNoise
         Additional noise of the axis.
     K : float
         Random walk coefficient in unit/√s.
     """
-    crossing_s: float = rest.white**0.5 / K
-    return min(crossing_s / BLOCKS_PER_CROSSING_TIME, span_s / TARGET_BLOCKS)
+    crossing_s: float = background.white**0.5 / K
+    return min(crossing_s / BLOCKS_PER_CROSSING_TIME, duration_s / TARGET_BLOCKS)
 
 
-def fit_jumps(means: Floats, block_s: float, rest: BackgroundNoise, K: float) -> EventProcessFit:
+def fit_jumps(means: Floats, block_s: float, background: BackgroundNoise, K: float) -> EventProcessFit:
     """Maximise the likelihood over the rate and the height of the jumps.
 
-    The search starts from the likeliest of several rates, with the second moments of a random walk ``K``.
+    The search starts from the likeliest of several rates. The height at the start gives the same second moments as a
+    random walk with the coefficient ``K``.
 
     Parameters
     ----------
@@ -112,32 +113,36 @@ def fit_jumps(means: Floats, block_s: float, rest: BackgroundNoise, K: float) ->
         Block means in the unit of the axis.
     block_s : float
         Length of a block in seconds.
-    rest : BackgroundNoise
+    background : BackgroundNoise
         Additional noise of the axis.
     K : float
         Random walk coefficient in unit/√s.
     """
-    span_s, start = means.size * block_s, prior_level_variance(means)
-    noise = state_space_noise(rest, block_s, span_s)
+    duration_s, level_variance = means.size * block_s, prior_level_variance(means)
+    noise = state_space_noise(background, block_s, duration_s)
 
     def poisson(rate: float, height: float, odds: float = 1.0) -> float:
-        return _log_likelihood(means, noise, start, rate * block_s, height, odds)
+        return _log_likelihood(means, noise, level_variance, rate * block_s, height, odds)
 
-    rates = np.geomspace(2.0 / span_s, max(MAX_START_JUMPS * K / rest.white**0.5, 4.0 / span_s), START_RATES)
+    rates = np.geomspace(
+        2.0 / duration_s, max(MAX_START_JUMPS * K / background.white**0.5, 4.0 / duration_s), START_RATES
+    )
     rate = max(rates, key=lambda rate: poisson(rate, K / rate**0.5))
     return fit_event_process(poisson, {"rate": rate, "height": K / rate**0.5})
 
 
 def _log_likelihood(
-    means: Floats, noise: StateSpaceNoise, start: float, jumps: float, height: float, odds: float = 1.0
+    means: Floats, noise: StateSpaceNoise, level_variance: float, jumps: float, height: float, odds: float = 1.0
 ) -> float:
-    """Return the log-likelihood of Poisson steps in block means with an expected number of jumps in a block.
+    """Return the log-likelihood of Poisson steps with ``jumps`` expected jumps in a block.
 
-    ``odds`` is a factor on the probability of each jump.
+    The probability of each jump is multiplied by ``odds``.
     """
     some = -expm1(-jumps)
     variance = jumps / some * height**2  # variance of the sum of all jumps in a block with at least one jump
-    return float(_jump_log_likelihood(means, noise, start, _JumpProbabilities(exp(-jumps), odds * some, variance)))
+    return float(
+        _jump_log_likelihood(means, noise, level_variance, _JumpProbabilities(exp(-jumps), odds * some, variance))
+    )
 
 
 class _JumpProbabilities(NamedTuple):
@@ -157,23 +162,25 @@ class _GaussianMixture(NamedTuple):
 
 
 @compiled
-def _jump_log_likelihood(means: Floats, noise: StateSpaceNoise, start: float, jumps: _JumpProbabilities) -> float:
+def _jump_log_likelihood(
+    means: Floats, noise: StateSpaceNoise, level_variance: float, jumps: _JumpProbabilities
+) -> float:
     """Return the log-likelihood of a level that jumps at random times."""
     d = noise.table.shape[0]
     by_age = _GaussianMixture(np.zeros(JUMP_AGES), np.zeros((JUMP_AGES, d)), np.zeros((JUMP_AGES, d, d)))
-    # for each hypothesis: entries below JUMP_AGES without a jump, the others with a jump
+    # entries 0 to JUMP_AGES − 1 have no jump in this block, the other entries have a jump
     branches = _GaussianMixture(np.empty(2 * JUMP_AGES), np.zeros((2 * JUMP_AGES, d)), np.zeros((2 * JUMP_AGES, d, d)))
     by_age.weight[JUMP_AGES - 1] = 1.0
-    by_age.covariance[JUMP_AGES - 1] = initial_covariance(noise, start)
+    by_age.covariance[JUMP_AGES - 1] = initial_covariance(noise, level_variance)
     total: float = -0.5 * means.size * np.log(2.0 * np.pi)
-    for z in means:
+    for block_mean in means:
         for age in range(JUMP_AGES):
-            _branch(z, age, by_age, branches, noise, jumps)
+            _branch(block_mean, age, by_age, branches, noise, jumps)
         total += _normalise(branches.weight)
         for age in range(JUMP_AGES):
-            if age == 0:  # all hypotheses with a jump in this block
+            if age == 0:  # merge all hypotheses with a jump in this block
                 first, end = JUMP_AGES, 2 * JUMP_AGES
-            else:  # no jump in this block: the previous age, and for the last age also the last age itself
+            else:  # without a jump, the age increases by one block; the last age includes all older jumps
                 first, end = age - 1, age + age // (JUMP_AGES - 1)
             _merge(branches, first, end, by_age, age)
     return total
@@ -181,46 +188,46 @@ def _jump_log_likelihood(means: Floats, noise: StateSpaceNoise, start: float, ju
 
 @compiled
 def _branch(
-    z: float,
+    block_mean: float,
     age: int,
     by_age: _GaussianMixture,
     branches: _GaussianMixture,
     noise: StateSpaceNoise,
     jumps: _JumpProbabilities,
 ) -> None:
-    """Update one hypothesis by a block mean ``z``, once without a jump in the block and once with a jump.
+    """Update one hypothesis with a block mean, once without a jump in the block and once with a jump.
 
-    A jump at a uniformly distributed time in the block changes the block mean by 1/2 of its height on average and
-    contributes 1/3 of its variance.
+    The time of a jump is uniformly distributed in the block. A jump therefore changes the block mean by half of the
+    height on average, and adds a third of the variance of the height to the variance of the block mean.
     """
     branches.weight[age] = branches.weight[JUMP_AGES + age] = -np.inf
     if by_age.weight[age] < MIN_HYPOTHESIS_PROBABILITY:
         return
     table = noise.table
     d = table.shape[0]
-    covariance, reach = by_age.covariance[age], np.empty(d)
-    seen = predict_block_mean_variance(noise, covariance, reach)
-    innovation = innovation_of_block(z, noise, by_age.mean[age])
+    covariance, state_covariance = by_age.covariance[age], np.empty(d)
+    variance = predict_block_mean_variance(noise, covariance, state_covariance)
+    innovation = innovation_of_block(block_mean, noise, by_age.mean[age])
     for jump in range(2):
         to, chance = (JUMP_AGES + age, jumps.some) if jump else (age, jumps.none)
         if jump:
-            seen += jumps.variance / 3.0
-            reach[0] += 0.5 * jumps.variance
-        likelihood = -0.5 * (innovation * innovation / seen + np.log(seen))
+            variance += jumps.variance / 3.0
+            state_covariance[0] += 0.5 * jumps.variance
+        likelihood = -0.5 * (innovation * innovation / variance + np.log(variance))
         branches.weight[to] = np.log(by_age.weight[age] * chance) + likelihood
         spread = branches.covariance[to]
         for i in range(d):
-            branches.mean[to, i] = table[i, 0] * by_age.mean[age, i] + reach[i] * innovation / seen
+            branches.mean[to, i] = table[i, 0] * by_age.mean[age, i] + state_covariance[i] * innovation / variance
             for j in range(d):
                 spread[i, j] = table[i, 0] * table[j, 0] * covariance[i, j]
-                spread[i, j] -= reach[i] * reach[j] / seen
+                spread[i, j] -= state_covariance[i] * state_covariance[j] / variance
             spread[i, i] += table[i, 2]
         spread[0, 0] += jump * jumps.variance
 
 
 @compiled
 def _normalise(weight: Floats) -> float:
-    """Convert logarithms of probabilities in place to probabilities with the sum 1, and return ln of their sum."""
+    """Normalise probabilities, given as logarithms, in place. Return the logarithm of the sum before normalisation."""
     highest = weight[0]
     for k in range(1, weight.size):
         highest = max(highest, weight[k])
@@ -236,7 +243,7 @@ def _normalise(weight: Floats) -> float:
 
 @compiled
 def _merge(branches: _GaussianMixture, first: int, end: int, merged: _GaussianMixture, to: int) -> None:
-    """Merge branches ``first`` to ``end`` − 1 into one Gaussian with their mean and covariance, at index ``to``."""
+    """Merge the branches from ``first`` to ``end`` − 1 into one Gaussian with the same mean and covariance."""
     share = 0.0
     for k in range(first, end):
         share += branches.weight[k]

@@ -1,15 +1,15 @@
-"""Likelihood ratio of Poisson steps, a continuing process, and a few single steps.
+"""Comparison of Poisson steps, a random process, with a few single steps at fixed times.
 
-Steps at fixed times with free heights are found one after the other. Each step is placed where the smoother of the
-remaining noise shows the likeliest shock of the level (de Jong & Penzer, "Diagnosing shocks in time series", JASA 93,
-1998). Each step is then placed once more with all others present. Finally the times are refined within blocks, and the
-heights are fitted by least squares.
+The search adds one step at a time. A Kalman smoother computes the gain of a shock of the level at each block, and the
+new step is placed at the block with the largest gain (de Jong & Penzer, "Diagnosing shocks in time series", JASA 93,
+1998). After each new step, the search places every step again while the other steps are kept. Finally, the times are
+refined within the blocks, and the heights are fitted by least squares.
 
-The likelihood of a process is an average over all times and heights that it allows. The likelihood of fixed steps is a
-maximum. Each fixed step therefore gets a penalty for its time and its height h. The penalties are the logarithm of the
-number of blocks and ½ ln(1 + h²/Var h), after the minimum description length of Rissanen (1978). Up to about five
-steps, single steps usually have the smaller penalty. From about a dozen steps on, the process has the smaller penalty,
-because it describes them by common parameters.
+The likelihood of Poisson steps is averaged over all possible times and heights, whereas the times and heights of single
+steps are fitted. Each single step therefore has two penalties, following the minimum description length of Rissanen
+(1978). The penalty for the time is the logarithm of the number of blocks. The penalty for the height h is
+½ ln(1 + h²/Var h). With up to about five steps, the single steps usually have the larger score. With more than about a
+dozen steps, Poisson steps have the larger score, because two parameters describe all steps.
 """
 
 from math import log
@@ -33,18 +33,17 @@ from monitor.reconcile.likelihood.event_process_comparison import (
 )
 
 TIMES_PER_BLOCK: Final = 8
-"""Number of times that are tried within a block."""
 
 
 class _SingleStepsFit(NamedTuple):
-    """Best fit of single steps."""
+    """Fitted single steps."""
 
     score: float  # log-likelihood less the penalties for times and heights
     times: Floats  # [k] in blocks since the start
 
 
 def compare_poisson_with_single_steps(
-    y: Floats, tau0_s: float, rest: BackgroundNoise, K: float, most: int = 5
+    y: Floats, tau0_s: float, background: BackgroundNoise, K: float, max_single_steps: int = 5
 ) -> EventProcessComparison:
     """Compare Poisson steps with a few single steps.
 
@@ -54,11 +53,11 @@ def compare_poisson_with_single_steps(
         Series in the unit of the axis, without gaps.
     tau0_s : float
         Sample period in seconds.
-    rest : BackgroundNoise
-        Additional noise of the axis.
+    background : BackgroundNoise
+        Other noise of the axis.
     K : float
         Starting value of the random walk coefficient, in unit/√s, above zero.
-    most : int, optional
+    max_single_steps : int, optional
         Largest number of single steps.
 
     Returns
@@ -69,18 +68,18 @@ def compare_poisson_with_single_steps(
     Raises
     ------
     ValueError
-        If there are too few samples or no white noise.
+        If the series is too short or the background contains no white noise.
     """
-    means, block_s = block_means(y, tau0_s, poisson_steps.block_length_s(y.size * tau0_s, rest, K))
-    single = _fit_single_steps(means, state_space_noise(rest, block_s, means.size * block_s), most)
-    return poisson_steps.fit_jumps(means, block_s, rest, K).compare(single.score, single.times.size)
+    means, block_s = block_means(y, tau0_s, poisson_steps.block_length_s(y.size * tau0_s, background, K))
+    single = _fit_single_steps(means, state_space_noise(background, block_s, means.size * block_s), max_single_steps)
+    return poisson_steps.fit_jumps(means, block_s, background, K).compare_with_effect(single.score, single.times.size)
 
 
-def _fit_single_steps(means: Floats, noise: StateSpaceNoise, most: int) -> _SingleStepsFit:
-    """Fit the number of single steps that explains the block means with the smallest penalty."""
+def _fit_single_steps(means: Floats, noise: StateSpaceNoise, max_single_steps: int) -> _SingleStepsFit:
+    """Return the fit with the largest score of 0 to ``max_single_steps`` steps."""
     blocks: list[int] = []
     best = _SingleStepsFit(kalman_log_likelihood(means, noise, prior_level_variance(means)), np.empty(0))
-    for _ in range(most):
+    for _ in range(max_single_steps):
         blocks.append(int(np.argmax(_shock_gains(means, noise, blocks))))
         for k in range(len(blocks)):
             blocks[k] = int(np.argmax(_shock_gains(means, noise, blocks[:k] + blocks[k + 1 :])))
@@ -91,19 +90,19 @@ def _fit_single_steps(means: Floats, noise: StateSpaceNoise, most: int) -> _Sing
 
 
 def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Floats:
-    """Return twice the log-likelihood gain, shape (m,), of one more shock at the start of each block.
+    """Return twice the log-likelihood gain, shape (m,), of a shock at the start of each block.
 
-    The shocks in ``blocks`` are already present.
+    The model already contains shocks at the start of the given ``blocks``.
     """
-    free = np.zeros(means.size)
-    free[blocks] = prior_level_variance(means)
-    scores = _shock_statistics(means, noise, prior_level_variance(means), free)
-    scores[blocks] = 0.0
-    return scores
+    shock_variances = np.zeros(means.size)
+    shock_variances[blocks] = prior_level_variance(means)
+    gains = _shock_statistics(means, noise, prior_level_variance(means), shock_variances)
+    gains[blocks] = 0.0
+    return gains
 
 
 def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> _SingleStepsFit:
-    """Refine the times of the steps within their blocks and return the fit with its penalties."""
+    """Refine the times of the steps within the blocks and return the fit."""
     times = np.array(blocks, np.float64)
     places = np.arange(-TIMES_PER_BLOCK, TIMES_PER_BLOCK + 1) / TIMES_PER_BLOCK
     for k in range(times.size):
@@ -117,8 +116,9 @@ def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> _
 
 
 def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[float, Floats, Floats]:
-    """Return the log-likelihood with steps at given times, and the heights with standard deviations, by least
-    squares.
+    """Fit the heights of steps at given times.
+
+    Return the log-likelihood, the heights and the standard deviations of the heights.
     """
     # fraction of each block that lies after the step
     columns = np.clip(np.arange(1.0, means.size + 1.0)[:, None] - times, 0.0, 1.0)
@@ -132,12 +132,15 @@ def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[
 
 
 @compiled
-def _whiten(columns: Floats, noise: StateSpaceNoise, start: float) -> float:
-    """Whiten columns, shape (m, c), in place to unit variance and return Σ ln 2πS of their innovation variances S."""
-    variances, reaches = innovation_variances(np.zeros(columns.shape[0]), noise, start)
+def _whiten(columns: Floats, noise: StateSpaceNoise, level_variance: float) -> float:
+    """Whiten columns, shape (m, c), in place, and return the sum of ln 2πS of the innovation variances S.
+
+    A whitened column contains innovations divided by the standard deviation.
+    """
+    variances, state_covariances = innovation_variances(np.zeros(columns.shape[0]), noise, level_variance)
     total = 0.0
     for c in range(columns.shape[1]):
-        innovations = innovations_of_series(columns[:, c].copy(), noise, variances, reaches)
+        innovations = innovations_of_series(columns[:, c].copy(), noise, variances, state_covariances)
         for k in range(innovations.size):
             columns[k, c] = innovations[k] / np.sqrt(variances[k])
     for variance in variances:
@@ -146,23 +149,26 @@ def _whiten(columns: Floats, noise: StateSpaceNoise, start: float) -> float:
 
 
 @compiled
-def _shock_statistics(means: Floats, noise: StateSpaceNoise, start: float, free: Floats) -> Floats:
+def _shock_statistics(
+    means: Floats, noise: StateSpaceNoise, level_variance: float, extra_level_variance: Floats
+) -> Floats:
     """Return twice the log-likelihood ratio, shape (m,), of a shock of the level at the start of each block.
 
-    The ratio is r²/N of the fixed-interval smoother (de Jong & Penzer 1998, section 2). The backward recursions are r ←
-    h e/S + L'r and N ← h h'/S + L'N L, with L = F − reach h'/S. ``free`` has the same meaning as in
-    ``innovation_variances``.
+    The ratio is r²/N of the fixed-interval smoother (de Jong & Penzer 1998, section 2). The backward recursions are
+    r ← h e/S + L'r and N ← h h'/S + L'N L, with L = F − k h'/S. For each block, e is the innovation, S is the variance
+    of the innovation, k is the covariance of the innovation with the next state, h is the contribution of the state to
+    the block mean, and F is the state transition.
     """
     table = noise.table
     d, m = table.shape[0], means.size
-    variances, reaches = innovation_variances(free, noise, start)
-    innovations = innovations_of_series(means, noise, variances, reaches)
+    variances, state_covariances = innovation_variances(extra_level_variance, noise, level_variance)
+    innovations = innovations_of_series(means, noise, variances, state_covariances)
     r, N, scores = np.zeros(d), np.zeros((d, d)), np.empty(m)
     L = np.empty((d, d))
     for k in range(m - 1, -1, -1):
         for i in range(d):
             for j in range(d):
-                L[i, j] = (table[i, 0] if i == j else 0.0) - reaches[k, i] * table[j, 1] / variances[k]
+                L[i, j] = (table[i, 0] if i == j else 0.0) - state_covariances[k, i] * table[j, 1] / variances[k]
         _smooth_backward(r, N, L, table, innovations[k], variances[k])
         scores[k] = r[0] * r[0] / N[0, 0]
     return scores
@@ -170,7 +176,7 @@ def _shock_statistics(means: Floats, noise: StateSpaceNoise, start: float, free:
 
 @compiled
 def _smooth_backward(r: Floats, N: Floats, L: Floats, table: Floats, innovation: float, variance: float) -> None:
-    """Update r [d] and N [d, d] of the smoother by one block."""
+    """Update the smoother variables r, shape (d,), and N, shape (d, d), with one block."""
     d = r.size
     NL, new = np.empty((d, d)), np.empty(d)
     for i in range(d):

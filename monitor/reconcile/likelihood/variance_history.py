@@ -1,17 +1,18 @@
 """Variance of white residuals as a function of time, for all frequencies together and for each band.
 
 ``fit_variance_changes`` fits a step of the variance at every time, and three alternatives to a step: a trend, a
-periodic variation and a slow random variation. The alternatives are fitted to the energies of blocks, which are
-distributed as χ². Every gain is a log-likelihood gain over a constant variance, so that the gains are comparable.
+periodic variation and a slow random variation. The alternatives are fitted to the mean squares of blocks, which have a
+χ² distribution. Every gain is a log-likelihood gain over a constant variance, so that the gains are comparable.
 
-``find_least_constant_tiles`` divides the recording into pieces and takes the Fourier transform of each piece midway
-between the usual frequencies. At these frequencies white noise is independent, and a steady line has a steady power.
-Every rectangle of 2^a pieces by 2^b frequencies is compared with the rest of its frequencies, so that a steady line or
-a coloured spectrum has no influence. Every row of rectangles is also compared with a constant row. Long pieces detect
-lines that vary, and short pieces detect bursts.
+``find_least_constant_tiles`` divides the recording into pieces and computes the Fourier transform of each piece at the
+frequencies (k + ½)/piece. At these frequencies, the coefficients of white noise are independent, and the power of a
+steady line is the same in each piece. A **tile** is a rectangle of 2^a pieces by 2^b frequencies. A **row** consists of
+all tiles at the same frequencies. Each tile is compared with the other tiles of the same row, so that a steady line or
+a coloured spectrum has no influence. Each row is also tested for a constant power. Long pieces detect lines with a
+varying power, and short pieces detect bursts.
 
-All statistics are ratios of energies without a unit. Under white Gaussian noise, their distribution depends only on the
-number of samples. Outliers change the distribution and must be replaced before.
+All statistics are ratios without a unit. For white Gaussian noise, the distribution of each statistic depends only on
+the number of samples. Outliers change the distribution, so they must be replaced first.
 """
 
 from dataclasses import dataclass
@@ -30,23 +31,22 @@ from monitor.reconcile.preparation.value_statistics import ValueWithInterval
 MIN_SEGMENT_SAMPLES: Final = 16
 """Smallest number of samples on each side of a step."""
 STEP_SEARCH_STRIDE: Final = 8
-"""Distance in samples of the times in the first search for a step."""
+"""Distance in samples between the times of the first search for a step."""
 FINE_SEARCH_SAMPLES: Final = 20_000
-"""Largest range in samples in which the time of a step is then sought sample by sample."""
+"""Largest range in samples that the second search examines sample by sample."""
 MIN_BLOCK_SAMPLES: Final = 32
-"""Smallest number of samples in a block. The energies of fewer samples are far from Gaussian."""
+"""Smallest number of samples in a block. The mean square of fewer samples is far from Gaussian."""
 MAX_VARIANCE_BLOCKS: Final = 4096
-"""Largest number of blocks."""
 MIN_VARIANCE_BLOCKS: Final = 8
 """Smallest number of blocks or pieces for a variance history."""
 MIN_CYCLES: Final = 2
 """Smallest number of periods in the recording. A slower variation is a trend."""
 PIECE_SAMPLES: Final = (256, 2048)
-"""Numbers of samples in a piece of the spectrogram."""
+"""Piece lengths of the spectrogram, in samples."""
 MIN_SQUARES_PER_CELL: Final = 64
-"""Number of squares in each cell from which a row of cells of several pieces is tested for a constant power."""
+"""Smallest number of squared values in a tile of several pieces for which the row is tested for a constant power."""
 MIN_SQUARES_FOR_DECREASE: Final = 8
-"""Number of squares in a cell below which a low power is no evidence."""
+"""Smallest number of squared values in a tile for which a low power counts as evidence."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,22 +60,27 @@ class VarianceStep:
 
 @dataclass(frozen=True, slots=True)
 class VarianceChangeFit:
-    """Best step of the variance, and the gains of its alternatives over a constant variance in nats."""
+    """Best step of the variance, and the log-likelihood gains of three alternatives over a constant variance."""
 
     step: VarianceStep
-    trend: float  # ln σ² = a + b t + c t²
-    periodic: float  # ln σ² with a period
-    wander: float  # slow random variation
+    trend_gain: float  # of ln σ² = a + b t + c t², nats
+    periodic_gain: float  # of ln σ² = a + b cos(2πft) + c sin(2πft), nats
+    slow_variation_gain: float  # of a slow random variation, nats
+
+    @property
+    def largest_alternative_gain(self) -> float:
+        """Largest gain of the three alternatives to a step, in nats."""
+        return max(self.trend_gain, self.periodic_gain, self.slow_variation_gain)
 
 
 @dataclass(frozen=True, slots=True)
 class LeastConstantTiles:
-    """Rectangle and row of a spectrogram that are least constant in time."""
+    """Tile that differs most from its row, and row whose power is least constant in time."""
 
-    gain: float  # gain of the best rectangle over the rest of its row, nats
-    time: tuple[float, float]  # s from the first sample
-    frequency: tuple[float, float]  # Hz
-    row_gain: float  # −ln of the probability that a row with constant power is as uneven
+    gain: float  # log-likelihood gain of a separate power for the tile, nats
+    time: tuple[float, float]  # time range of the tile, s from the first sample
+    frequency: tuple[float, float]  # frequency range of the tile, Hz
+    row_gain: float  # −ln of the probability that a row of constant power varies as much, nats
     row: tuple[float, float]  # frequency range of the row, Hz
 
 
@@ -92,7 +97,7 @@ def fit_variance_changes(w: Floats, tau0_s: float) -> VarianceChangeFit:
     Raises
     ------
     ValueError
-        If there are fewer than 256 samples.
+        If the series has fewer than 256 samples.
 
     Examples
     --------
@@ -103,8 +108,7 @@ def fit_variance_changes(w: Floats, tau0_s: float) -> VarianceChangeFit:
     >>> print(f"{found.step.gain > 100} {found.step.time.value:.1f} {found.step.ratio.value:.1f}")
     True 200.5 1.2
     """
-    if w.size < MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES:
-        raise ValueError(f"{w.size} samples are too few, {MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES} are needed")
+    _check_sample_count(w, MIN_VARIANCE_BLOCKS * MIN_BLOCK_SAMPLES)
     squares = w * w
     length = max(MIN_BLOCK_SAMPLES, -(-w.size // MAX_VARIANCE_BLOCKS))
     count = w.size // length
@@ -113,14 +117,14 @@ def fit_variance_changes(w: Floats, tau0_s: float) -> VarianceChangeFit:
     time = np.linspace(-1.0, 1.0, count)
     return VarianceChangeFit(
         step=_best_step(squares, tau0_s),
-        trend=_log_linear_gain(energy, length, np.stack([time, time**2 - 1.0 / 3.0])),
-        periodic=_periodic_gain(energy, scores, length),
-        wander=_slow_variation_gain(scores, length),
+        trend_gain=_log_linear_gain(energy, length, np.stack([time, time**2 - 1.0 / 3.0])),
+        periodic_gain=_periodic_gain(energy, scores, length),
+        slow_variation_gain=_slow_variation_gain(scores, length),
     )
 
 
 def find_least_constant_tiles(w: Floats, tau0_s: float) -> LeastConstantTiles:
-    """Find the rectangle of time and frequency, and the row, in which the power of white residuals is least constant.
+    """Find the tile and the row of the spectrogram whose power is least constant in time.
 
     Parameters
     ----------
@@ -132,7 +136,7 @@ def find_least_constant_tiles(w: Floats, tau0_s: float) -> LeastConstantTiles:
     Raises
     ------
     ValueError
-        If there are fewer than 2048 samples.
+        If the series has fewer than 2048 samples.
 
     Examples
     --------
@@ -143,8 +147,7 @@ def find_least_constant_tiles(w: Floats, tau0_s: float) -> LeastConstantTiles:
     >>> found.gain > 50.0, found.frequency[0] < 17.3 < found.frequency[1]
     (True, True)
     """
-    if w.size < MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0]:
-        raise ValueError(f"{w.size} samples are too few, {MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0]} are needed")
+    _check_sample_count(w, MIN_VARIANCE_BLOCKS * PIECE_SAMPLES[0])
     pieces = [piece for piece in PIECE_SAMPLES if w.size >= MIN_VARIANCE_BLOCKS * piece]
     tiles, rows = zip(*(_best_tiles(_piece_spectra(w, piece), piece) for piece in pieces), strict=True)
     best, row = max(tiles), max(rows)
@@ -153,10 +156,17 @@ def find_least_constant_tiles(w: Floats, tau0_s: float) -> LeastConstantTiles:
     )
 
 
-def _best_step(squares: Floats, tau0_s: float) -> VarianceStep:
-    """Return the best single step of the variance of squared residuals.
+def _check_sample_count(w: Floats, minimum: int) -> None:
+    """Raise ValueError if the series is too short."""
+    if w.size < minimum:
+        raise ValueError(f"the series has {w.size} samples; at least {minimum} are needed")
 
-    The gain is computed at every ``STEP_SEARCH_STRIDE``-th time, and at every time in the range where a step is likely.
+
+def _best_step(squares: Floats, tau0_s: float) -> VarianceStep:
+    """Return the most likely step of the variance from the squares of the residuals.
+
+    The gain is first computed at every ``STEP_SEARCH_STRIDE``-th sample. If the likely times lie close together, the
+    gain is then computed at each sample between them.
     """
     sums = np.cumsum(squares)
     k = np.arange(MIN_SEGMENT_SAMPLES, sums.size - MIN_SEGMENT_SAMPLES + 1, STEP_SEARCH_STRIDE)
@@ -192,9 +202,9 @@ def _step_gains(sums: Floats, k: Ints) -> Floats:
 
 
 def _log_linear_gain(energy: Floats, length: int, rows: Floats) -> float:
-    """Return the log-likelihood gain of ln σ² = a + Σ b_i row_i over a constant.
+    """Return the log-likelihood gain of the variance model ln σ² = a + Σ b_i row_i over a constant variance.
 
-    The energies are means of ``length`` squares. The fit is Fisher scoring of a Gamma model with logarithmic link
+    ``energy`` contains means of ``length`` squares. The method is Fisher scoring of a Gamma model with logarithmic link
     (McCullagh & Nelder 1989).
     """
     x = np.vstack([np.ones(energy.size), rows])
@@ -212,7 +222,7 @@ def _log_linear_gain(energy: Floats, length: int, rows: Floats) -> float:
 
 
 def _periodic_gain(energy: Floats, scores: Floats, length: int) -> float:
-    """Return the log-likelihood gain of a variation with the best frequency in the periodogram of the scores."""
+    """Return the log-likelihood gain of a periodic variation at the peak of the periodogram of the scores."""
     power = np.abs(np.fft.rfft(scores, 2 * scores.size)) ** 2
     power[: 2 * MIN_CYCLES] = 0.0
     best = int(power[:-1].argmax())
@@ -224,10 +234,11 @@ def _periodic_gain(energy: Floats, scores: Floats, length: int) -> float:
 
 
 def _slow_variation_gain(scores: Floats, length: int) -> float:
-    """Return the log-likelihood gain of larger power at the lowest 2^j frequencies of the scores, for the best j.
+    """Return the log-likelihood gain of a slow random variation.
 
-    The periodogram values of a white score with variance 2/length are exponential. K of them with mean p gain K (p − 1
-    − ln p).
+    White scores have the variance 2/length, and their periodogram values are exponentially distributed with mean 1. If
+    the lowest K frequencies have the mean power p, a separate power for them gains K (p − 1 − ln p). The result is the
+    largest gain of all K = 2^j with p > 1.
     """
     ordinates = np.abs(np.fft.rfft(scores)[1 : scores.size // 2]) ** 2 * length / (2.0 * scores.size)
     ends = 2 ** np.arange(2, int(np.log2(max(ordinates.size, 4))) + 1)
@@ -237,30 +248,30 @@ def _slow_variation_gain(scores: Floats, length: int) -> float:
 
 
 class _TileScore(NamedTuple):
-    """Part of a spectrogram, and how much its power differs from the rest of its frequencies."""
+    """Tile of a spectrogram with the log-likelihood gain of a separate power for this tile."""
 
     gain: float  # nats
-    samples: int  # samples in a piece
-    pieces: int  # pieces in the tile
-    piece_at: int  # index of the tile in time
-    frequencies: int  # frequencies in the tile
-    frequency_at: int  # index of the tile in frequency
+    piece_samples: int
+    pieces: int  # number of pieces in the tile
+    time_index: int
+    frequencies: int  # number of frequencies in the tile
+    frequency_index: int
 
     def time_s(self, tau0_s: float) -> tuple[float, float]:
         """Return the time range in seconds for a sample period of ``tau0_s`` seconds."""
-        length = self.pieces * self.samples
-        return self.piece_at * length * tau0_s, (self.piece_at + 1) * length * tau0_s
+        length = self.pieces * self.piece_samples
+        return self.time_index * length * tau0_s, (self.time_index + 1) * length * tau0_s
 
     def frequency_hz(self, tau0_s: float) -> tuple[float, float]:
         """Return the frequency range in Hz for a sample period of ``tau0_s`` seconds."""
-        first, step = self.frequency_at, self.samples * tau0_s
+        first, step = self.frequency_index, self.piece_samples * tau0_s
         return first * self.frequencies / step, (first + 1) * self.frequencies / step
 
 
 def _piece_spectra(w: Floats, piece: int) -> Floats:
-    """Return the powers, shape (pieces, piece/2), of Fourier transforms at (k + ½)/piece.
+    """Return the powers, shape (pieces, piece/2), of the Fourier coefficients at the frequencies (k + ½)/piece.
 
-    For white noise each power is χ² with two degrees of freedom.
+    For white noise, each power has a χ² distribution with two degrees of freedom.
     """
     half = np.exp(-1j * np.pi / piece * np.arange(piece))
     lines = fft(w[: w.size // piece * piece].reshape(-1, piece) * half, axis=1)[:, : piece // 2]
@@ -268,7 +279,7 @@ def _piece_spectra(w: Floats, piece: int) -> Floats:
 
 
 def _best_tiles(power: Floats, piece: int) -> tuple[_TileScore, _TileScore]:
-    """Return the best rectangle and the best row of powers, shape (pieces, frequencies)."""
+    """Return the tile and the row with the largest gains, from powers of shape (pieces, frequencies)."""
     best = row = _TileScore(-1.0, piece, 1, 0, 1, 0)
     b, total = 1, power.sum(axis=0)
     while True:
@@ -290,9 +301,9 @@ def _best_tiles(power: Floats, piece: int) -> tuple[_TileScore, _TileScore]:
 
 @compiled
 def _column_extremes(power: Floats) -> tuple[Floats, Ints, Floats, Ints, Floats]:
-    """Return the minimum and maximum of each column with their positions, and the sum of its logarithms.
+    """Return the minimum and maximum of each column with their positions, and the sum of the logarithms of the column.
 
-    The logarithms are taken of products of eight values.
+    The logarithm is computed once for the product of eight values, which is faster.
     """
     rows, columns = power.shape
     low, high, logs = power[0].copy(), power[0].copy(), np.zeros(columns)
@@ -315,11 +326,12 @@ def _column_extremes(power: Floats) -> tuple[Floats, Ints, Floats, Ints, Floats]
 
 @compiled
 def _best_contrast(x: Floats, total: Floats, inside: int, whole: int) -> tuple[float, int]:
-    """Return gain and index of the best energy of ``inside`` squares over the rest of its column.
+    """Return the largest gain of a separate power for one tile of each row, and the index of the row.
 
-    With x of c squares inside and R of d squares outside, the gain is (c+d)/2 ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2
-    ln(R/d). It is convex in x, so that only the smallest and the largest value of a column can be the best. A low power
-    of only a few squares is no evidence.
+    ``x`` contains the sum of ``inside`` squares of one tile of each row. ``total`` contains the sum of all ``whole``
+    squares of the row. Let x be the sum of c squares in the tile, and R the sum of the d other squares. The gain is
+    then (c+d)/2 ln((x+R)/(c+d)) − c/2 ln(x/c) − d/2 ln(R/d). The gain is convex in x, so that the tile with the largest
+    gain has the smallest or the largest x of the row. A low power of a few squares does not count as evidence.
     """
     outside = whole - inside
     best, place = -1.0, 0
@@ -336,10 +348,11 @@ def _best_contrast(x: Floats, total: Floats, inside: int, whole: int) -> tuple[f
 
 
 def _bartlett_test(total: Floats, logs: Floats, count: int, squares: int) -> tuple[float, int]:
-    """Return −ln p and the index of the least constant column of ``count`` energies, by Bartlett's (1937) statistic.
+    """Return −ln p of the row whose power is least constant, and the index of the row.
 
-    The statistic is Σ c/2 (ln of the mean − ln of each), with c squares in each cell. Its distribution is approximated
-    by a Gamma distribution with the same mean and variance.
+    ``total`` contains the sum, and ``logs`` the sum of the logarithms, of the ``count`` powers of each row. Bartlett's
+    statistic (1937) is c/2 Σ (ln m − ln x_i), with c squares in each power x_i and the mean m. The distribution of the
+    statistic is approximated by a Gamma distribution with the same mean and variance.
     """
     uneven = 0.5 * squares * (count * np.log(total / count) - logs)
     j = int(uneven.argmax())
@@ -353,6 +366,6 @@ def _bartlett_test(total: Floats, logs: Floats, count: int, squares: int) -> tup
 
 @lru_cache(maxsize=1024)
 def _bartlett_moments(count: int, half: float) -> tuple[float, float]:
-    """Return the exact mean and variance of Bartlett's statistic of ``count`` χ² values of 2 ``half`` squares each."""
+    """Return the exact mean and variance of Bartlett's statistic for ``count`` sums of 2·``half`` squares each."""
     expected = half * count * (float(psi(count * half)) - float(np.log(count)) - float(psi(half)))
     return expected, half**2 * (count * float(polygamma(1, half)) - count**2 * float(polygamma(1, count * half)))

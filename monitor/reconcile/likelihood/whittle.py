@@ -1,18 +1,19 @@
 """Whittle likelihood of one axis, maximised jointly over the variances of the noise and the sizes of the regressors.
 
-The cosine transform coefficients of an axis are independent and Gaussian (Whittle 1953). In bin b the coefficients have
-the variance
+The cosine transform coefficients Y_k of an axis are independent and Gaussian (Whittle 1953). The mean of Y_k is
+Σ_i β_i R_ik with the transforms R_i of the regressors and the sizes β_i. The variance of the n_b coefficients in bin b
+is
 
     v_b = c_b + Σ_j θ_j B_jb,    θ_j ≥ 0,
 
-about the mean Σ_i β_i R_ik. The log-likelihood is therefore
+with the fixed variance c_b, the variance bases B_j and the squared sizes θ_j of the noise effects. The residual power
+of bin b is P_b = Σ_k (Y_k − Σ_i β_i R_ik)², and the log-likelihood is
 
-    ln L = −½ Σ_b [ count_b ln v_b + P_b(β)/v_b ],    P_b = Σ_k (Y_k − Σ β_i R_ik)².
+    ln L = −½ Σ_b (n_b ln v_b + P_b/v_b).
 
-The regressors R depend on time, temperature or another axis. The likelihood needs only sums over bins of products of
-the samples and the regressors. Fisher scoring finds θ. Coordinate descent on the quadratic approximation keeps the
-bound θ ≥ 0. Generalised least squares finds β for the current variances v. Both steps alternate until ln L no longer
-increases. A step that does not increase ln L is halved.
+The likelihood depends only on the sums over bins of the products of Y and R. Fisher scoring finds θ. Coordinate descent
+on the quadratic approximation respects the bound θ ≥ 0. Generalised least squares finds β for the current variances.
+The two steps alternate until ln L no longer increases. A step that does not increase ln L is halved.
 """
 
 from dataclasses import dataclass
@@ -24,18 +25,15 @@ from drivers.sample import Floats
 from monitor.common.compiled import compiled
 
 MAX_FIT_ITERATIONS: Final = 200
-"""Largest number of iterations."""
 MAX_STEP_HALVINGS: Final = 12
-"""Largest number of step lengths that are tried in one iteration."""
 CONVERGENCE_NATS: Final = 1e-5
-"""Gain in nats below which the iteration stops."""
 MIN_VARIANCE_RATIO: Final = 1e-20
 """Lower limit of a variance, relative to the largest power of a bin."""
 
 
 @dataclass(frozen=True, slots=True)
 class BinSums:
-    """Sums over bins that the likelihood needs."""
+    """Sums over bins of products of the axis Y and the regressors R."""
 
     power: Floats  # [m] Σ Y²
     cross: Floats  # [q, m] Σ R_i Y
@@ -63,7 +61,7 @@ def maximise_whittle(count: Floats, sums: BinSums, bases: Floats, constant: Floa
     count : ndarray of float64, shape (m,)
         Number of coefficients in each bin.
     sums : BinSums
-        Sums over bins of the axis and its regressors.
+        Sums over bins of the products of the axis and the regressors.
     bases : ndarray of float64, shape (p, m)
         Variance of a coefficient for θ_j = 1.
     constant : ndarray of float64, shape (m,)
@@ -132,7 +130,7 @@ def _profile(
 def _score_and_information(
     count: Floats, bases: Floats, variance: Floats, residual: Floats, information: Floats
 ) -> Floats:
-    """Return the gradient of the log-likelihood by θ, and store the Fisher information."""
+    """Return the gradient of the log-likelihood with respect to θ, and write the Fisher information in place."""
     p, m = bases.shape
     gradient = np.zeros(p)
     for j in range(p):
@@ -153,7 +151,7 @@ def _score_and_information(
 def _regress(cross: Floats, gram: Floats, variance: Floats) -> tuple[Floats, Floats]:
     """Return the generalised least-squares estimate of β and its normal matrix.
 
-    A small ridge makes collinear regressors solvable.
+    A small ridge term allows collinear regressors.
     """
     q, m = cross.shape
     normal = np.zeros((q, q))

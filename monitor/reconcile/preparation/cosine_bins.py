@@ -1,15 +1,15 @@
 """Orthonormal cosine transform (DCT-II) of one axis and sums of its coefficients over frequency bins.
 
-The transform needs no window. The coefficients of a stationary series are Y_k for k = 1 … n − 1, at the frequencies f_k
-= k·rate/2n. They are nearly independent and have the variance S(f_k)/τ0. For white noise and random walk, both
-statements are exact. A slope or a step does not leak from the ends of the series as it does in a periodogram, because
-the transform continues the series as a mirror image. The mean is Y_0. It is left out, because the mean of a model is
-always free.
+The transform needs no window. A stationary series of n samples has the coefficients Y_k for k = 1 … n − 1 at the
+frequencies f_k = k·rate/2n. The coefficients are nearly independent, and the variance of Y_k is nearly S(f_k)/τ0. For
+white noise and random walk, the independence and the variance are exact. The transform continues the series as a mirror
+image. Therefore, a slope or a step does not leak into other frequencies as in a periodogram. The coefficient Y_0, which
+contains the mean of the series, is not used, because the mean of a model is always free.
 
-The likelihood needs only sums over bins that are so narrow that the spectrum is nearly constant within each. The first
-``SINGLE_COEFFICIENT_BINS`` coefficients have a bin each. ``BINS_PER_OCTAVE`` bins per octave follow, and none is wider
-than ``MAX_BIN_WIDTH_HZ``. The bins are finer around narrow peaks and towards half the sample rate. For an hour at 100
-Hz there are about 850 bins.
+The likelihood needs only sums over bins. The bins are so narrow that the spectrum is nearly constant within a bin. The
+first ``SINGLE_COEFFICIENT_BINS`` coefficients have one bin each. ``BINS_PER_OCTAVE`` bins per octave follow. No bin is
+wider than ``MAX_BIN_WIDTH_HZ``. The bins are finer around narrow peaks and towards half the sample rate. A recording of
+one hour at 100 Hz has about 850 bins.
 """
 
 from collections.abc import Sequence
@@ -22,15 +22,13 @@ from scipy.fft import dct, idct
 from drivers.sample import Floats, Ints
 
 SINGLE_COEFFICIENT_BINS: Final = 48
-"""Number of bins at the lowest frequencies that hold one coefficient each."""
+"""Number of bins at the lowest frequencies that contain one coefficient each."""
 BINS_PER_OCTAVE: Final = 16
-"""Number of bins per octave."""
 MAX_BIN_WIDTH_HZ: Final = 0.1
-"""Largest width of a bin in Hz."""
 MAX_BIN_WIDTH_FRACTION: Final = 0.002
 """Largest width of a bin as a fraction of the band. This limit matters for recordings with a low sample rate."""
 BINS_PER_PEAK_SIDE: Final = 24
-"""Number of bins on each side of a narrow peak, from its centre to where its power no longer matters."""
+"""Number of bins on each side of a narrow peak."""
 PEAK_REACH_HALF_WIDTHS: Final = 30.0
 """Distance from the centre of a peak, in half widths, up to which the bins are finer."""
 
@@ -41,17 +39,16 @@ class Bins:
 
     first: Ints  # [m] k of the first coefficient of each bin, minus 1
     count: Floats  # [m] number of coefficients
-    f_hz: Floats  # [m] centre frequency, Hz
-    n: int  # samples of the series
+    f_hz: Floats  # [m] centre frequency
     rate_hz: float
 
-    def sums(self, products: Floats) -> Floats:
-        """Return the sum over each bin, shape (m,), of a value per coefficient, shape (n − 1,)."""
+    def sum_over_bins(self, products: Floats) -> Floats:
+        """Return the sum over each bin, shape (m,), of one value for each coefficient, shape (n − 1,)."""
         return np.asarray(np.add.reduceat(products, self.first))
 
-    def spread(self, of_bins: Floats) -> Floats:
-        """Return for each coefficient, shape (n − 1,), the value of its bin, shape (m,)."""
-        return np.repeat(of_bins, self.count.astype(np.int64))
+    def expand_to_coefficients(self, bin_values: Floats) -> Floats:
+        """Return one value for each coefficient, shape (n − 1,), from one value for each bin, shape (m,)."""
+        return np.repeat(bin_values, self.count.astype(np.int64))
 
 
 def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] = ()) -> Bins:
@@ -64,12 +61,12 @@ def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] 
     rate_hz : float
         Sample rate in Hz.
     peaks : sequence of tuple of float, optional
-        Centre and full width, in Hz, of the narrow peaks that get finer bins.
+        Centre and full width, in Hz, of the narrow peaks around which the bins are finer.
 
     Returns
     -------
     Bins
-        Bins that together hold the n − 1 coefficients.
+        Bins that together contain all n − 1 coefficients.
 
     Examples
     --------
@@ -83,8 +80,8 @@ def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] 
     edges = list(range(1, min(SINGLE_COEFFICIENT_BINS, n - 1) + 1))
     at = float(edges[-1])
     while at < n:
-        # The bins narrow towards half the rate as they do towards zero, because the null of a digital filter at half
-        # the rate follows a power law of the distance from it.
+        # The bins become narrower towards half the sample rate, because the spectrum near the null of a digital filter
+        # follows a power law.
         at += max(min(at * ratio, (n - at) * ratio, widest), 1.0)
         edges.append(round(at))
     parts = [np.asarray(edges, np.int64)]
@@ -95,11 +92,11 @@ def frequency_bins(n: int, rate_hz: float, peaks: Sequence[tuple[float, float]] 
     k = np.unique(np.concatenate(parts))
     first = k[(k >= 1) & (k < n)]
     last = np.append(first[1:], n)
-    return Bins(first - 1, (last - first).astype(np.float64), np.sqrt(first * (last - 1.0)) * step_hz, n, rate_hz)
+    return Bins(first - 1, (last - first).astype(np.float64), np.sqrt(first * (last - 1.0)) * step_hz, rate_hz)
 
 
 def cosine_transform(y: Floats) -> Floats:
-    """Return the cosine transform of a series without its mean.
+    """Return the cosine transform of a series, without the coefficient of the mean.
 
     Parameters
     ----------

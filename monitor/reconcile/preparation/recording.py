@@ -11,9 +11,8 @@ from drivers.sample import Floats
 from monitor.noise.model import NoiseModel
 
 MIN_SAMPLES: Final = 4096
-"""Smallest number of samples. With fewer samples, neither a spectrum nor a spectrogram is meaningful."""
+"""Smallest number of samples. A spectrum and a spectrogram need at least this number."""
 MIN_VALID_FRACTION: Final = 0.5
-"""Smallest fraction of samples of an axis that must be present."""
 TEMPERATURE_SMOOTHING_FRACTION: Final = 0.001
 """Length of the moving average of the temperature, as a fraction of the recording. The temperature of a sensor changes
 slowly, and thermometers are noisy.
@@ -49,12 +48,12 @@ def select_usable_axes(recording: Recording, model: NoiseModel | None) -> tuple[
     recording : Recording
         Recording with the selected axes and the smoothed temperature.
     notes : tuple of str
-        One sentence for each axis that was left out.
+        One sentence for each axis that is not used.
 
     Raises
     ------
     NotReady
-        If there are too few samples or no axis is left.
+        If the recording has too few samples or no usable axis.
     """
     if recording.samples < MIN_SAMPLES:
         raise NotReady(
@@ -81,7 +80,7 @@ def select_usable_axes(recording: Recording, model: NoiseModel | None) -> tuple[
 
 
 def _smooth_temperature(temperature_c: Floats) -> Floats:
-    """Return the temperature with missing samples interpolated and with thermometer noise averaged out."""
+    """Interpolate missing samples of the temperature and smooth the noise of the thermometer by a moving average."""
     known = np.flatnonzero(np.isfinite(temperature_c))
     whole = np.interp(np.arange(temperature_c.size), known, temperature_c[known])
     half = int(0.5 * TEMPERATURE_SMOOTHING_FRACTION * whole.size)

@@ -1,16 +1,16 @@
 """Replacement of missing, wrong and clipped samples by plausible random draws.
 
-``fill_missing`` draws each missing sample from its neighbourhood. The draw is the mean of good neighbours plus the
-deviation of a randomly chosen neighbour from its own mean. Level, drift and white noise thus continue through the gap.
-The neighbourhood is as wide as the drift allows. The mean contains the noise of the averaged samples. If p percent of
-the samples are missing and the noise is white, the spectral density below the inverse of the neighbourhood length is
-therefore 2p percent too high. Other frequencies are not affected. A long gap is filled along a line between the levels
-at both ends, with a random walk as strong as the drift of the recording.
+``fill_missing`` replaces each missing sample by the mean of good neighbours plus a random deviation. The deviation is
+that of a randomly chosen good sample, the **donor**, from the mean around the donor. Level, drift and white noise
+therefore continue through a gap. The neighbourhood is as wide as the drift allows. The mean contains the noise of the
+averaged samples. If p percent of the samples are missing and the noise is white, the spectral density below the inverse
+of the neighbourhood length is therefore 2p percent too high. Other frequencies are not affected. A long gap is filled
+along a line between the levels at both ends, with a random walk as strong as the drift of the recording.
 
-``restore_clipped`` draws from the tail of a Gaussian beyond the limit. The local mean of this Gaussian accounts for the
-clipped samples.
+``restore_clipped`` replaces each clipped sample by a draw from the tail of a Gaussian beyond the limit. The mean of the
+Gaussian is the local mean of the restored series.
 
-The input arrays are not changed, and good samples keep their values.
+The functions do not change the input arrays, and good samples keep the measured values.
 """
 
 from typing import Final
@@ -29,17 +29,15 @@ MAX_VARIANCE_RATIO: Final = 1.01
 too wide.
 """
 MAX_WIDTH_TEST_SAMPLES: Final = 20_000
-"""Number of samples at which the widths are compared."""
 DONOR_RANGE_SAMPLES: Final = 1024
-"""Number of good samples on each side from which the random deviation is taken."""
+"""Number of good samples on each side among which the donor is chosen."""
 LONG_GAP_SAMPLES: Final = 100
 """Length in samples above which a gap is filled with a Brownian bridge."""
 MIN_WANDER_INTERVALS: Final = 16
-"""Smallest ratio of the recording length to the interval over which its wander is measured."""
+"""Smallest ratio of the recording length to the interval over which the drift is measured."""
 CLIP_LEVEL_SAMPLES: Final = 64
 """Number of samples on each side that determine the level of clipped samples."""
 MAX_CLIP_ITERATIONS: Final = 50
-"""Largest number of iterations between the level and the clipped samples."""
 CLIP_TOLERANCE_SIGMA: Final = 1e-2
 """Largest change of a sample, in standard deviations, that ends the iterations."""
 
@@ -64,7 +62,7 @@ def fill_missing(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
     Raises
     ------
     ValueError
-        If no sample is good.
+        If there is no good sample.
 
     Examples
     --------
@@ -81,7 +79,7 @@ def fill_missing(y: Floats, mask: Mask, rng: np.random.Generator) -> Floats:
         return new
     where = np.flatnonzero(good)
     if not where.size:
-        raise ValueError("no sample is good")
+        raise ValueError("the series contains no good sample")
     middle = float(y[where[where.size // 2]])
     sums, counts = _running_sums(y, good, middle)
     width = _neighbourhood_width(y, where, sums, counts, middle)
@@ -154,7 +152,7 @@ def _local_means(y: Floats, good: Mask, at: Ints) -> Floats:
 
 @compiled
 def _running_sums(y: Floats, good: Mask, middle: float) -> tuple[Floats, Ints]:
-    """Return, before each sample, the sum of the good samples less ``middle`` and their number."""
+    """Return the sum of (sample − ``middle``) and the number of the good samples before each sample."""
     sums, counts = np.empty(y.size + 1), np.empty(y.size + 1, np.int64)
     total, count = 0.0, 0
     for k in range(y.size):
@@ -167,7 +165,7 @@ def _running_sums(y: Floats, good: Mask, middle: float) -> tuple[Floats, Ints]:
 
 
 def _neighbourhood_width(y: Floats, where: Ints, sums: Floats, counts: Ints, middle: float) -> int:
-    """Return the widest neighbourhood whose mean, without the sample itself, predicts samples as well as any other."""
+    """Return the widest neighbourhood whose mean predicts a sample nearly as well as the best neighbourhood does."""
     some = where[:: max(1, where.size // MAX_WIDTH_TEST_SAMPLES)]
     errors = []
     for width in NEIGHBOURHOOD_WIDTHS:
@@ -191,8 +189,8 @@ def _draw_missing(
 ) -> None:
     """Fill the missing samples of ``new`` in place.
 
-    ``where`` holds the positions of the good samples. ``chances`` holds a random number in [0, 1) for each missing
-    sample.
+    ``where`` contains the positions of the good samples. ``chances`` contains a random number in [0, 1) for each
+    missing sample.
     """
     n = new.size
     for k in range(missing.size):
@@ -218,8 +216,8 @@ def _draw_missing(
         from_, to = max(donor - width, 0), min(donor + width + 1, n)
         others = counts[to] - counts[from_]
         away = new[donor] - middle - (sums[to] - sums[from_]) / others
-        # Relative variances: the level has 1/used and the donor's deviation from its mean has 1 − 1/others. The
-        # deviation is scaled so that their sum is 1.
+        # If a sample has the variance 1, the mean of ``used`` samples has the variance 1/used, and the deviation of the
+        # donor has 1 − 1/others. The deviation is scaled so that the sum of mean and deviation has the variance 1.
         grown = 1.0
         if used > 1.0 and others > 1:
             grown = ((1.0 - 1.0 / used) / (1.0 - 1.0 / others)) ** 0.5
@@ -227,10 +225,7 @@ def _draw_missing(
 
 
 def _wander_variance(sums: Floats, counts: Ints, length: int, width: int) -> float:
-    """Return the variance per sample of the random walk that describes the drift of the recording.
-
-    The drift is measured over about ``length`` samples.
-    """
+    """Return the variance per sample of a random walk as strong as the drift over about ``length`` samples."""
     n = counts.size - 1
     length = min(length, n // MIN_WANDER_INTERVALS)
     begins = np.arange(0, n - length - 2 * width, max(width, (n - length) // 2000 or 1))
@@ -250,9 +245,9 @@ def _wander_variance(sums: Floats, counts: Ints, length: int, width: int) -> flo
 
 
 def _brownian_bridge(length: int, variance: float, rng: np.random.Generator) -> Floats:
-    """Return a random walk that starts at zero before its first sample and returns to zero after its last sample.
+    """Return a random walk that is zero before the first sample and after the last sample.
 
-    ``variance`` is its variance per sample.
+    ``variance`` is the variance per sample.
     """
     walk = np.cumsum(rng.standard_normal(length + 1)) * variance**0.5
     return np.asarray(walk[:-1] - walk[-1] * np.arange(1, length + 1) / (length + 1))

@@ -1,18 +1,17 @@
 """Detection of quantization, clipping and repeated samples from the values of one axis.
 
-The input is one axis as measured, with NaN for missing samples. Each function returns its finding, or None. The
-evidence is a log-likelihood gain in nats over values without the property.
+The input is one axis as measured, with NaN for missing samples. Each function returns the detected property, or None.
+The evidence is the log-likelihood gain in nats over a series without the property.
 
-Values lie on a grid if all their differences are whole multiples of a step. Steps that are far finer than the noise are
-detected too. Numbers have steps of their own that do not come from the sensor: the spacing of float32 or float64
-values, or the last decimal of a text in SI units, degrees or g. A grid that is not coarser than these steps is reported
-only if it is at least a tenth of the noise. Such a grid shapes the spectrum, whatever its origin.
+Values lie on a grid if all differences are whole multiples of a step. Steps far below the noise are detected too. The
+number format also causes steps: the spacing of float32 or float64 values, or the last decimal of numbers in a text. The
+unit of such a text may be SI, degrees or g. If a grid is no coarser than the number format, it is reported only if the
+step is at least a tenth of the noise, because such a grid changes the spectrum.
 
-A continuous quantity never takes its largest value twice. A stepped quantity takes its last step less often than the
-distribution of the steps before it predicts, unless it is clipped. Each repeat of a continuous value is identified. For
-stepped values only the number of repeats is known, from the excess of zeros among the differences. If the steps are
-larger than the noise, repeats cannot be detected. If the steps are larger than two standard deviations, clipping cannot
-be detected either.
+Continuous values reach the same maximum twice only if they are clipped. Values on a grid reach the highest level more
+often than the next levels predict only if they are clipped. Each repeat of a continuous value is located. For values
+on a grid, only the number of repeats is known, from the excess of zero differences. Repeats cannot be detected if the
+step is larger than the noise. Clipping cannot be detected if the step is larger than two standard deviations.
 """
 
 from dataclasses import dataclass
@@ -30,36 +29,30 @@ from monitor.common.distributions import Z95
 from monitor.estimation.detection.resolution import GRID_TOLERANCE, SIGMA_PER_MEAN_DISTANCE
 
 Mask = NDArray[np.bool_]
-"""Boolean array."""
 
 MIN_SAMPLES: Final = 16
-"""Smallest number of samples for any statistic."""
 GRID_SEARCH_SAMPLES: Final = 4096
-"""Number of samples among which a grid is sought. All samples are then checked against the grid."""
+"""Number of samples in which a grid is searched. All samples are then checked against the grid."""
 MIN_STEP_TO_ROUNDING: Final = 25.0
 """Smallest detectable step, as a multiple of the rounding of the values."""
 MIN_STEP_TO_NOISE: Final = 0.1
 """Ratio of step to noise from which a step is reported, whatever its origin."""
 MIN_NOISE_TO_STEP_CLIPPING: Final = 0.5
-"""Smallest ratio of noise to step at which clipping is tested. With less noise, the shape of the ends depends on the
-position of the level between two steps.
+"""Smallest ratio of noise to step at which clipping is tested. With less noise, the counts of the highest levels depend
+on the position of the mean between two levels.
 """
 MIN_NOISE_TO_STEP_REPEATS: Final = 0.9
-"""Smallest ratio of noise to step at which repeats are tested. With more noise, the level changes the probability of a
-repeat by less than exp(−π²·0.8) = 4·10⁻⁴.
+"""Smallest ratio of noise to step at which repeats are tested. With more noise, the position of the mean between two
+levels changes the probability of a repeat by less than exp(−π²·0.8) = 4·10⁻⁴.
 """
 CHANCE_RELATIVE_ERROR: Final = 0.01
-"""Relative uncertainty of the share of neighbours that are equal by chance, because noise is only approximately
-Gaussian.
-"""
+"""Relative uncertainty of the expected share of equal neighbours, because the noise is only approximately Gaussian."""
 MIN_EXPECTED_COINCIDENCES: Final = 1e-3
-"""Lower limit of the expected number of coincidences."""
 TEXT_UNITS: Final = (1.0, DEGREE, DEGREE / HOUR_S, G0)
-"""Units of the texts that values may come from, in SI units: SI, °/s, °/h, g."""
+"""Units in which a text may contain the values: SI, °/s, °/h and g."""
 MIN_DISTINCT_DECIMALS: Final = 8
-"""Number of different decimals that distinguishes a text from chance. A text with fewer decimals is coarse anyway."""
+"""Number of different decimal numbers above which agreement with a text is not due to chance."""
 PREDICTOR_TAPS: Final = 8
-"""Number of neighbours on each side that predict a sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,36 +69,27 @@ class QuantizationGrid:
     """Grid that all values lie on."""
 
     step: ValueWithInterval
-    offset: float  # offset of the grid from zero, in [−step/2, step/2]
     levels: int  # number of grid levels from the smallest to the largest value
-    noise: float  # standard deviation from sample to sample, including the steps
     gain: float  # log-likelihood gain over continuous values, nats
-
-    @property
-    def coarse(self) -> float:
-        """Ratio of step to noise."""
-        return self.step.value / self.noise if self.noise > 0.0 else np.inf
 
 
 @dataclass(frozen=True, slots=True)
 class Clipping:
-    """Values that accumulate at an end of the range."""
+    """Clipping of the values at an end of the range."""
 
     limit: ValueWithInterval
     count: int  # number of clipped samples
-    upper: bool  # True if values are clipped at the largest value
-    lower: bool  # True if values are clipped at the smallest value
     symmetric: bool  # True if no value lies beyond ± limit, as for y = clip(x, ± limit)
     gain: float  # log-likelihood gain over values without clipping, nats
 
 
 @dataclass(frozen=True, slots=True)
 class RepeatedSamples:
-    """Samples that repeat the sample before them."""
+    """Samples that repeat the previous sample."""
 
     fraction: ValueWithInterval
-    count: float  # number of repeats in excess of chance
-    mask: Mask  # [n] True for each repeat of a continuous value; all False for stepped values
+    count: float  # number of repeats beyond the number expected by chance
+    mask: Mask  # [n] True for each repeat of a continuous value; all False for values on a grid
     gain: float  # log-likelihood gain over chance, nats
 
 
@@ -121,8 +105,8 @@ def detect_quantization(y: Floats) -> QuantizationGrid | None:
 
     Returns
     -------
-    Levels or None
-        The grid, or None if there is none.
+    QuantizationGrid or None
+        The grid, or None if no grid is detected.
 
     Examples
     --------
@@ -143,12 +127,12 @@ def detect_quantization(y: Floats) -> QuantizationGrid | None:
     for blur, own in ((rounding, max(rounding, last)), (0.5 * last, last)):
         step = _common_divisor(np.unique(np.diff(part)), blur) if blur > 0.0 else None
         if step is not None and (step > 1.5 * own or step >= MIN_STEP_TO_NOISE * noise):
-            return _fit_grid(values, step, blur, noise)
+            return _fit_grid(values, step, blur)
     return None
 
 
 def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
-    """Detect values that accumulate at the largest or the smallest value.
+    """Detect clipping at the largest or the smallest value.
 
     Parameters
     ----------
@@ -159,8 +143,8 @@ def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
 
     Returns
     -------
-    Clipped or None
-        The clipping limit, or None if no values are clipped.
+    Clipping or None
+        The clipping limit, or None if no clipping is detected.
 
     Examples
     --------
@@ -174,7 +158,7 @@ def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
         return None
     ends = np.array([values.max(), -values.min()])
     if step == 0.0 and max(np.count_nonzero(values == ends[0]), np.count_nonzero(values == -ends[1])) < 2:
-        return None  # fast path for most recordings
+        return None  # most recordings end here
     noise = _sample_noise(values)
     pile = _stepped_clipping_gain if step >= 0.5 * MIN_STEP_TO_NOISE * noise > 0.0 else _continuous_clipping_gain
     gains = np.array([pile(sign * values, end, step, noise) for sign, end in zip((1.0, -1.0), ends, strict=True)])
@@ -187,15 +171,13 @@ def detect_clipping(y: Floats, step: float = 0.0) -> Clipping | None:
     return Clipping(
         limit=ValueWithInterval(abs(limit), abs(limit) - near, abs(limit) + near),
         count=int(np.dot(at, piled)),
-        upper=bool(piled[0]),
-        lower=bool(piled[1]),
         symmetric=bool(limit > 0.0 and ends.max() <= limit + near),
         gain=float(gains[piled].sum()),
     )
 
 
 def detect_repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> RepeatedSamples | None:
-    """Detect samples that repeat the sample before them more often than chance explains.
+    """Detect repeats of the previous sample that are more frequent than expected by chance.
 
     Parameters
     ----------
@@ -204,12 +186,12 @@ def detect_repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> Repea
     step : float, optional
         Step of the grid that the values lie on, in the unit of ``y``. Zero means no grid.
     limit : float, optional
-        Limit of the measuring range, in the unit of ``y``. Samples at the limit are left out.
+        Limit of the measuring range, in the unit of ``y``. Samples at the limit are not tested.
 
     Returns
     -------
-    Repeats or None
-        The repeats, or None if there are none or if a stepped axis has too little noise to detect them.
+    RepeatedSamples or None
+        The repeats. The result is None if no repeats are detected, or if the step is too coarse to detect repeats.
 
     Examples
     --------
@@ -219,7 +201,7 @@ def detect_repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> Repea
     1.0
     """
     if step == 0.0 and not (y[1:] == y[:-1]).any():
-        return None  # fast path for most recordings
+        return None  # most recordings end here
     good = np.isfinite(y) & (np.abs(y) < limit - max(0.5 * step, 1e-9 * abs(limit)) if np.isfinite(limit) else True)
     pairs = good[1:] & good[:-1]
     apart = np.diff(y)[pairs]
@@ -229,7 +211,7 @@ def detect_repeats(y: Floats, step: float = 0.0, limit: float = np.inf) -> Repea
     if step < 1e-6 * noise:
         return _repeats_of_continuous(y, pairs, apart, noise)
     twice = (y[2:] - y[:-2])[good[2:] & good[1:-1] & good[:-2]]
-    # differences over two samples are less affected by repeats
+    # repeats change differences over two samples less than differences of neighbours
     quiet = SIGMA_PER_MEAN_DISTANCE * float(np.abs(twice).mean()) < MIN_NOISE_TO_STEP_REPEATS * step
     return None if quiet else _repeats_of_stepped(np.abs(apart) / step, np.abs(twice) / step, y.size)
 
@@ -256,7 +238,7 @@ def _total_variation(values: Floats) -> float:
 def _float_spacing(values: Floats) -> float:
     """Return the spacing of floating-point numbers at the largest value.
 
-    The spacing is that of float32 if a few thousand of the values are all exact in float32.
+    If float32 can represent a sample of the values exactly, the spacing of float32 is returned.
     """
     values = values[:: max(1, values.size // GRID_SEARCH_SAMPLES)]
     largest = float(np.abs(values).max())
@@ -265,7 +247,7 @@ def _float_spacing(values: Floats) -> float:
 
 
 def _last_decimal(levels: Floats) -> float:
-    """Return the last decimal of a text that represents all values exactly, in SI units, or 0 if no text does."""
+    """Return the unit of the last digit, in SI units, if all values are decimal numbers of a text, otherwise 0."""
     some = levels[np.linspace(0, levels.size - 1, min(256, levels.size)).astype(np.int64)]
     some = np.abs(some[some != 0.0])
     if not some.size:
@@ -285,7 +267,7 @@ def _last_decimal(levels: Floats) -> float:
 def _common_divisor(gaps: Floats, blur: float) -> float | None:
     """Return the greatest common divisor of ascending distances by Euclid's algorithm with error bounds.
 
-    The values are known to within ``blur``.
+    The error of a value is at most ``blur``.
     """
     gaps = gaps[gaps > 2.0 * blur]
     if not gaps.size:
@@ -294,7 +276,7 @@ def _common_divisor(gaps: Floats, blur: float) -> float | None:
     for _ in range(300):
         if step < MIN_STEP_TO_ROUNDING * blur:
             return None
-        most = max(1.5, min(0.2 * step / error, 8.0 * reached))  # largest multiple that the error leaves unambiguous
+        most = max(1.5, min(0.2 * step / error, 8.0 * reached))  # largest multiple that the error allows to determine
         near = gaps[: max(1, np.searchsorted(gaps, most * step))]
         counts = np.rint(near / step)
         if counts[0] * error > 0.25 * step:
@@ -313,7 +295,7 @@ def _common_divisor(gaps: Floats, blur: float) -> float | None:
     return None
 
 
-def _fit_grid(values: Floats, step: float, blur: float, noise: float) -> QuantizationGrid | None:
+def _fit_grid(values: Floats, step: float, blur: float) -> QuantizationGrid | None:
     """Return the grid with a given step if every value lies on it."""
     middle = float(values[values.size // 2])
     for _ in range(2):  # the second pass uses the step derived from the two extreme values
@@ -326,21 +308,21 @@ def _fit_grid(values: Floats, step: float, blur: float, noise: float) -> Quantiz
     most = max(float(np.ptp(left)) / 2.0, blur)
     if not (between and most < GRID_TOLERANCE * step):
         return None
-    offset = middle + 0.5 * float(left.max() + left.min())
-    told = np.count_nonzero(np.diff(values)) - 1  # a repeated sample is no evidence
-    gain = told * np.log(step / (2.0 * most)) - 2.0 * np.log(between + 1.0)
+    informative = np.count_nonzero(np.diff(values)) - 1  # repeated samples contain no information about the grid
+    gain = informative * np.log(step / (2.0 * most)) - 2.0 * np.log(between + 1.0)
     error = 2.0 * most / between
     return QuantizationGrid(
         step=ValueWithInterval(step, step - error, step + error),
-        offset=offset - step * float(np.rint(offset / step)),
         levels=int(between) + 1,
-        noise=noise,
         gain=float(gain),
     )
 
 
 def _continuous_clipping_gain(values: Floats, end: float, step: float, noise: float) -> float:
-    """Return the gain of clipping at the largest of continuous values, which is then reached repeatedly and held."""
+    """Return the gain of clipping continuous values at the maximum.
+
+    Clipped values reach the maximum several times and stay there for several samples.
+    """
     at = values == end
     count = int(np.count_nonzero(at))
     visits = int(np.count_nonzero(at[1:] & ~at[:-1])) + int(at[0])
@@ -362,11 +344,11 @@ def _continuous_clipping_gain(values: Floats, end: float, step: float, noise: fl
 
 
 def _stepped_clipping_gain(values: Floats, end: float, step: float, noise: float) -> float:
-    """Return the gain of clipping at the largest of stepped values.
+    """Return the gain of clipping values on a grid at the highest level.
 
-    Two conditions must hold, and the smaller gain counts. The last step occurs more often than the steps before it
-    predict. More samples are missing beyond the last step than the best linear interpolation from their neighbours
-    predicts.
+    The result is the smaller gain of two tests. The first test compares the count of the highest level with the counts
+    of the next levels. The second test predicts each sample from its neighbours and compares the predictions with the
+    highest level.
     """
     if noise < MIN_NOISE_TO_STEP_CLIPPING * step:
         return 0.0
@@ -380,7 +362,10 @@ def _stepped_clipping_gain(values: Floats, end: float, step: float, noise: float
 
 
 def _excess_over_parabola(counts: Floats) -> float:
-    """Return the gain of the first of four counts over the parabola through the logarithms of the other three."""
+    """Return the gain of the first of four counts if it lies above the extrapolation of the others, otherwise 0.
+
+    The extrapolation is a parabola through the logarithms of the other three counts.
+    """
     if not counts[1:].all():
         return 0.0
     above = float(np.log(counts) @ np.array([1.0, -3.0, 3.0, -1.0]))
@@ -388,7 +373,10 @@ def _excess_over_parabola(counts: Floats) -> float:
 
 
 def _count_difference_gain(one: float, other: float) -> float:
-    """Return the log-likelihood gain of two different counts over equal counts if the first is larger, otherwise 0."""
+    """Return the log-likelihood gain of two different expected counts over equal expected counts.
+
+    The gain is 0 if the first count is not the larger one.
+    """
     half = 0.5 * (one + other)
     return float(xlogy(one, one / half) + xlogy(other, other / half)) if one > other else 0.0
 
@@ -409,10 +397,10 @@ def _predict_from_neighbours(values: Floats) -> tuple[Floats, float]:
 
 
 def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: float) -> RepeatedSamples | None:
-    """Return the repeats of values without a known step.
+    """Return the repeats in values for which no grid was detected.
 
-    If values also recur after a different value in between, they lie on an unknown grid. Neighbours are then equal by
-    chance as often as every second sample is, except for samples that were repeated twice.
+    If a sample equals the sample two before it but not its neighbour, the values lie on an unknown grid. The share of
+    neighbours that are equal by chance is then estimated from the share of equal samples at a distance of two.
     """
     mask = np.zeros(y.size, dtype=np.bool_)
     mask[1:] = pairs & (y[1:] == y[:-1])
@@ -431,7 +419,7 @@ def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: f
         error = Z95 * (count + n * again) ** 0.5 / n
         size = ValueWithInterval(share, max(share - error, 0.0), share + error)
         return RepeatedSamples(size, n * share, np.zeros_like(mask), gain) if gain > 0.0 else None
-    # probability density of a difference at zero, times the spacing of the numbers
+    # probability density of a zero difference, times the spacing of the numbers
     chance = max(
         MIN_EXPECTED_COINCIDENCES, differences.size * _float_spacing(_finite_values(y)) / (noise * 2.0 * np.pi**0.5)
     )
@@ -440,13 +428,13 @@ def _repeats_of_continuous(y: Floats, pairs: Mask, differences: Floats, noise: f
 
 
 def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: int) -> RepeatedSamples | None:
-    """Return the repeats of stepped values.
+    """Return the repeats in values on a grid.
 
-    The arguments are the absolute differences, in steps, of successive samples and of every second sample. The
-    differences of stepped Gaussian values have a known distribution (``_step_difference_probabilities``), and repeats
-    add zeros to it. Outliers, modulated noise and a level that stays between two steps also add zeros. They add them to
-    differences over two samples as well, whereas repeats with a share h add only h² there. The smaller gain therefore
-    counts.
+    The arguments are the absolute differences, in steps, between neighbours and between samples at a distance of two.
+    ``_step_difference_probabilities`` gives the distribution of the differences of Gaussian noise on a grid. Repeats
+    increase the number of zero differences. Outliers, modulated noise and a mean midway between two levels have the
+    same influence, but at a distance of two samples as well. If the share h of the samples are repeats, the share of
+    zero differences at a distance of two increases only by h². The smaller gain of the two tests is therefore returned.
     """
     most = int(np.clip(np.ceil(SIGMA_PER_MEAN_DISTANCE * 2.0**0.5 * differences.mean()), 2, 64))
     counts, chance, gain = _zero_difference_excess(differences, most)
@@ -465,7 +453,7 @@ def _repeats_of_stepped(differences: Floats, differences_over_two: Floats, n: in
 
 
 def _zero_difference_excess(differences: Floats, most: int) -> tuple[Floats, float, float]:
-    """Return the statistics of zero differences between stepped values.
+    """Compare the number of zero differences with the number that the other differences predict.
 
     Returns
     -------
@@ -474,7 +462,7 @@ def _zero_difference_excess(differences: Floats, most: int) -> tuple[Floats, flo
     chance : float
         Number of zeros that the distribution of the other differences predicts.
     gain : float
-        Log-likelihood gain of a free number of zeros, nats.
+        Log-likelihood gain of a fitted number of zeros, nats.
     """
     counts = np.bincount(np.minimum(np.rint(differences), most + 1).astype(np.int64), minlength=most + 2)[:-1].astype(
         float
@@ -489,8 +477,9 @@ def _zero_difference_excess(differences: Floats, most: int) -> tuple[Floats, flo
 
 
 def _excess_gain(count: float, chance: float, variance: float) -> float:
-    """Return the gain of a count over its expectation, which has a given variance and a relative error of
-    ``CHANCE_RELATIVE_ERROR``.
+    """Return the gain of a count above the expected count ``chance``, otherwise 0.
+
+    The expected count has the given variance and the relative error ``CHANCE_RELATIVE_ERROR``.
     """
     excess = count - chance
     return (
@@ -516,11 +505,11 @@ def _fit_difference_spread(counts: Floats, first: int) -> tuple[float, float]:
 
 
 def _step_difference_probabilities(spread: float, most: int) -> Floats:
-    """Return the probabilities that two stepped values differ by 0 … ``most`` steps in either direction.
+    """Return the probabilities that two values on a grid differ by 0 … ``most`` steps in either direction.
 
-    ``spread`` is the standard deviation of the underlying Gaussian difference, in steps. The level may lie anywhere
-    between two steps. The probabilities are second differences of the double integral of the Gaussian, which is the
-    Gaussian weighted with a triangle of two steps.
+    ``spread`` is the standard deviation, in steps, of the difference before rounding. The mean has any position between
+    two levels with the same probability. Each probability is the integral of the Gaussian density times a triangle with
+    a width of two steps. It is computed as a second difference of the double integral of the density.
     """
     x = np.arange(-1.0, most + 2.0)
     twice = x * ndtr(x / spread) + spread * np.exp(-0.5 * (x / spread) ** 2) / np.sqrt(2.0 * np.pi)
@@ -530,7 +519,10 @@ def _step_difference_probabilities(spread: float, most: int) -> Floats:
 
 
 def _share_difference_gain(counts: Floats, trials: Floats) -> float:
-    """Return the log-likelihood gain of two shares over one common share if the first is larger, otherwise 0."""
+    """Return the log-likelihood gain of two different shares over a common share.
+
+    The gain is 0 if the first share is not the larger one.
+    """
     share, same = counts / trials, counts.sum() / trials.sum()
     if share[0] <= share[1]:
         return 0.0
@@ -538,7 +530,7 @@ def _share_difference_gain(counts: Floats, trials: Floats) -> float:
 
 
 def _poisson_gain(count: float, expected: float) -> float:
-    """Return the log-likelihood gain of a count over its expectation if it is larger, otherwise 0."""
+    """Return the log-likelihood gain of a Poisson count above the expected count, otherwise 0."""
     return float(count * np.log(count / expected) - count + expected) if count > expected else 0.0
 
 

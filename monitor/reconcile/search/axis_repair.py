@@ -1,18 +1,17 @@
-"""Preparation of the axes of a recording: replace missing samples and samples that the model describes as wrong.
+"""Replacement of the samples of an axis that are missing or that effects of the model have altered.
 
-Missing samples are replaced by random draws from their neighbourhood. The positions of repeats of continuous values are
-known, and these samples are treated as missing. Outliers are detected in the whitened axis and are also treated as
-missing. Clipped samples are drawn from beyond the limit. Measured and simulated recordings are prepared in the same
-way, each with its own model. The spectrum then describes the remaining effects.
+``sample_repair`` draws the replacement samples. Missing samples are always replaced. Repeated, outlying and clipped
+samples are replaced only if the model contains the effect. The positions of repeats of continuous values are known.
+Outliers are detected in the whitened axis. Measured and simulated recordings are repaired in the same way. The spectrum
+of a repaired axis depends only on the other effects.
 """
 
 from collections.abc import Mapping
-from typing import Final, TypeVar
+from typing import Final
 
 import numpy as np
 
 from drivers.sample import Floats
-from monitor.noise.effect import Effect
 from monitor.noise.effects import Outliers, RandomSampleHold, Saturation
 from monitor.reconcile.likelihood.axis import Axis, Effects, RegressorCache, ValueStatistics
 from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
@@ -26,23 +25,20 @@ from monitor.reconcile.preparation.value_statistics import detect_clipping, dete
 CLIP_RELATIVE_TOLERANCE: Final = 1e-9
 """Relative distance to the limit below which a sample counts as clipped."""
 MAX_SIGMA_ITERATIONS: Final = 40
-"""Largest number of iterations between clipped samples and their standard deviation."""
 SIGMA_RELATIVE_TOLERANCE: Final = 5e-4
-"""Relative change of the standard deviation that ends the iterations."""
-E = TypeVar("E", bound=Effect)
 
 
 def build_repaired_axes(
     recording: Recording, effects: Mapping[str, Effects], regressors: RegressorCache, rng: np.random.Generator
 ) -> dict[str, Axis]:
-    """Return the prepared axes of one recording.
+    """Build the axes of one recording, with repaired samples.
 
     Parameters
     ----------
     recording : Recording
         Measured or simulated recording. The temperature must not have missing samples.
     effects : mapping of str to tuple of Effect
-        Effects of each axis according to the model.
+        Effects of each axis in the model.
     regressors : RegressorCache
         Cached regressors for the same length, sample rate and temperature.
     rng : numpy.random.Generator
@@ -72,12 +68,12 @@ def build_repaired_axes(
 
 
 def repair_axis_again(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
-    """Return the same axis, repaired for other effects.
+    """Return the axis with the measured samples repaired again, for a different set of effects.
 
     Parameters
     ----------
     axis : Axis
-        Axis to repair again from the measured samples.
+        Axis with the measured samples.
     effects : tuple of Effect
         Effects of the axis.
     rng : numpy.random.Generator
@@ -91,7 +87,7 @@ def repair_axis_again(axis: Axis, effects: Effects, rng: np.random.Generator) ->
 def _may_leak(source: str, axis: str) -> bool:
     """Return True if one axis may leak into another.
 
-    Gyroscopes and accelerometers leak into their own kind. Accelerometers also leak into gyroscopes.
+    Any axis may leak into a gyroscope axis. Only accelerometer axes may leak into an accelerometer axis.
     """
     return source != axis and (axis.startswith("g") or source.startswith("a"))
 
@@ -107,23 +103,20 @@ def measure_value_statistics(y: Floats) -> ValueStatistics:
 def _repair_samples(y: Floats, statistics: ValueStatistics, effects: Effects, rng: np.random.Generator) -> Floats:
     """Return the samples ``y``, shape (n,), with missing, repeated and clipped samples replaced.
 
-    Repeats and clipping are repaired only if they are among the effects.
+    Repeated and clipped samples are replaced only if the effects include ``RandomSampleHold`` or ``Saturation``.
     """
     missing = ~np.isfinite(y)
-    if _first_of_type(effects, RandomSampleHold) and statistics.repeats:
+    types = {type(effect) for effect in effects}
+    if RandomSampleHold in types and statistics.repeats:
         missing = missing | statistics.repeats.mask
     repaired = fill_missing(y, missing, rng)
-    limit = _first_of_type(effects, Saturation)
-    if limit is None or statistics.clipping is None or not statistics.clipping.symmetric:
+    if Saturation not in types or statistics.clipping is None or not statistics.clipping.symmetric:
         return repaired
     return _restore_clipped(repaired, statistics.clipping.limit.value, rng)
 
 
 def _restore_clipped(y: Floats, limit: float, rng: np.random.Generator) -> Floats:
-    """Redraw the clipped samples and update the standard deviation in turns until it converges.
-
-    A few iterations suffice if few samples were clipped.
-    """
+    """Replace the clipped samples repeatedly, until the standard deviation of the noise converges."""
     inside = np.abs(y) < limit * (1.0 - CLIP_RELATIVE_TOLERANCE)
     sigma = float(np.std(np.diff(y)[inside[1:] & inside[:-1]])) / 2.0**0.5
     whole = y
@@ -137,12 +130,7 @@ def _restore_clipped(y: Floats, limit: float, rng: np.random.Generator) -> Float
 
 def _replace_outliers(axis: Axis, effects: Effects, rng: np.random.Generator) -> Axis:
     """Return the axis with the outliers replaced, if the effects include outliers."""
-    if _first_of_type(effects, Outliers) is None:
+    if not any(isinstance(effect, Outliers) for effect in effects):
         return axis
     found = fit_outliers(whiten_axis(fit_with_fixed_noise(axis, effects).fit).flat_series)
     return axis if found is None else axis.with_samples(fill_missing(axis.repaired, found.mask, rng))
-
-
-def _first_of_type(effects: Effects, kind: type[E]) -> E | None:
-    """Return the first effect of a type, or None."""
-    return next((effect for effect in effects if isinstance(effect, kind)), None)

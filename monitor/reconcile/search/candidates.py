@@ -1,10 +1,10 @@
 """Candidate effects for one axis, with starting values from the data.
 
-Each function takes a whitened axis and examines one family of effects. It returns effects whose shape parameters are
-the best of their family, given the effects by which the axis was whitened. The caller fits the sizes. An effect must
-gain more than its penalty in ``PENALTY_NATS``. The penalty consists of the gain that chance gives a true model, an
-allowance for effects that can occur at many frequencies or times, and an allowance for fitted shape parameters. The
-values are empirical.
+Each function takes a whitened axis and proposes effects of one kind. The shape parameters of a proposed effect are
+fitted together with the effects by which the axis was whitened. The caller fits the sizes. The log-likelihood gain of
+an effect must exceed the penalty in ``PENALTY_NATS``. The penalty is the gain that an effect reaches by chance if the
+model is true. The penalty is larger for effects that can occur at many frequencies or times, and for effects with
+fitted shape parameters. The values are empirical.
 """
 
 from collections.abc import Callable, Sequence
@@ -63,44 +63,38 @@ PENALTY_NATS: Final[dict[str, float]] = {
     "poisson_steps": 8.5 + 1.5,
     "power_law": 9.5 + 2.0,
 }
-"""Penalty of each effect in nats of log-likelihood gain."""
+"""Penalty of each effect in nats."""
 SHAPES_PER_DECADE: Final = 4
 """Number of shape values per decade in the first search."""
 MAX_CORRELATION_FRACTION: Final = 0.1
-"""Longest correlation time as a fraction of the recording. A longer correlation looks like a random walk."""
+"""Longest correlation time as a fraction of the recording. With a longer one, the noise resembles a random walk."""
 MAX_TIME_CONSTANT_FRACTION: Final = 0.4
-"""Longest time constant of a transient or delay as a fraction of the recording. A longer time constant looks like a
-slope.
-"""
+"""Longest time constant of a transient or delay as a fraction of the recording. Longer transients resemble a slope."""
 PEAK_SEPARATION_STEPS: Final = 24
-"""Distance to each side, in quarters of a width, within which two windows contain the same peak."""
+"""Distance, in quarters of the window width, within which two windows contain the same peak."""
 MIN_DELAY_FRACTION: Final = 0.002
-"""Shortest temperature delay as a fraction of the recording. Because of the noise of the thermometer, a shorter delay
-cannot be detected.
-"""
+"""Shortest temperature delay as a fraction of the recording. The noise of the thermometer hides shorter delays."""
 MAX_PEAKS: Final = 2
-"""Largest number of peaks that are examined."""
 FILTER_ORDERS: Final = (1, 2, 3, 4)
-"""Orders of the low-pass filters that are tried."""
 
 CandidateFunction = Callable[[WhitenedAxis], list[Effect]]
-"""Function that proposes effects of one family."""
+"""Function that proposes effects of one kind."""
 
 
 def propose_classic_terms(whitened: WhitenedAxis) -> list[Effect]:
-    """Return the classic terms Q, N, B and K that the axis does not have yet."""
+    """Return those terms of Q, N, B and K that the hypothesis does not contain."""
     small = initial_size(whitened.axis)
     every = (QuantizationNoise(Q=small), AngleRandomWalk(N=small), BiasInstability(B=small), RateRandomWalk(K=small))
     return [effect for effect in every if type(effect) not in whitened.types]
 
 
 def propose_correlated_noise(whitened: WhitenedAxis) -> list[Effect]:
-    """Return the best exponentially correlated noise, or nothing if its correlation time is out of range."""
+    """Return the best exponentially correlated noise. The list is empty if the correlation time is out of range."""
     return fit_correlated_noise(whitened.axis, whitened.effects)
 
 
 def fit_correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
-    """Return the best exponentially correlated noise, or nothing if its correlation time is out of range.
+    """Return the best exponentially correlated noise. The list is empty if the correlation time is out of range.
 
     Parameters
     ----------
@@ -116,7 +110,7 @@ def fit_correlated_noise(axis: Axis, effects: Effects) -> list[Effect]:
     best = _most_likely(
         axis, effects, [ExponentiallyCorrelated(sigma=initial_size(axis), correlation_time=float(t)) for t in times_s]
     )
-    found = refine_shape(axis, (*effects, best), -1, ["correlation_time"], 2.0)[-1]
+    found = refine_shape(axis, effects, best, "correlation_time", 2.0)
     assert isinstance(found, ExponentiallyCorrelated)
     return [found] if shortest <= found.correlation_time <= longest else []
 
@@ -129,23 +123,22 @@ def propose_resonances(whitened: WhitenedAxis) -> list[Effect]:
             Narrowband(sigma=initial_size(axis), frequency=middle, bandwidth=float(width * factor))
             for factor in (0.3, 0.6, 1.0, 1.8)
         ]
-        effects = (*whitened.effects, _most_likely(axis, whitened.effects, trials))
-        effects = refine_shape(axis, effects, -1, ["bandwidth"], 2.5)
-        peak = effects[-1]
+        peak = _most_likely(axis, whitened.effects, trials)
+        peak = refine_shape(axis, whitened.effects, peak, "bandwidth", 2.5)
         assert isinstance(peak, Narrowband)
-        effects = refine_shape(axis, effects, -1, ["frequency"], 1.0 + 0.7 * peak.bandwidth / peak.frequency)
-        found.append(refine_shape(axis, effects, -1, ["bandwidth"], 1.5)[-1])
+        peak = refine_shape(axis, whitened.effects, peak, "frequency", 1.0 + 0.7 * peak.bandwidth / peak.frequency)
+        found.append(refine_shape(axis, whitened.effects, peak, "bandwidth", 1.5))
     return found
 
 
-def find_spectral_peaks(whitened: WhitenedAxis, most: int = MAX_PEAKS) -> list[tuple[float, float]]:
+def find_spectral_peaks(whitened: WhitenedAxis, max_peaks: int = MAX_PEAKS) -> list[tuple[float, float]]:
     """Return the peaks of the whitened spectrum that are wider than a line, strongest first.
 
     Parameters
     ----------
     whitened : WhitenedAxis
         Whitened axis.
-    most : int, optional
+    max_peaks : int, optional
         Largest number of peaks.
 
     Returns
@@ -162,7 +155,7 @@ def find_spectral_peaks(whitened: WhitenedAxis, most: int = MAX_PEAKS) -> list[t
         first = np.arange(width, n - 1 - width, max(1, width // 4))
         power = np.maximum((running[first + width] - running[first]) / width, 1.0)
         gains = free_variance_gain_nats(power, np.full(first.size, width))
-        for _ in range(most):
+        for _ in range(max_peaks):
             at = int(np.argmax(gains))
             middle = (first[at] + 0.5 * width) * step_hz
             found.append((float(gains[at]), float(middle), float(width * step_hz)))
@@ -170,7 +163,7 @@ def find_spectral_peaks(whitened: WhitenedAxis, most: int = MAX_PEAKS) -> list[t
         width *= 2
     chosen: list[tuple[float, float]] = []
     for gain, middle, wide in sorted(found, reverse=True):
-        if gain < PENALTY_NATS["narrowband"] / 2.0 or len(chosen) == most:
+        if gain < PENALTY_NATS["narrowband"] / 2.0 or len(chosen) == max_peaks:
             break
         if all(abs(middle - other) > 2.0 * (wide + width_of) for other, width_of in chosen):
             chosen.append((middle, wide))
@@ -187,7 +180,7 @@ def propose_sinusoids(whitened: WhitenedAxis) -> list[Effect]:
 
 
 def _line_frequency(whitened: WhitenedAxis, f_hz: float) -> float:
-    """Return the frequency of the maximum of the periodogram near a given frequency, by golden-section search."""
+    """Return the frequency of the maximum of the periodogram near ``f_hz``."""
     t = np.arange(whitened.axis.n) / whitened.axis.rate_hz
     half = 0.5 * whitened.axis.rate_hz / whitened.axis.n
 
@@ -202,7 +195,10 @@ def _line_frequency(whitened: WhitenedAxis, f_hz: float) -> float:
 
 
 def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
-    """Return the best low-pass filter, or nothing if the effects already contain one or no filter fits."""
+    """Return the best low-pass filter.
+
+    The list is empty if the hypothesis contains a low-pass filter, or if the best cut-off is half the sample rate.
+    """
     if BandwidthLimit in whitened.types:
         return []
     axis = whitened.axis
@@ -211,7 +207,7 @@ def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
     found: list[Effect] = []
     for order in FILTER_ORDERS:
         best = _most_likely(axis, whitened.effects, [BandwidthLimit(cutoff=float(f), order=order) for f in cutoffs])
-        refined = refine_shape(axis, (*whitened.effects, best), -1, ["cutoff"], 1.4)[-1]
+        refined = refine_shape(axis, whitened.effects, best, "cutoff", 1.4)
         assert isinstance(refined, BandwidthLimit)
         if refined.cutoff < 0.99 * nyquist:
             found.append(refined)
@@ -219,7 +215,7 @@ def propose_low_pass(whitened: WhitenedAxis) -> list[Effect]:
 
 
 def propose_drifts(whitened: WhitenedAxis) -> list[Effect]:
-    """Return effects that follow time: a ramp, a transient after the start, and a step."""
+    """Return effects that depend on time: a ramp, a transient after the start, and a step."""
     found: list[Effect] = []
     if RateRamp not in whitened.types:
         found.append(RateRamp(R=initial_size(whitened.axis)))
@@ -234,7 +230,7 @@ def propose_drifts(whitened: WhitenedAxis) -> list[Effect]:
 
 
 def propose_temperature_effects(whitened: WhitenedAxis) -> list[Effect]:
-    """Return effects that follow the temperature: linearly, quadratically or with a delay."""
+    """Return linear, quadratic and delayed temperature effects."""
     temperature_c = whitened.axis.temperature_c
     if temperature_c is None or np.ptp(temperature_c) == 0.0:
         return []
@@ -252,18 +248,18 @@ def propose_temperature_effects(whitened: WhitenedAxis) -> list[Effect]:
 
 
 def _best_time_constant(
-    whitened: WhitenedAxis, trials: Sequence[TurnOnTransient | TemperatureLag], reach: float, shortest_s: float
+    whitened: WhitenedAxis, trials: Sequence[TurnOnTransient | TemperatureLag], search_factor: float, shortest_s: float
 ) -> list[Effect]:
-    """Return the best effect with a refined time constant, or nothing if the time constant is out of range."""
+    """Return the best effect with a fitted time constant. The list is empty if the time constant is out of range."""
     best = _most_likely(whitened.axis, whitened.effects, trials)
-    refined = refine_shape(whitened.axis, (*whitened.effects, best), -1, ["time_constant"], reach)[-1]
+    refined = refine_shape(whitened.axis, whitened.effects, best, "time_constant", search_factor)
     assert isinstance(refined, (TurnOnTransient, TemperatureLag))
     longest_s = MAX_TIME_CONSTANT_FRACTION * whitened.axis.length_s
     return [refined] if shortest_s < refined.time_constant <= longest_s else []
 
 
 def propose_leaks(whitened: WhitenedAxis) -> list[Effect]:
-    """Return leaks from the other axes."""
+    """Return a leak from each axis that the hypothesis does not already contain as a source."""
     known = {getattr(effect, "source", None) for effect in whitened.effects}
     found: list[Effect] = []
     for source in whitened.axis.leak_sources:
@@ -287,14 +283,14 @@ DETERMINISTIC_CANDIDATES: Final[tuple[CandidateFunction, ...]] = (
     propose_temperature_effects,
     propose_leaks,
 )
-"""Functions that propose effects that follow time, temperature or another axis."""
+"""Functions that propose effects that depend on time, temperature or another axis."""
 
 
 def _most_likely(axis: Axis, effects: Effects, trials: Sequence[Effect]) -> Effect:
-    """Return the effect with the largest likelihood, with all sizes free."""
+    """Return the effect with the largest likelihood when all sizes are fitted."""
     return max(trials, key=lambda one: axis.fit((*effects, one)).log_likelihood)
 
 
 def initial_size(axis: Axis) -> float:
-    """Return a starting size that is small compared with the standard deviation of the samples."""
+    """Return a starting value for a size, which is small compared with the standard deviation of the samples."""
     return 1e-3 * axis.rms

@@ -1,10 +1,10 @@
 """Cross-validation of a new effect on the two halves of a recording.
 
-The effect is fitted to one half of the recording, including all sizes. The other half is tested with the diagnostic
-that found the difference, once with the model before the step and once with the model after the step. Then the halves
-are exchanged. The effect is kept if the difference decreases and the likelihood of the unseen half increases. Some
-effects cannot be validated, because they happen once or because one half would gain less than ``MIN_HALF_GAIN_NATS``.
-These effects are kept, and the reason is reported.
+The hypotheses before and after the step are fitted to one half of the recording. Both fits are then tested on the other
+half with the diagnostic that detected the difference. The test is repeated with the halves exchanged. The effect is
+kept if the gap decreases and the likelihood of the test halves increases. An effect that happens once cannot be
+validated. An effect with an expected gain below ``MIN_HALF_GAIN_NATS`` in one half cannot be validated either. These
+effects are kept, and the reason is reported.
 """
 
 from collections.abc import Collection
@@ -27,11 +27,10 @@ from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequenc
 from monitor.reconcile.search.axis_repair import measure_value_statistics, repair_axis_again
 
 MIN_HALF_GAIN_NATS: Final = 5.0
-"""Smallest gain in nats that one half must be able to provide."""
+"""Smallest gain in nats of an effect in one half of the recording."""
 SAMPLE_EFFECTS: Final = (Resolution, Saturation, RandomSampleHold, Outliers)
-"""Effects that are visible in single samples and not in the spectrum."""
+"""Effects that alter single samples."""
 TOO_LITTLE_EVIDENCE: Final = "one half of the recording alone contains too little evidence for the effect"
-"""Reason why a weak effect is not validated."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +40,11 @@ class CrossValidation:
     before: float  # gap without the step, standard deviations
     after: float  # gap with the step, standard deviations
     kept: bool
-    reason: str  # why no validation was possible; the gaps are then NaN and the step is kept
+    reason: str  # reason why the step was not validated, or empty; without validation, the gaps are NaN
 
 
 def not_validated(reason: str) -> CrossValidation:
-    """Return the result for a step that cannot be validated, with the reason."""
+    """Return the result for a step that cannot be validated and is kept."""
     return CrossValidation(float("nan"), float("nan"), True, reason)
 
 
@@ -62,14 +61,14 @@ def cross_validate(
     Parameters
     ----------
     before, after : Hypothesis
-        Effects before and after the step, fitted to the whole axis. The axis of ``after`` is repaired for the effects
-        in ``after``.
+        Effects before and after the step, fitted to the whole axis. The axis of ``after`` is repaired with the effects
+        of ``after``.
     added : Effect or None
-        Effect that was added. None means that only sizes of known noise effects were changed.
+        Effect that was added, or None if only sizes of the model were changed.
     lens : str
-        Name of the diagnostic that found the difference.
+        Name of the diagnostic that detected the difference.
     null : NullDistribution
-        Null distribution of this diagnostic.
+        Null distribution of the diagnostic.
     rng : numpy.random.Generator
         Generator for the replacement samples.
     """
@@ -93,19 +92,19 @@ def cross_validate(
 
 
 def _fit_half(half: Axis, hypothesis: Hypothesis) -> AxisFit:
-    """Fit the effects of a hypothesis to one half of the axis."""
+    """Fit the effects of a hypothesis to one half. Sizes that are fixed in the hypothesis stay fixed."""
     return half.fit(hypothesis.effects, hypothesis.fit.fixed_noise)
 
 
 def _summed_gap(halves: list[Axis], hypothesis: Hypothesis, lens: str) -> float:
-    """Return the gap of a diagnostic in both halves together, each with its own fit."""
+    """Return the combined gap of a diagnostic in both halves. The hypothesis is fitted to each half separately."""
     return sqrt(sum(DIAGNOSTICS[lens](whiten_axis(_fit_half(half, hypothesis))).gain for half in halves))
 
 
 def _exchange_halves(
     halves: list[Axis], before: Hypothesis, after: Hypothesis, lens: str, null: NullDistribution
 ) -> CrossValidation:
-    """Fit each half, with and without the step, and test the other half with this fit."""
+    """Fit each half, with and without the step, and test the fit on the other half."""
     gaps = np.zeros(2)
     better = 0.0
     for learn, test in ((0, 1), (1, 0)):
@@ -119,7 +118,7 @@ def _exchange_halves(
 
 
 def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[str], rng: np.random.Generator) -> Axis:
-    """Return one half of an axis as an axis of its own."""
+    """Return one half of an axis as a new axis."""
     raw, y = axis.raw[part], axis.repaired[part]
     temperature_c = None if axis.temperature_c is None else axis.temperature_c[part]
     others = {
@@ -142,10 +141,13 @@ def _half_axis(axis: Axis, part: slice, effects: Effects, sources: Collection[st
 
 
 def _expected_gain(fit: AxisFit, effect: Effect) -> float:
-    """Return the gain in nats of a deterministic effect of a given size beside the noise of a fit: ½ Σ (β R)²/v."""
+    """Return the expected gain in nats of a deterministic effect with its present size.
+
+    The gain is ½ Σ s²/v with the transform s of the series of the effect and the variance v of the fitted noise.
+    """
     half = fit.axis
     columns = half.regressor_transforms(effect)
-    weight = half.bins.spread(half.used_bins / fit.whittle.variance)
+    weight = half.bins.expand_to_coefficients(half.used_bins / fit.whittle.variance)
     if isinstance(effect, Sinusoidal):
         return 0.5 * effect.amplitude**2 * float((columns[0] ** 2 * weight).sum())
     quadratic = getattr(effect, "quadratic", None)
@@ -154,12 +156,12 @@ def _expected_gain(fit: AxisFit, effect: Effect) -> float:
 
 
 def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
-    """Return one half of an axis with the fit of the other half.
+    """Apply the fit of one half of an axis, ``learned``, to the other half.
 
-    Noise effects keep the sizes that were learned. For deterministic effects, the learning half gives the sizes β₁ with
-    covariance C₁, and the other half alone gives β₂ with C₂. The resulting sizes are the weighted mean of both. The
-    log-likelihood is that of β₂ less the penalty for the distance Δ of the sizes, ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln |C₁ +
-    C₂|/|C₂|. The phase of a line is fitted anew.
+    Noise effects have the learned sizes. Let β₁ be the learned sizes of the deterministic effects with the covariance
+    C₁, and β₂ the sizes fitted to the other half with the covariance C₂. The result has the weighted mean of β₁ and β₂.
+    The log-likelihood is the value for β₂, less a penalty for the difference Δ = β₂ − β₁. The penalty is
+    ½ Δ'(C₁ + C₂)⁻¹Δ + ½ ln(|C₁ + C₂|/|C₂|). A line has the learned amplitude and a fitted phase.
     """
     effects = learned.effects
     free = half.fit(effects, noise_indices(effects))
@@ -167,7 +169,7 @@ def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
     known: list[int] = []
     for at, place in free.regressor_slices:
         effect = effects[at]
-        if isinstance(effect, Sinusoidal):  # the phase is fitted anew, the amplitude is kept
+        if isinstance(effect, Sinusoidal):  # keep the fitted phase and use the learned amplitude
             beta[place] *= effect.amplitude / max(float(np.hypot(*beta[place])), 1e-300)
         else:
             known += range(place.start, place.stop)
@@ -185,5 +187,5 @@ def _predict_half(half: Axis, learned: AxisFit) -> AxisFit:
 
 
 def _regularised(covariance: Floats) -> Floats:
-    """Return a covariance with a small addition to its diagonal, so that its determinant exists."""
+    """Add a small value to the diagonal of a covariance, so that the determinant is positive."""
     return covariance + np.diag(1e-9 * np.diag(covariance) + 1e-300)

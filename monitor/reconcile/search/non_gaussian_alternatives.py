@@ -1,9 +1,9 @@
 """Alternatives to Gaussian effects that have the same spectrum but another distribution.
 
 The pairs are correlated noise and random telegraph, random walk and Poisson steps, and single steps and Poisson steps.
-The search first finds the effect with a Gaussian likelihood. Here the alternative gets a full likelihood on the same
-axis, with all other effects unchanged. The alternative replaces the effect if the log-likelihood is larger by
-``MIN_ALTERNATIVE_GAIN_NATS``.
+The search adds the effect that it finds with a Gaussian likelihood. This module then computes the full likelihood of
+the effect and of the alternative, with all other effects unchanged. The alternative replaces the effect if it has a
+larger log-likelihood by ``MIN_ALTERNATIVE_GAIN_NATS``.
 """
 
 from collections.abc import Mapping
@@ -33,65 +33,64 @@ from monitor.reconcile.search.candidates import PENALTY_NATS, fit_correlated_noi
 from monitor.reconcile.search.trials import Trial
 
 MIN_ALTERNATIVE_GAIN_NATS: Final = 3.0
-"""Gain in nats that an alternative must reach. In 2 of 4000 simulated recordings, telegraph and correlated noise were
-confused in spite of a larger gain.
+"""Gain in nats that an alternative must exceed. In 2 of 4000 simulated recordings, a larger gain led to a confusion of
+telegraph and correlated noise.
 """
 POISSON_PENALTY_NATS: Final = 1.0
-"""Additional gain in nats that Poisson steps must reach. A random walk is the limit of Poisson steps and never fits
-better.
-"""
+"""Penalty in nats for Poisson steps. A random walk is a limit of Poisson steps and therefore never fits better."""
 MAX_FREE_STEPS: Final = 2
 """Number of single steps without an additional penalty."""
 STEP_PENALTY_NATS: Final = 3.0
-"""Penalty in nats for each further single step. A new effect costs more than a new step time."""
+"""Penalty in nats for each further single step, because a new effect needs more evidence than a new step time."""
 MIN_FITTED_STEPS: Final = 5
-"""Smallest limit for the number of single steps that are compared with Poisson steps."""
+"""Smallest number of single steps that the comparison with Poisson steps may fit."""
 MIN_SWITCHES: Final = 10
-"""Smallest number of switches of a telegraph that is preferred to Poisson steps. Fewer jumps may alternate in sign by
-chance.
-"""
+"""Smallest number of switches of a telegraph that replaces Poisson steps. A few jumps may alternate by chance."""
 WALK_EFFECTS: Final = (BiasStep, RateRandomWalk)
 """Effects that jump processes are compared with."""
 
 
 @dataclass(frozen=True, slots=True)
 class NonGaussianAlternative:
-    """Alternative effect with the same spectrum as an effect that was found, but another distribution."""
+    """Alternative effect with the same spectrum as an added effect and another distribution."""
 
-    added: Effects  # effects beyond the model; the alternative comes last and replaces the original effect
+    added: Effects  # added effects; the alternative is the last one and replaces the original effect
     gain: float  # log-likelihood gain over the original effect, nats
     intervals: Mapping[str, ParameterInterval]  # parameters of the alternative
     event_count: int  # number of switches or jumps
     poisson_log_likelihood: float = (
         0.0  # log-likelihood with Poisson steps: that of a random walk plus their gain over it
     )
-    runner_up: "NonGaussianAlternative | None" = None  # the alternative that this one was preferred to
+    runner_up: "NonGaussianAlternative | None" = None  # alternative that fits second best
 
-    def as_trials(self, replaced_gain_nats: float) -> tuple[Trial, ...]:
-        """Return the trials of this alternative to an effect with the given value in nats, and of the rival."""
+    def as_trials(self, replaced_score: float) -> tuple[Trial, ...]:
+        """Return the trials of this alternative and of the runner-up.
+
+        ``replaced_score`` is the score of the replaced effect in nats.
+        """
         effect = self.added[-1]
         trial = Trial(
-            effect.name, effect, replaced_gain_nats + self.gain, intervals=self.intervals, event_count=self.event_count
+            effect.name, effect, replaced_score + self.gain, intervals=self.intervals, event_count=self.event_count
         )
-        return (trial, *(self.runner_up.as_trials(replaced_gain_nats) if self.runner_up else ()))
+        return (trial, *(self.runner_up.as_trials(replaced_score) if self.runner_up else ()))
 
 
 def choose_distribution(hypothesis: Hypothesis, trials: list[Trial]) -> tuple[Hypothesis, list[Trial]]:
-    """Replace a new effect by an effect with the same spectrum if this distribution fits better.
+    """Replace a new effect by the alternative with the same spectrum, if the alternative fits better.
 
     Parameters
     ----------
     hypothesis : Hypothesis
-        Fitted effects, of which the last one is new.
+        Fitted effects. The last effect is the new one.
     trials : list of Trial
-        Trials of which the first one was selected.
+        Trials. The first trial is the selected one.
 
     Returns
     -------
     hypothesis : Hypothesis
         Fitted effects with the selected alternative.
     trials : list of Trial
-        Trials with the alternatives included.
+        Trials including the alternatives.
     """
     alternative, new = None, trials[0].effect
     if isinstance(new, ExponentiallyCorrelated) and isinstance(hypothesis.effects[-1], ExponentiallyCorrelated):
@@ -107,14 +106,14 @@ def choose_distribution(hypothesis: Hypothesis, trials: list[Trial]) -> tuple[Hy
 
 
 def compare_jump_processes(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
-    """Return Poisson steps as alternative to a random walk or single steps, or a slow telegraph if it fits better.
+    """Return the better of Poisson steps and a slow telegraph as an alternative to a random walk or single steps.
 
-    The result is None if the axis has no random walk and no steps that Poisson steps could replace.
+    The result is None if the hypothesis contains neither single steps nor a changed random walk.
     """
     steps = fit_poisson_alternative(hypothesis)
     if steps is None or steps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return steps
-    # Use the original random walk of the model. An increased random walk would leave nothing for a telegraph.
+    # a random walk with the fitted size would contain the power of a telegraph
     bare, fixed_noise = _with_original_walks(hypothesis)
     for noise in fit_correlated_noise(hypothesis.axis, hypothesis.axis.fit(bare, fixed_noise).effects):
         other = Hypothesis(hypothesis.model, hypothesis.axis.fit((*bare, noise), fixed_noise))
@@ -131,7 +130,10 @@ def compare_jump_processes(hypothesis: Hypothesis) -> NonGaussianAlternative | N
 
 
 def _with_original_walks(hypothesis: Hypothesis) -> tuple[Effects, frozenset[int]]:
-    """Return the effects without found steps and walks, with the original walks of the model, and the fixed sizes."""
+    """Return the effects without added steps and random walks, and the indices of the noise effects with a fixed size.
+
+    Random walks of the model have the original size.
+    """
     walks = frozenset(at for at, effect in enumerate(hypothesis.model) if isinstance(effect, WALK_EFFECTS))
     known = [hypothesis.model[at] if at in walks else hypothesis.effects[at] for at in range(hypothesis.given_count)]
     fixed_noise = frozenset(
@@ -141,7 +143,7 @@ def _with_original_walks(hypothesis: Hypothesis) -> tuple[Effects, frozenset[int
 
 
 def fit_telegraph_alternative(hypothesis: Hypothesis, index: int) -> NonGaussianAlternative | None:
-    """Return a random telegraph as alternative to correlated noise.
+    """Return a random telegraph as an alternative to correlated noise.
 
     Parameters
     ----------
@@ -157,22 +159,22 @@ def fit_telegraph_alternative(hypothesis: Hypothesis, index: int) -> NonGaussian
     """
     noise = hypothesis.effects[index]
     assert isinstance(noise, ExponentiallyCorrelated)
-    rest = background_noise((*hypothesis.effects[:index], *hypothesis.effects[index + 1 :]))
-    if not rest.white > 0.0:
+    background = background_noise((*hypothesis.effects[:index], *hypothesis.effects[index + 1 :]))
+    if not background.white > 0.0:
         return None
     series, tau0_s = _residual_series(hypothesis.fit), 1.0 / hypothesis.axis.rate_hz
-    compared = compare_telegraph_with_correlated_noise(series, tau0_s, rest, noise.sigma, noise.correlation_time)
+    compared = compare_telegraph_with_correlated_noise(series, tau0_s, background, noise.sigma, noise.correlation_time)
     amplitude, dwell = (float(compared.parameters[name].value) for name in ("amplitude", "dwell_time"))
     effect = RandomTelegraph(amplitude=amplitude, dwell_time=dwell)
-    found = (*hypothesis.effects[hypothesis.given_count : index], *hypothesis.effects[index + 1 :], effect)
-    return NonGaussianAlternative(found, compared.gain, compared.parameters, compared.events)
+    added = (*hypothesis.effects[hypothesis.given_count : index], *hypothesis.effects[index + 1 :], effect)
+    return NonGaussianAlternative(added, compared.gain, compared.parameters, compared.events)
 
 
 def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | None:
-    """Return Poisson steps as alternative to single steps or to an increased random walk.
+    """Return Poisson steps as an alternative to single steps or to an increase of the random walk.
 
-    The random walk of the model keeps the original size. The steps, or the increase of the random walk, are tested. The
-    result is None if the axis has neither single steps nor an increased random walk.
+    The random walk of the model keeps the original size. The result is None if the hypothesis contains neither single
+    steps nor an increased random walk.
     """
     steps = sum(isinstance(effect, BiasStep) for effect in hypothesis.added)
     walks = [at for at, effect in enumerate(hypothesis.effects) if isinstance(effect, RateRandomWalk)]
@@ -183,29 +185,31 @@ def fit_poisson_alternative(hypothesis: Hypothesis) -> NonGaussianAlternative | 
     known = max((size(effects[at]) for at in walks if at < hypothesis.given_count), default=0.0)
     walk = hypothesis.axis.fit((*effects, RateRandomWalk(K=max(known, 1e-12))), fixed_noise)
     excess = size(walk.effects[-1])
-    rest = background_noise(without.effects)
-    if not (excess > 0.0 and rest.white > 0.0):
+    background = background_noise(without.effects)
+    if not (excess > 0.0 and background.white > 0.0):
         return None
     series, tau0_s = _residual_series(without), 1.0 / hypothesis.axis.rate_hz
-    compared = compare_poisson_with_random_walk(series, tau0_s, rest, excess)
+    compared = compare_poisson_with_random_walk(series, tau0_s, background, excess)
     gain, whole = compared.gain, walk.log_likelihood + compared.gain
     if steps:
-        compared = compare_poisson_with_single_steps(series, tau0_s, rest, excess, most=max(steps, MIN_FITTED_STEPS))
+        compared = compare_poisson_with_single_steps(
+            series, tau0_s, background, excess, max_single_steps=max(steps, MIN_FITTED_STEPS)
+        )
         gain = compared.gain + STEP_PENALTY_NATS * max(compared.single_steps - MAX_FREE_STEPS, 0)
     rate, height = (float(compared.parameters[name].value) for name in ("rate", "height"))
-    found = (*effects[hypothesis.given_count :], PoissonSteps(rate=rate, height=height))
+    added = (*effects[hypothesis.given_count :], PoissonSteps(rate=rate, height=height))
     return NonGaussianAlternative(
-        found, gain - POISSON_PENALTY_NATS, compared.parameters, compared.events, poisson_log_likelihood=whole
+        added, gain - POISSON_PENALTY_NATS, compared.parameters, compared.events, poisson_log_likelihood=whole
     )
 
 
 def _residual_series(fit: AxisFit) -> Floats:
-    """Return the series, shape (n,), with all fitted deterministic effects removed."""
+    """Return the series, shape (n,), less all fitted deterministic effects."""
     return inverse_cosine_transform(fit.residual_coefficients())
 
 
 def background_noise(effects: Effects) -> BackgroundNoise:
-    """Return the noise of an axis as the likelihood ratios use it."""
+    """Return the noise of all given effects as a ``BackgroundNoise``."""
     white = walk = flicker = 0.0
     correlated: list[tuple[float, float]] = []
     for effect in effects:

@@ -1,8 +1,8 @@
 """Detection of a true sample rate that differs from the stated sample rate of a recording.
 
-A wrong sample rate shifts all frequencies on all axes by one ratio. The error is detectable if the model has a feature
-at a known frequency, such as a line or a resonance. The feature is then missing at the stated frequency and appears at
-another frequency. Without such a feature, a wrong sample rate cannot be distinguished from a wrong N.
+A wrong sample rate multiplies all frequencies on all axes by the same ratio. The error can be detected if the model
+contains a **feature**, which is a line or a resonance. The recording then shows the feature at a frequency that differs
+from the frequency in the model. Without a feature, a wrong sample rate cannot be distinguished from a wrong N.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,20 +24,16 @@ from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidates import find_spectral_peaks
 
 MAX_LOG_RATIO: Final = 0.15
-"""Largest absolute logarithm of the ratio. A larger error means that the recording is from another sensor."""
+"""Largest absolute logarithm of the ratio. A larger ratio indicates a recording of another sensor."""
 MIN_OTHER_GAIN_NATS: Final = 6.0
-"""Log-likelihood gain in nats that the other features and the noise of all axes must reach without the strongest
-feature. The same number is the largest loss of a single feature. A feature that loses more has stayed at the stated
-frequency.
+"""Smallest log-likelihood gain in nats of the other features and the noise, without the strongest feature. The value is
+also the largest loss of a single feature, because a feature with a larger loss is still at the stated frequency.
 """
 SAME_FEATURE_RATIO: Final = 1.01
 """Largest ratio of two frequencies, on any axes, that belong to the same feature."""
 MAX_TRIAL_RATIOS: Final = 12
-"""Number of ratios at which all axes are fitted."""
 SAMPLE_RATE_PENALTY_NATS: Final = 12.0
-"""Penalty in nats for the ratio and for the choice of features."""
 SEARCH_ITERATIONS: Final = 18
-"""Number of iterations of the search for the best ratio."""
 RATIO_EXPONENTS: Final[Mapping[str, float]] = {
     "Q": 1.0,
     "N": 0.5,
@@ -52,12 +48,12 @@ RATIO_EXPONENTS: Final[Mapping[str, float]] = {
     "time": 1.0,
     "rate": -1.0,
 }
-"""For each parameter, the power of r = (true rate / stated rate) that converts the parameter to stated time.
+"""For each parameter, the exponent of r that converts the parameter from true time to stated time.
 
-A spectral density S(f) becomes r S(rf), and a time τ becomes τ/r.
+r is the true rate over the stated rate. A spectral density S(f) in true time is r S(rf) in stated time.
 """
 Feature = Sinusoidal | Narrowband
-"""Effect with a known frequency."""
+"""Effect at a known frequency."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,12 +67,12 @@ class SampleRateErrorEstimate:
 
 
 def convert_to_stated_time(effect: Effect, ratio: float) -> Effect:
-    """Return the effect as it appears in a recording whose stated sample rate is 1/ratio of the true rate.
+    """Return the effect as it appears in a recording with a wrong sample rate.
 
     Parameters
     ----------
     effect : Effect
-        Effect in true time.
+        Effect with parameters in true time.
     ratio : float
         True rate over stated rate.
 
@@ -101,14 +97,14 @@ def detect_sample_rate_error(
     Parameters
     ----------
     axes : mapping of str to Axis
-        Prepared axes of the recording.
+        Repaired axes of the recording.
     effects : mapping of str to tuple of Effect
         Effects of each axis in the model under test.
 
     Returns
     -------
     SampleRateErrorEstimate or None
-        The ratio at which all axes together fit best, or None if the gain does not exceed the penalty.
+        The ratio with the largest likelihood of all axes, or None if there is no significant error.
     """
     trials = _candidate_ratios(axes, effects)
     if not trials:
@@ -141,7 +137,7 @@ def detect_sample_rate_error(
 
 
 def _log_likelihood(axis: Axis, effects: Effects) -> float:
-    """Return the log-likelihood of effects with the given noise sizes."""
+    """Return the log-likelihood of effects with fixed sizes of the noise effects."""
     return fit_with_fixed_noise(axis, effects).fit.log_likelihood
 
 
@@ -153,7 +149,7 @@ def _features(effects: Effects) -> list[Feature]:
 def _gain_per_feature(
     axes: Mapping[str, Axis], effects: Mapping[str, Effects], before: Mapping[str, float], ratio: float
 ) -> list[float]:
-    """Return the gain in nats of each feature when only this feature is moved by the ratio."""
+    """Return the gain in nats of each feature if only the frequency of this feature is changed by the ratio."""
     groups: list[list[float]] = []
     for f_hz in sorted({feature.frequency for of in effects.values() for feature in _features(of)}):
         if groups and f_hz < groups[-1][-1] * SAME_FEATURE_RATIO:
@@ -172,7 +168,7 @@ def _gain_per_feature(
 
 
 def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) -> list[tuple[float, float]]:
-    """Return the ratios that move features of the model to observed peaks, each with half the width to search."""
+    """Return the ratios of features of the model to observed peaks, each with half the width of the search range."""
     features = {name: _features(of) for name, of in effects.items()}
     if not any(features.values()):
         return []
@@ -192,7 +188,7 @@ def _candidate_ratios(axes: Mapping[str, Axis], effects: Mapping[str, Effects]) 
 
 
 def _line_power(whitened: WhitenedAxis, features: list[Feature], factors: Floats) -> Floats:
-    """Return the summed power of all lines if their frequencies are multiplied by each of the given factors."""
+    """Return, for each factor, the total power at the frequencies of all lines times the factor."""
     power = np.zeros(factors.size)
     spectrum = periodogram(whitened.series)
     spacing_hz = whitened.axis.rate_hz / (2 * (spectrum.size - 1))
@@ -204,7 +200,7 @@ def _line_power(whitened: WhitenedAxis, features: list[Feature], factors: Floats
 
 
 def _resonance_ratios(whitened: WhitenedAxis, features: list[Feature]) -> list[tuple[float, float]]:
-    """Return the ratios that move resonances to observed peaks, each with half the width to search."""
+    """Return the ratios of resonances to observed peaks, each with half the width of the search range."""
     return [
         (feature.frequency / peak_hz, 2.0 * feature.bandwidth / feature.frequency)
         for feature in features
@@ -215,7 +211,7 @@ def _resonance_ratios(whitened: WhitenedAxis, features: list[Feature]) -> list[t
 
 
 def _interval_end(gain: Callable[[float], float], x: float, top: float, step: float) -> float:
-    """Return the point on one side of the maximum at which the gain has fallen by ``HALF_CHI2_95``."""
+    """Return the position beside the maximum at ``x`` at which the gain is ``HALF_CHI2_95`` below the maximum."""
     near, far = x, x + step
     for _ in range(12):
         if top - gain(far) > HALF_CHI2_95:

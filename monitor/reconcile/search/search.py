@@ -1,10 +1,10 @@
 """Search for missing effects on one axis, by forward selection.
 
-In each round the axis is whitened by the current model, and all diagnostics are run. If no diagnostic passes its
-threshold, the search ends. Otherwise the candidates of ``trials`` are tried, one kind after the other. The first
-candidate that exceeds its penalty and passes cross-validation is added. Effects from earlier rounds that no longer
-contribute are dropped. When spectrum and level agree, effects with the same spectrum are distinguished by their
-distribution. At the end, effects that fail a consistency check are withdrawn.
+In each round, the axis is whitened by the current hypothesis, and all diagnostics are run. If no diagnostic exceeds
+its threshold, the search ends. Otherwise, ``trials`` yields groups of candidates. The search adds the first candidate
+whose gain exceeds its penalty and that passes cross-validation. Effects of earlier rounds that no longer contribute are
+dropped. If the samples are Gaussian and stationary, the likelihood decides between effects that have the same spectrum
+and different distributions. At the end, effects that fail a consistency check are withdrawn.
 """
 
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, 
 from monitor.reconcile.diagnostics.plot_data import plot_data
 from monitor.reconcile.likelihood.axis import Axis, Effects
 from monitor.reconcile.likelihood.effect_terms import (
-    NATURAL_DIAGNOSTIC,
+    MOST_DIRECT_DIAGNOSTIC,
     NOISE_SIZE_PARAMETERS,
     ONE_TIME_EFFECTS,
     SIZE_PARAMETERS,
@@ -41,11 +41,10 @@ from monitor.reconcile.search.trials import UNNAMED, Trial, alternatives_to_resi
 from monitor.reconcile.search.withdrawal import SMOOTH_SPECTRA, keep_supported_effects
 
 MAX_ROUNDS: Final = 8
-"""Largest number of rounds."""
 MAX_VALIDATION_ATTEMPTS: Final = 3
-"""Number of candidates of one kind that may fail cross-validation before the next kind is tried."""
+"""Number of candidates of one group that may fail cross-validation before the next group is tried."""
 MIN_FINER_BINS: Final = 8
-"""Number of additional bins from which finer bins are worth a new fit."""
+"""Number of additional bins above which the fit is repeated with finer bins."""
 REPAIRED_EFFECTS: Final = frozenset({Saturation, RandomSampleHold, Outliers})
 """Effects after which the samples are repaired again."""
 DISTRIBUTION_DIAGNOSTICS: Final = ("tails", "variance")
@@ -53,34 +52,44 @@ DISTRIBUTION_DIAGNOSTICS: Final = ("tails", "variance")
 
 
 @dataclass(frozen=True, slots=True)
-class SearchRound:
-    """Result of one round of the search."""
+class AxisDiagnostics:
+    """Findings and plots of an axis that is whitened by the effects of one hypothesis."""
 
-    plots: tuple[PlotData, ...]  # before the round
-    findings: Findings  # before the round
-    trials: tuple[Trial, ...]  # the first was selected; the others follow, best first
+    findings: Findings
+    plots: tuple[PlotData, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class SearchRound:
+    """Round of the search that added an effect or changed sizes of the model."""
+
+    before: AxisDiagnostics
+    trials: tuple[Trial, ...]  # the selected trial, then the other trials in descending order of the score
     hypothesis: Hypothesis  # after the round
     validation: CrossValidation
 
 
 @dataclass(frozen=True, slots=True)
 class AxisSearchResult:
-    """Result of all rounds on one axis."""
+    """Rounds and final hypothesis of the search on one axis."""
 
     rounds: tuple[SearchRound, ...]
     hypothesis: Hypothesis
-    plots: tuple[PlotData, ...]  # at the end
-    findings: Findings  # at the end
-    before: tuple[tuple[PlotData, ...], Findings] | None  # hypothesis before effects were withdrawn; None if none were
+    final: AxisDiagnostics
+    before_withdrawal: AxisDiagnostics | None  # None if no effect was withdrawn
 
 
 @dataclass(frozen=True, slots=True)
 class _DiagnosedHypothesis:
-    """Fitted effects of an axis, and what the diagnostics find in the axis whitened by these effects."""
+    """Hypothesis about an axis, with the whitened axis and the findings of the diagnostics."""
 
     hypothesis: Hypothesis
     whitened: WhitenedAxis
     findings: Findings
+
+    def diagnostics(self) -> AxisDiagnostics:
+        """Return the findings and the plots."""
+        return AxisDiagnostics(self.findings, plot_data(self.whitened))
 
 
 def search_axis(axis: Axis, model: Effects, null: AxisNull, rng: np.random.Generator) -> AxisSearchResult:
@@ -89,32 +98,32 @@ def search_axis(axis: Axis, model: Effects, null: AxisNull, rng: np.random.Gener
     Parameters
     ----------
     axis : Axis
-        Axis, prepared with the model.
+        Axis, repaired with the effects of the model.
     model : tuple of Effect
         Effects of the axis in the model under test.
     null : AxisNull
         Null distribution of each diagnostic.
     rng : numpy.random.Generator
-        Generator for the replacement of samples that are found to be wrong.
+        Generator for the samples that replace outliers, repeats and clipped samples.
     """
-    current = _examine(fit_with_fixed_noise(axis, model))
+    current = _diagnose(fit_with_fixed_noise(axis, model))
     rounds: list[SearchRound] = []
     while len(rounds) < MAX_ROUNDS:
         current, done = _next_round(current, bool(rounds), null, rng)
         if done is None:
             break
         rounds.append(done)
-        current = _examine(done.hypothesis)
+        current = _diagnose(done.hypothesis)
     kept = keep_supported_effects(current.hypothesis.added, _gains_by_type(rounds), current.findings, null)
-    kept, before = _without_zero_sizes(kept), None
+    kept, before_withdrawal = _without_zero_sizes(kept), None
     while kept != current.hypothesis.added:
-        before = before or (plot_data(current.whitened), current.findings)
-        current = _examine(current.hypothesis.refit_with_added_effects(kept))
+        before_withdrawal = before_withdrawal or current.diagnostics()
+        current = _diagnose(current.hypothesis.refit_with_added_effects(kept))
         kept = _without_zero_sizes(current.hypothesis.added)
-    return AxisSearchResult(tuple(rounds), current.hypothesis, plot_data(current.whitened), current.findings, before)
+    return AxisSearchResult(tuple(rounds), current.hypothesis, current.diagnostics(), before_withdrawal)
 
 
-def _examine(hypothesis: Hypothesis) -> _DiagnosedHypothesis:
+def _diagnose(hypothesis: Hypothesis) -> _DiagnosedHypothesis:
     """Whiten an axis by the fitted effects and run all diagnostics."""
     whitened = whiten_axis(hypothesis.fit)
     return _DiagnosedHypothesis(hypothesis, whitened, run_diagnostics(whitened))
@@ -123,9 +132,10 @@ def _examine(hypothesis: Hypothesis) -> _DiagnosedHypothesis:
 def _next_round(
     current: _DiagnosedHypothesis, later: bool, null: AxisNull, rng: np.random.Generator
 ) -> tuple[_DiagnosedHypothesis, SearchRound | None]:
-    """Return the examination, with finer bins if necessary, and the next round, or None if the search ends.
+    """Run one round of the search. ``later`` is True if this is not the first round.
 
-    ``later`` is True if there were rounds before.
+    Return the hypothesis before the round, with finer bins if there are narrow peaks, and the round. The round is None
+    if the search ends.
     """
     hypothesis, whitened = current.hypothesis, current.whitened
     agrees = not any(one.gain > null[lens].threshold for lens, one in current.findings.items())
@@ -143,17 +153,17 @@ def _next_round(
 
 
 def _replace_random_walk(current: _DiagnosedHypothesis) -> SearchRound | None:
-    """Return the round that replaces a random walk or single steps by a jump process, or None if that fits worse."""
+    """Replace a random walk or single steps by a jump process. Return None if the jump process does not fit better."""
     jumps = compare_jump_processes(current.hypothesis)
     if jumps is None or jumps.gain <= MIN_ALTERNATIVE_GAIN_NATS:
         return None
     validation = not_validated("the replaced effect has the same spectrum and was validated")
     hypothesis = current.hypothesis.refit_with_added_effects(jumps.added)
-    return SearchRound(plot_data(current.whitened), current.findings, jumps.as_trials(0.0), hypothesis, validation)
+    return SearchRound(current.diagnostics(), jumps.as_trials(0.0), hypothesis, validation)
 
 
 def _with_finer_bins(current: _DiagnosedHypothesis) -> _DiagnosedHypothesis:
-    """Return the examination with finer bins around narrow peaks, if there are any. The findings stay the same."""
+    """Return the hypothesis, fitted with finer bins around narrow peaks, and the same findings."""
     axis, hypothesis = current.hypothesis.axis, current.hypothesis
     finer = frequency_bins(axis.n, axis.rate_hz, find_spectral_peaks(current.whitened))
     if finer.count.size <= axis.bins.count.size + MIN_FINER_BINS:
@@ -167,13 +177,13 @@ def _with_finer_bins(current: _DiagnosedHypothesis) -> _DiagnosedHypothesis:
 def _select_trial(
     current: _DiagnosedHypothesis, trials: list[Trial], null: AxisNull, rng: np.random.Generator
 ) -> SearchRound | None:
-    """Return the round with the best trial of one kind that passes cross-validation, or None."""
+    """Return the round that adds the effect of the first trial that passes all tests, or None if no trial passes."""
     findings = current.findings
     strongest = max(findings, key=lambda name: findings[name].gain - null[name].threshold)
     for at, trial in enumerate(trials[:MAX_VALIDATION_ATTEMPTS]):
         if trial.score <= 0.0 or trial.name == UNNAMED:
             return None
-        lens = NATURAL_DIAGNOSTIC.get(trial.name, strongest)
+        lens = MOST_DIRECT_DIAGNOSTIC.get(trial.name, strongest)
         after = _add_effect(current.hypothesis, trial, rng)
         added = None if trial.effect is None else after.added[-1]
         if added is not None and _has_zero_size(added):
@@ -186,29 +196,26 @@ def _select_trial(
             after, tried = choose_distribution(after, tried)
         validation = cross_validate(current.hypothesis, after, added, lens, null[lens], rng)
         if validation.kept:
-            return SearchRound(plot_data(current.whitened), findings, tuple(tried), after, validation)
+            return SearchRound(current.diagnostics(), tuple(tried), after, validation)
     return None
 
 
 def _add_effect(hypothesis: Hypothesis, trial: Trial, rng: np.random.Generator) -> Hypothesis:
-    """Return the hypothesis with the effect of a trial, fitted to samples that are repaired for this effect."""
-    found = hypothesis.added if trial.effect is None else (*hypothesis.added, trial.effect)
+    """Return the hypothesis with the effect of a trial. If the effect alters samples, repair the axis again first."""
+    added = hypothesis.added if trial.effect is None else (*hypothesis.added, trial.effect)
     axis = hypothesis.axis
     if type(trial.effect) in REPAIRED_EFFECTS:
-        axis = repair_axis_again(axis, (*hypothesis.model, *found), rng)
-    return drop_unneeded_effects(fit_with_fewest_changes(axis, found, hypothesis.model))
+        axis = repair_axis_again(axis, (*hypothesis.model, *added), rng)
+    return drop_unneeded_effects(fit_with_fewest_changes(axis, added, hypothesis.model))
 
 
 def _is_gaussian_and_stationary(whitened: WhitenedAxis, null: AxisNull) -> bool:
-    """Return True if the samples are Gaussian and stationary.
-
-    Otherwise, effects that differ only in their distribution cannot be distinguished.
-    """
+    """Return True if no diagnostic shows that the samples are not Gaussian or not stationary."""
     return all(DIAGNOSTICS[lens](whitened).gain <= null[lens].threshold for lens in DISTRIBUTION_DIAGNOSTICS)
 
 
 def drop_unneeded_effects(hypothesis: Hypothesis) -> Hypothesis:
-    """Return the hypothesis without effects that no longer contribute. The last effect is never dropped."""
+    """Return the hypothesis without the added effects that no longer contribute. The last effect is always kept."""
     for at in range(len(hypothesis.added) - 2, -1, -1):
         effect = hypothesis.added[at]
         if type(effect) not in SIZE_PARAMETERS:
@@ -220,25 +227,25 @@ def drop_unneeded_effects(hypothesis: Hypothesis) -> Hypothesis:
 
 
 def _gains_by_type(rounds: list[SearchRound]) -> dict[type[Effect], float]:
-    """Return, for each type of effect, the largest gain of a diagnostic when an effect of this type was selected.
+    """Return, for each type of added effect, the largest gain of a diagnostic before such an effect was added.
 
-    For leaks, steps and smooth spectra, only their natural diagnostic counts.
+    For leaks, steps and smooth spectra, only the most direct diagnostic is used.
     """
     found: dict[type[Effect], float] = {}
     for one in rounds:
         if one.hypothesis.added:
             kind = type(one.hypothesis.added[-1])
-            natural_only = issubclass(kind, (Leak, BiasStep, *SMOOTH_SPECTRA))
-            lenses = (NATURAL_DIAGNOSTIC[kind.name],) if natural_only else tuple(one.findings)
-            found[kind] = max(found.get(kind, 0.0), *(one.findings[lens].gain for lens in lenses))
+            most_direct_only = issubclass(kind, (Leak, BiasStep, *SMOOTH_SPECTRA))
+            lenses = (MOST_DIRECT_DIAGNOSTIC[kind.name],) if most_direct_only else tuple(one.before.findings)
+            found[kind] = max(found.get(kind, 0.0), *(one.before.findings[lens].gain for lens in lenses))
     return found
 
 
 def _without_zero_sizes(effects: Effects) -> Effects:
-    """Return the effects without noise effects that the fit gave the size zero."""
+    """Return the effects without the noise effects that have the fitted size zero."""
     return tuple(effect for effect in effects if not _has_zero_size(effect))
 
 
 def _has_zero_size(effect: Effect) -> bool:
-    """Return True if the fit gave a noise effect the size zero."""
+    """Return True for a noise effect with the size zero."""
     return type(effect) in NOISE_SIZE_PARAMETERS and size(effect) == 0.0

@@ -1,13 +1,17 @@
-"""Trials of candidate effects, each added alone and fitted together with all other effects.
+"""Trials of candidate effects: each candidate is added to a hypothesis and fitted together with the other effects.
 
-- **Trials of values and single samples** come first, because their evidence is either certain or absent.
-- **Deterministic effects** come before noise effects. Otherwise a noise effect would absorb a drift, and later fits
-  would not correct this. A deterministic effect must exceed its penalty even if a slow noise that could replace the
-  effect is present before and after. This noise is a random walk, a correlated noise or a power law.
-- **Noise effects** are ordered by their score. The score is the gain in ln L, less the penalty of the effect and the
-  penalty for changed sizes of known noise effects.
-- **Unnamed alternatives** are a power law with any exponent among the noise effects, and a curved drift among the
-  deterministic effects. If an unnamed alternative is the best, no known effect is right.
+The **score** of a trial is the gain in log-likelihood, less the penalty of the effect and the penalties for changed
+sizes of the model. ``trial_groups`` yields the trials in groups:
+
+1. Quantization, clipping and repeated samples come first, then outliers and a step of the noise. The evidence for these
+   effects is either strong or absent.
+2. Deterministic effects usually come before noise effects, because an added noise effect would absorb a drift
+   permanently. Slow noise can resemble a deterministic effect. The score is therefore the gain over the best slow
+   noise: a random walk, a correlated noise or a power law.
+3. Noise effects and a common factor for all noise effects of the model follow.
+
+Two alternatives have no name. A power law with any exponent competes with the noise effects, and a curved drift with
+the deterministic effects. If such an alternative has the largest score, no effect is added.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +21,6 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtrc
 
-from drivers.sample import Floats
 from monitor.noise.effect import Effect, Leak
 from monitor.noise.effects import (
     AngleRandomWalk,
@@ -31,10 +34,9 @@ from monitor.noise.effects import (
     Saturation,
     ScaleFactor,
 )
-from monitor.reconcile.diagnostics.diagnostics import STEP_MARGIN_FRACTION, least_constant_tiles
-from monitor.reconcile.likelihood.axis import Axis, Effects
+from monitor.reconcile.diagnostics.diagnostics import STEP_MARGIN_FRACTION
+from monitor.reconcile.likelihood.axis import Effects
 from monitor.reconcile.likelihood.hypothesis import (
-    RESIZE_PENALTY_NATS,
     Hypothesis,
     find_maximum_by_golden_section,
     noise_indices,
@@ -53,51 +55,49 @@ from monitor.reconcile.search.candidates import (
 UNNAMED: Final = "power_law"
 """Name of a trial that corresponds to no known effect."""
 RETUNE: Final = "retuned"
-"""Name of a trial without a new effect, in which known effects get other sizes."""
+"""Name of a trial that adds no effect and changes sizes of the model."""
 EXPONENTS: Final = (0.5, 1.5, 2.5, 3.0)
-"""Exponents of the power laws that are tried."""
 MIN_RESIZE_GAIN_NATS: Final = 1.0
-"""Smallest gain in nats of other sizes."""
 SCALE_FACTOR_MARGIN_NATS: Final = 3.0
-"""Gain in nats by which separately fitted sizes may be better than one common factor, which has fewer parameters."""
+"""Gain in nats by which separately fitted sizes may exceed a common factor, which has fewer parameters."""
 SCALE_SEARCH_ITERATIONS: Final = 16
-"""Number of iterations of the search for the best common factor."""
 FREQUENCY_BANDS: Final = 8
 """Number of frequency bands in which a leak must have the same coefficient."""
 MIN_LEAK_PROBABILITY: Final = 1e-5
-"""Smallest probability of the observed differences of a leak coefficient between frequency bands. A smaller probability
-indicates that vibration acts on both axes.
+"""Smallest probability of the differences of a leak coefficient between frequency bands. If the probability is smaller,
+vibration acts on both axes.
 """
 QUADRATIC_PENALTY_NATS: Final = 2.5
-"""Penalty in nats for a second parameter."""
 MIN_STUDENT_GAIN_NATS: Final = 2.0
 """Smallest gain in nats of outliers over Student's t."""
 MAX_OUTLIER_Z: Final = 4.0
-"""Largest z of clustering and of misfit of outliers. Samples with a larger z are not outliers."""
-RIVAL_MARGIN_NATS: Final = 1.0
-"""Gain in nats by which a step of the noise may be worse than the alternatives, which have more parameters."""
+"""Largest z value of the clustering and of the misfit of outliers."""
+ALTERNATIVE_MARGIN_NATS: Final = 1.0
+"""Gain in nats by which the alternatives to a step of the noise may exceed the step, which has fewer parameters."""
 MAX_BAND_FRACTION: Final = 0.25
-"""Largest width of a frequency band, as a fraction of the sample rate. This is half of the observed frequency range."""
+"""Largest width of a frequency band, as a fraction of the sample rate. Wider ranges count as all frequencies."""
 NOISE_PRIORITY_NATS: Final = 5.0
-"""Difference in nats from which noise effects are tried before deterministic effects."""
+"""Difference of the scores, in nats, from which noise effects are tried before deterministic effects."""
 UNNAMED_MARGIN_NATS: Final = 2.0
-"""Gain in nats by which an unnamed alternative must be better so that no effect is named."""
+"""Difference of the scores, in nats, from which an alternative without a name is preferred."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Candidate that was tried."""
+    """Candidate with its score."""
 
-    name: str
-    effect: Effect | None  # None: no known effect, or no new effect
-    score: float  # gain less penalty, nats; for a deterministic effect, together with the best slow noise
-    score_without_slow_noise: float = 0.0  # gain less penalty of a deterministic effect without such noise, nats
-    intervals: Mapping[str, ParameterInterval] = field(default_factory=dict)  # parameters that no spectrum determines
+    name: str  # name of the effect, ``UNNAMED`` or ``RETUNE``
+    effect: Effect | None  # None if no effect is added
+    score: float  # log-likelihood gain less penalties, nats; for a deterministic effect, the gain over slow noise
+    score_without_slow_noise: float = 0.0  # of a deterministic effect, nats
+    intervals: Mapping[str, ParameterInterval] = field(
+        default_factory=dict
+    )  # parameters that the fit does not determine
     event_count: int = 0  # number of events that were detected
 
 
 def trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Iterator[list[Trial]]:
-    """Yield the trials of one kind after the other, each kind with the best trial first.
+    """Yield the groups of trials, each in descending order of the score.
 
     Parameters
     ----------
@@ -107,10 +107,9 @@ def trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Iterator[lis
         Axis whitened by ``hypothesis``.
     """
     yield _value_trials(whitened)
-    yield _sample_trials(hypothesis, whitened)
+    yield _best_first(_outlier_trial(hypothesis, whitened) + _noise_step_trial(whitened))
     deterministic, noises = _deterministic_trials(hypothesis, whitened), _noise_trials(hypothesis, whitened)
-    # A noise effect that explains far more comes first, because the residuals of a wrong spectrum look like steps and
-    # slopes.
+    # with a wrong spectrum, the residuals contain apparent steps and slopes; a much better noise effect is tried first
     if deterministic and deterministic[0].score_without_slow_noise > noises[0].score - NOISE_PRIORITY_NATS:
         yield deterministic
         yield noises
@@ -120,7 +119,7 @@ def trial_groups(hypothesis: Hypothesis, whitened: WhitenedAxis) -> Iterator[lis
 
 
 def alternatives_to_resizing(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Return effects that explain the data better than changed sizes of known noise effects.
+    """Return trials of effects that explain the data better than the changed sizes of the model.
 
     Parameters
     ----------
@@ -129,22 +128,18 @@ def alternatives_to_resizing(hypothesis: Hypothesis, whitened: WhitenedAxis) -> 
     whitened : WhitenedAxis
         Axis whitened by ``hypothesis``.
     """
-    found = [
-        one
-        for one in _deterministic_trials(hypothesis, whitened)
-        if one.score_without_slow_noise > 0.0 and one.score > 0.0
-    ]
-    noises = [_noise_trial(hypothesis, effect) for effect in propose_correlated_noise(whitened)]
-    return _best_first(found + [one for one in noises if one.score > 0.0])
+    trials = [one for one in _deterministic_trials(hypothesis, whitened) if one.score_without_slow_noise > 0.0]
+    trials += [_noise_trial(hypothesis, effect) for effect in propose_correlated_noise(whitened)]
+    return _best_first([one for one in trials if one.score > 0.0])
 
 
 def _best_first(trials: Sequence[Trial]) -> list[Trial]:
-    """Return trials in the order of their values."""
+    """Return the trials in descending order of the score."""
     return sorted(trials, key=lambda one: -one.score)
 
 
 def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
-    """Return the trials of quantization, clipping and repeats."""
+    """Try quantization, clipping and repeats."""
     statistics = whitened.axis.value_statistics
     found: list[Trial] = []
     if statistics.quantization and Resolution not in whitened.types:
@@ -163,15 +158,10 @@ def _value_trials(whitened: WhitenedAxis) -> list[Trial]:
     return _best_first(found)
 
 
-def _sample_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Return the trials of outliers and of a step of the noise."""
-    return _best_first(_outlier_trial(hypothesis, whitened) + _noise_step_trial(whitened))
-
-
 def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Return the trial of outliers, or nothing if another cause of heavy tails is as likely."""
+    """Try outliers. The list is empty if another cause of heavy tails is as likely."""
     far = whitened.outliers
-    if far is None or Outliers in whitened.types or far.over_student <= MIN_STUDENT_GAIN_NATS:
+    if far is None or Outliers in whitened.types or far.gain_over_student <= MIN_STUDENT_GAIN_NATS:
         return []
     if max(far.clustering_z, far.misfit_z) >= MAX_OUTLIER_Z:
         return []
@@ -182,34 +172,31 @@ def _outlier_trial(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial
 
 
 def _noise_step_trial(whitened: WhitenedAxis) -> list[Trial]:
-    """Return the trial of a step of the noise, or nothing if another variation of the variance explains more."""
-    history, length_s = whitened.variance_changes, whitened.axis.length_s
-    step = history.step
-    margin_s = STEP_MARGIN_FRACTION * length_s
-    if (
-        AngleRandomWalk not in whitened.types
-        or not margin_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s
-    ):
+    """Try a step of the noise. The list is empty if the variance changes in another way."""
+    changes, length_s = whitened.variance_changes, whitened.axis.length_s
+    step = changes.step
+    inside = STEP_MARGIN_FRACTION * length_s < step.time.value < (1.0 - STEP_MARGIN_FRACTION) * length_s
+    if AngleRandomWalk not in whitened.types or not inside:
         return []
-    rivals = (history.trend, history.periodic, history.wander)
-    if step.gain <= max(rivals) - RIVAL_MARGIN_NATS or step.gain <= _band_burst_gain(whitened) - RIVAL_MARGIN_NATS:
+    if step.gain <= max(changes.largest_alternative_gain, _band_gain(whitened)) - ALTERNATIVE_MARGIN_NATS:
         return []
     intervals = {"time": _scaled_bounds(step.time), "ratio": _scaled_bounds(step.ratio)}
     return [_penalised_trial(NoiseStep(time=step.time.value, ratio=step.ratio.value), step.gain, intervals)]
 
 
-def _band_burst_gain(whitened: WhitenedAxis) -> float:
-    """Return the gain in nats of the least constant place of the spectrogram if it is a band, otherwise 0.
+def _band_gain(whitened: WhitenedAxis) -> float:
+    """Return the gain of the least constant tile of the spectrogram, or 0 if the tile covers most frequencies.
 
-    A change within a band is no step of the white noise.
+    A step of white noise changes all frequencies, so a change within a narrow band has another cause.
     """
-    found = least_constant_tiles(whitened)
+    found = whitened.least_constant_tiles
     return found.gain if np.ptp(found.frequency) < MAX_BAND_FRACTION * whitened.axis.rate_hz else 0.0
 
 
 def _whitened_unit(hypothesis: Hypothesis) -> float:
-    """Return the standard deviation of the axis per unit of the whitened fast series, from the upper half of the
-    bins.
+    """Return the standard deviation of the residuals in the upper half of the bins.
+
+    This value converts the whitened series to the unit of the axis.
     """
     half = hypothesis.axis.bins.count.size // 2
     count, variance = hypothesis.axis.bins.count[half:], hypothesis.fit.whittle.residual[half:]
@@ -219,30 +206,28 @@ def _whitened_unit(hypothesis: Hypothesis) -> float:
 def _penalised_trial(
     effect: Effect, gain: float, intervals: Mapping[str, ParameterInterval], event_count: int = 0
 ) -> Trial:
-    """Return a trial whose value is the gain less the penalty of the effect."""
+    """Return a trial whose score is the gain less the penalty of the effect."""
     return Trial(effect.name, effect, gain - PENALTY_NATS[effect.name], intervals=intervals, event_count=event_count)
 
 
 def _scaled_bounds(found: ValueWithInterval, unit: float = 1.0) -> ParameterInterval:
-    """Return an interval in another unit."""
+    """Return the value and the interval multiplied by ``unit``."""
     return ParameterInterval(unit * found.value, unit * found.lo, unit * found.hi)
 
 
 def _noise_trial(hypothesis: Hypothesis, effect: Effect) -> Trial:
-    """Return the trial of one noise effect."""
+    """Try one noise effect."""
     score = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).score
     return Trial(effect.name, effect, score - hypothesis.score - PENALTY_NATS[effect.name])
 
 
 def _noise_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Return the trials of noise effects by their score, including an unnamed power law."""
+    """Try noise effects, changed sizes, a common factor and a power law without a name."""
     resized = hypothesis.refit_with_added_effects(hypothesis.added)
     found = [Trial(RETUNE, None, resized.score - hypothesis.score - MIN_RESIZE_GAIN_NATS)]
     found += [_noise_trial(hypothesis, effect) for propose in NOISE_CANDIDATES for effect in propose(whitened)]
     found = _best_first([*found, _scale_factor_trial(hypothesis, resized)])
-    value = (
-        max(_power_law_score(hypothesis, exponent) for exponent in EXPONENTS) - hypothesis.score - PENALTY_NATS[UNNAMED]
-    )
+    value = max(_score_with_power_law(hypothesis, hypothesis.effects, one) for one in EXPONENTS) - hypothesis.score
     if value > max(found[0].score, 0.0) + UNNAMED_MARGIN_NATS and found[0].name in POWER_LAW_RIVALS:
         return [Trial(UNNAMED, None, value), *found]
     return found
@@ -262,7 +247,7 @@ POWER_LAW_RIVALS: Final = frozenset(
 
 
 def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> list[Trial]:
-    """Return the trials of effects that follow time, temperature or another axis."""
+    """Try effects that depend on time, temperature or another axis, and a curved drift without a name."""
     free = hypothesis.axis.fit(hypothesis.effects).log_likelihood
     proposed = [effect for propose in DETERMINISTIC_CANDIDATES for effect in propose(whitened)]
     kept = [
@@ -274,15 +259,14 @@ def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> lis
     if not kept:
         return []
     slow_noises = _slow_noise_scores(hypothesis)
-    without = max(
-        hypothesis.refit_with_added_effects(hypothesis.added).score,
-        *(score(hypothesis.effects) for score in slow_noises),
-    )
+    resized = hypothesis.refit_with_added_effects(hypothesis.added)
+    without = max(resized.score, *(score(hypothesis.effects) for score in slow_noises))
     trials = []
     for effect in kept:
         alone = hypothesis.refit_with_added_effects((*hypothesis.added, effect)).score
         gain = max(alone, *(score((*hypothesis.effects, effect)) for score in slow_noises)) - without
-        penalty = PENALTY_NATS[effect.name] + _quadratic_penalty(effect)
+        quadratic = getattr(effect, "quadratic", None) is not None
+        penalty = PENALTY_NATS[effect.name] + (QUADRATIC_PENALTY_NATS if quadratic else 0.0)
         trials.append(Trial(effect.name, effect, gain - penalty, alone - hypothesis.score - penalty))
     trials = _best_first(trials)
     curved = _curved_drift_score(hypothesis) - without
@@ -294,8 +278,9 @@ def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> lis
 def _has_flat_coefficient(whitened: WhitenedAxis, leak: Leak) -> bool:
     """Return True if one coefficient describes a leak at all frequencies.
 
-    If vibration acts on both axes, the coefficient depends on the frequency. The coefficients in ``FREQUENCY_BANDS``
-    bands of equal width have the variance 1/(Σ X²/v). Their scatter about the mean is tested with χ².
+    If vibration acts on both axes, the coefficient of the leak depends on the frequency. The coefficient is fitted in
+    ``FREQUENCY_BANDS`` bands of equal width, and a χ² test compares the results. With the transform X of the source and
+    the variance v of the axis, the variance of a coefficient is 1/Σ(X²/v).
     """
     column = whitened.axis.leak_sources[leak.source] * whitened.weights
     edges = np.linspace(0, column.size, FREQUENCY_BANDS + 1).astype(np.int64)[:-1]
@@ -306,37 +291,26 @@ def _has_flat_coefficient(whitened: WhitenedAxis, leak: Leak) -> bool:
 
 
 def _curved_drift_score(hypothesis: Hypothesis) -> float:
-    """Return the score of a curved drift without a name, less its penalty."""
-    bent = hypothesis.axis.fit(
-        (*hypothesis.effects, RateRamp(R=initial_size(hypothesis.axis))), hypothesis.fit.fixed_noise, curvature=True
-    )
-    return (
-        bent.log_likelihood
-        - RESIZE_PENALTY_NATS * hypothesis.refitted_size_count
-        - PENALTY_NATS["rate_ramp"]
-        - QUADRATIC_PENALTY_NATS
-    )
-
-
-def _quadratic_penalty(effect: Effect) -> float:
-    """Return the penalty for a second parameter of an effect."""
-    return QUADRATIC_PENALTY_NATS if getattr(effect, "quadratic", None) is not None else 0.0
+    """Return the score with an additional drift that is a quadratic function of time, less the penalty."""
+    effects = (*hypothesis.effects, RateRamp(R=initial_size(hypothesis.axis)))
+    fit = hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise, curvature=True)
+    return fit.log_likelihood - hypothesis.resize_penalty - PENALTY_NATS["rate_ramp"] - QUADRATIC_PENALTY_NATS
 
 
 def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float]]:
-    """Return functions that score effects together with each slow noise that could replace a deterministic effect.
+    """Return functions that add a slow noise to given effects and return the score.
 
-    The sizes of the model's noise effects are not changed.
+    The list contains one function for each slow noise that may resemble a deterministic effect. The sizes of the model
+    are not changed.
     """
     axis, small = hypothesis.axis, initial_size(hypothesis.axis)
-    fixed_noise, cost = hypothesis.fit.fixed_noise, RESIZE_PENALTY_NATS * hypothesis.refitted_size_count
+    fixed_noise, cost = hypothesis.fit.fixed_noise, hypothesis.resize_penalty
 
     def with_noise(noise: Effect) -> Callable[[Effects], float]:
         return lambda effects: axis.fit((*effects, noise), fixed_noise).log_likelihood - cost - PENALTY_NATS[noise.name]
 
     def with_power_law(exponent: float) -> Callable[[Effects], float]:
-        row = _power_law(axis, exponent)
-        return lambda effects: axis.fit(effects, fixed_noise, row).log_likelihood - cost - PENALTY_NATS[UNNAMED]
+        return lambda effects: _score_with_power_law(hypothesis, effects, exponent)
 
     times_s = np.geomspace(10.0 / axis.rate_hz, 0.1 * axis.length_s, 8)
     noises: list[Effect] = [ExponentiallyCorrelated(sigma=small, correlation_time=float(t)) for t in times_s]
@@ -345,22 +319,19 @@ def _slow_noise_scores(hypothesis: Hypothesis) -> list[Callable[[Effects], float
     return [*(with_noise(one) for one in noises), *(with_power_law(exponent) for exponent in EXPONENTS)]
 
 
-def _power_law_score(hypothesis: Hypothesis, exponent: float) -> float:
-    """Return the score with an additional power law."""
-    fit = hypothesis.axis.fit(hypothesis.effects, hypothesis.fit.fixed_noise, _power_law(hypothesis.axis, exponent))
-    return fit.log_likelihood - RESIZE_PENALTY_NATS * hypothesis.refitted_size_count
-
-
-def _power_law(axis: Axis, exponent: float) -> Floats:
-    """Return the variance basis, shape (1, m), of a power law."""
-    return np.asarray((axis.bins.f_hz / axis.bins.f_hz[0]) ** -exponent)[None, :]
+def _score_with_power_law(hypothesis: Hypothesis, effects: Effects, exponent: float) -> float:
+    """Return the score of the effects with an additional power-law noise."""
+    f_hz = hypothesis.axis.bins.f_hz
+    basis = np.asarray((f_hz / f_hz[0]) ** -exponent)[None, :]
+    fit = hypothesis.axis.fit(effects, hypothesis.fit.fixed_noise, basis)
+    return fit.log_likelihood - hypothesis.resize_penalty - PENALTY_NATS[UNNAMED]
 
 
 def _scale_factor_trial(hypothesis: Hypothesis, resized: Hypothesis) -> Trial:
-    """Return the trial of one common factor for all noise effects of the model.
+    """Try a common factor for all noise effects of the model.
 
-    A single wrong size is no evidence for a common factor. In this case, only the wrong size is changed. If two or more
-    sizes are wrong and one factor explains them as well, the factor is preferred.
+    If only one size of the model is wrong, changing this size has the larger score. If two or more sizes are wrong and
+    a common factor fits nearly as well as separate sizes, the factor has at least the same score.
     """
     effects, fixed_noise = (*hypothesis.model, *hypothesis.added), noise_indices(hypothesis.model)
 

@@ -1,20 +1,20 @@
-"""Withdrawal of effects that are contradicted once the search is complete.
+"""Withdrawal of added effects that the final diagnostics contradict.
 
-A line with a varying amplitude or frequency is well described by several lines or by a resonance that does not exist. A
-chirp is described by a wide resonance, and a pulse by its harmonics. Each of these effects would be reported with high
-confidence and be wrong. Effects that were found at a frequency are therefore withdrawn in these cases:
+Several lines, or a resonance, can fit a line with a varying amplitude or frequency. A wide resonance can fit a chirp,
+and a comb of lines can fit a pulse. Such an effect has a high likelihood and is wrong. A line, a resonance or a
+low-pass filter is therefore withdrawn in each of these cases:
 
 - Several lines or resonances overlap.
 - ``MIN_COMB_LINES`` or more lines are harmonics of one frequency.
-- The power at the frequency still changes in time, or still differs from the model, by more than a share of the
-  original difference.
+- The power at the frequency of the effect still changes in time or differs from the model, and the remaining gain
+  exceeds a share of the gain that the effect should explain.
 
-Leaks are withdrawn if more than half of the original dependence on other axes remains. In this case, vibration acts on
-several axes, and no coefficient is right. Single steps are withdrawn if the level continues to change. Smooth spectra
-are withdrawn if there is ``MAX_FOREIGN_RATIO`` times as much non-stationary, non-Gaussian or shared noise, because this
-noise has a spectrum too.
+A leak is withdrawn if more than half of the dependence on other axes remains. In this case, vibration acts on several
+axes, and a leak is the wrong explanation. A step is withdrawn if the level still changes. An effect with a smooth
+spectrum is withdrawn if the noise is mainly non-stationary, non-Gaussian or shared with other axes, because such noise
+also changes the spectrum.
 
-A withdrawn effect is reported as a difference without a name.
+The difference that led to a withdrawn effect is reported as unexplained.
 """
 
 from collections.abc import Mapping
@@ -28,27 +28,21 @@ from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings
 from monitor.reconcile.likelihood.axis import Effects
 
 MIN_COMB_LINES: Final = 4
-"""Smallest number of lines that form a harmonic comb."""
 MAX_HARMONIC: Final = 60
-"""Highest harmonic that is considered."""
 DIFFERENCE_DIVISORS: Final = (1, 2, 3)
-"""Divisors of the difference of two lines that are tried as fundamental frequency."""
+"""Divisors of the frequency difference of two lines. The quotients are tried as fundamental frequency."""
 HARMONIC_TOLERANCE: Final = 2e-4
 """Largest distance of a line from a multiple of the fundamental, relative to the highest line."""
 RESONANCE_REACH_HALF_WIDTHS: Final = 2.0
 """Range of a resonance to each side, in half widths. Another feature in this range overlaps with the resonance."""
 LINE_REACH_HZ: Final = 0.1
-"""Range of a line to each side, in Hz."""
 MAX_REMAINING_SHARE: Final = 0.1
-"""Largest remaining gain relative to the gain that an effect was to remove. Up to this limit, an effect is kept even if
-the shape is not exact.
-"""
+"""Largest remaining gain relative to the gain that an effect should explain. The limit allows an inexact shape."""
 MAX_REMAINING_LEAK_SHARE: Final = 0.5
-"""Largest remaining gain of a leak, relative to the gain that the leak was to remove."""
+"""Largest remaining gain relative to the gain that a leak should explain."""
 MAX_FOREIGN_RATIO: Final = 100.0
-"""Largest gain of the ``NON_SPECTRAL_DIAGNOSTICS`` relative to the gain that a smooth spectrum was to remove."""
+"""Largest gain of the ``NON_SPECTRAL_DIAGNOSTICS`` relative to the gain that a smooth spectrum should explain."""
 SMOOTH_SPECTRA: Final = (BandwidthLimit, ExponentiallyCorrelated)
-"""Effects with a smooth spectrum."""
 NON_SPECTRAL_DIAGNOSTICS: Final = ("tails", "variance", "other_axes")
 """Diagnostics of departures that no stationary Gaussian spectrum explains."""
 FREQUENCY_DIAGNOSTICS: Final = ("psd", "lines", "spectrogram")
@@ -56,18 +50,18 @@ FREQUENCY_DIAGNOSTICS: Final = ("psd", "lines", "spectrogram")
 
 
 def keep_supported_effects(
-    found: Effects, removed: Mapping[type[Effect], float], findings: Findings, null: AxisNull
+    added: Effects, explained_gains: Mapping[type[Effect], float], findings: Findings, null: AxisNull
 ) -> Effects:
-    """Return the effects that were found on an axis and pass all checks.
+    """Return the added effects that the final diagnostics do not contradict.
 
     Parameters
     ----------
-    found : tuple of Effect
-        Effects that were found.
-    removed : mapping of type to float
-        For each type of effect, the gain in nats that the effect was to remove.
+    added : tuple of Effect
+        Effects that the search added.
+    explained_gains : mapping of type to float
+        For each type of effect, the gain in nats that the effect should explain.
     findings : Findings
-        Remaining findings on the axis.
+        Findings on the axis at the end of the search.
     null : AxisNull
         Null distribution of each diagnostic.
     """
@@ -77,18 +71,22 @@ def keep_supported_effects(
         return gain if gain > null[lens].threshold else 0.0
 
     def contradicted(kinds: type[Effect] | tuple[type[Effect], ...], gain: float, share: float) -> set[int]:
-        return {at for at, e in enumerate(found) if isinstance(e, kinds) and gain > share * removed.get(type(e), 0.0)}
+        return {
+            at
+            for at, e in enumerate(added)
+            if isinstance(e, kinds) and gain > share * explained_gains.get(type(e), 0.0)
+        }
 
-    withdrawn = _overlapping_features(found) | _harmonic_comb(found)
+    withdrawn = _overlapping_features(added) | _harmonic_comb(added)
     for lens in FREQUENCY_DIAGNOSTICS:
         place = findings[lens].where.frequency
         if place is not None:
             candidates = contradicted(Effect, remaining(lens), MAX_REMAINING_SHARE)
-            withdrawn |= {at for at in candidates if _overlaps(found[at], place)}
+            withdrawn |= {at for at in candidates if _overlaps(added[at], place)}
     withdrawn |= contradicted(Leak, remaining("other_axes"), MAX_REMAINING_LEAK_SHARE)
     withdrawn |= contradicted(BiasStep, remaining("level"), MAX_REMAINING_SHARE)
     withdrawn |= contradicted(SMOOTH_SPECTRA, max(map(remaining, NON_SPECTRAL_DIAGNOSTICS)), MAX_FOREIGN_RATIO)
-    return tuple(effect for at, effect in enumerate(found) if at not in withdrawn)
+    return tuple(effect for at, effect in enumerate(added) if at not in withdrawn)
 
 
 def _frequency_range(effect: Effect) -> tuple[float, float]:
@@ -110,9 +108,9 @@ def _overlaps(effect: Effect, place: tuple[float, float]) -> bool:
     return lo < place[1] and place[0] < hi
 
 
-def _overlapping_features(found: Effects) -> set[int]:
+def _overlapping_features(added: Effects) -> set[int]:
     """Return the indices of lines and resonances that overlap each other."""
-    features = {at: effect for at, effect in enumerate(found) if isinstance(effect, (Sinusoidal, Narrowband))}
+    features = {at: effect for at, effect in enumerate(added) if isinstance(effect, (Sinusoidal, Narrowband))}
     overlapping: set[int] = set()
     for at, one in features.items():
         lo, hi = _frequency_range(one)
@@ -121,12 +119,12 @@ def _overlapping_features(found: Effects) -> set[int]:
     return overlapping
 
 
-def _harmonic_comb(found: Effects) -> set[int]:
+def _harmonic_comb(added: Effects) -> set[int]:
     """Return the indices of lines that are harmonics of one fundamental frequency.
 
     The fundamental is one of the lines, or a fraction of the difference of two lines.
     """
-    lines = {at: effect.frequency for at, effect in enumerate(found) if isinstance(effect, Sinusoidal)}
+    lines = {at: effect.frequency for at, effect in enumerate(added) if isinstance(effect, Sinusoidal)}
     f = np.array(list(lines.values()))
     if f.size < MIN_COMB_LINES:
         return set()

@@ -1,11 +1,12 @@
 """Explanation of why one recording does not show an effect that another recording of the same sensor shows.
 
-The result is the meaning of the absence and a sentence that can be checked. The gap of a steady effect grows with the
-square root of the length of the recording. The gap of a temperature effect also grows with the range of the
-temperature. If the other noise is similar, the gap in the other recording can therefore be predicted to about one
-standard deviation. If the prediction is clearly larger than the threshold of the other recording, the absence is a
-contradiction. Otherwise the data are not sensitive enough. There is no conclusion for effects that happen once, for
-leaks from another axis, and for recordings with an unnamed difference in the same diagnostic.
+The result is one of five meanings, with a sentence that states the reason. The gap of a diagnostic, in standard
+deviations, grows with the square root of the recording length if the effect is permanent. The gap of a temperature
+effect also grows with the temperature range. If the noise of both recordings is similar, the gap in the other recording
+is therefore predictable to about one standard deviation. If the expected gap is clearly larger than the threshold of
+the other recording, the absence is a contradiction. Otherwise the data are not sensitive enough. No conclusion is
+possible for an effect that happens once or for a leak from another axis. No conclusion is possible either if the other
+recording has an unexplained difference in the same diagnostic.
 """
 
 from dataclasses import dataclass
@@ -25,18 +26,16 @@ Meaning = Literal["contradiction", "too_faint", "other_name", "unnamed", "may_di
 - ``may_differ``: the recording need not contain the effect.
 """
 MIN_EXCESS_SIGMA: Final = 2.0
-"""Number of standard deviations between the expected gap and a gap that would be sufficient."""
+"""Number of standard deviations by which the expected gap must exceed the threshold for a contradiction."""
 LEAK_EFFECTS: Final = ("g_sensitivity", "cross_axis")
-"""Effects that depend on the motion of another axis."""
 TEMPERATURE_EFFECTS: Final = ("temperature_bias", "temperature_lag")
-"""Effects that depend on the temperature."""
 
 
 @dataclass(frozen=True, slots=True)
 class Absence:
-    """Recording that contains the axis but does not show the effect."""
+    """Recording that contains the axis and does not show the effect."""
 
-    run: str
+    run: str  # name of the recording
     meaning: Meaning
     because: str
 
@@ -46,13 +45,13 @@ class ClearestOccurrence:
     """Effect in the recording that shows it most clearly."""
 
     step: AddedOrResizedEffect
-    axis_result: AxisResult  # result of the axis in that recording
+    axis_result: AxisResult  # result of the axis in this recording
     gap: float  # gap that the effect itself causes, standard deviations
-    duration_s: float  # length of that recording, s
+    duration_s: float  # length of this recording
 
 
 def explain_absence(shown: ClearestOccurrence, other: Reconciliation) -> tuple[Meaning, str]:
-    """Return why a recording does not show an effect: the meaning, and a sentence that explains it.
+    """Return the meaning of the absence of an effect, with a sentence that states the reason.
 
     Parameters
     ----------
@@ -69,40 +68,40 @@ def explain_absence(shown: ClearestOccurrence, other: Reconciliation) -> tuple[M
         return "may_differ", "an effect that happens once need not happen in another recording"
     if rival := _confused_effect(step, axis_result, there):
         return "other_name", f"the difference was named {rival} there, and the two effects are hard to distinguish"
-    seen = next((score for score in there.end.gaps if score.lens == step.before.lens), None)
-    if any(score.lens == step.before.lens for score in there.left_over):
+    gap = next((gap for gap in there.end.gaps if gap.lens == step.before.lens), None)
+    if any(gap.lens == step.before.lens for gap in there.left_over):
         return "unnamed", f"the same diagnostic ({step.before.lens}) leaves a difference without a name there"
     if step.effect in LEAK_EFFECTS:
         source = step.parameters["source"].value
         if source not in other.axes:
             return "too_faint", f"the recording does not contain {source}"
         return "may_differ", f"the contribution to the axis depends on the motion of {source}"
-    if seen is None or not shown.gap > 0.0:
+    if gap is None or not shown.gap > 0.0:
         return (
             "may_differ",
             f"the diagnostic that found the effect ({step.before.lens}) does not determine a size there",
         )
-    growth = _gap_ratio(step, shown.duration_s, other.duration_s, seen)
+    growth = _gap_ratio(step, shown.duration_s, other.duration_s, gap)
     if growth is None:
         return "too_faint", "no changing temperature was recorded"
-    return _compare_expected_gap(growth * shown.gap, growth, seen, other.duration_s)
+    return _compare_expected_gap(growth * shown.gap, growth, gap, other.duration_s)
 
 
-def _compare_expected_gap(expected: float, growth: float, seen: DiagnosticGap, seconds: float) -> tuple[Meaning, str]:
-    """Return whether an expected gap should have passed the threshold, with the sentence that explains it."""
+def _compare_expected_gap(expected: float, growth: float, gap: DiagnosticGap, seconds: float) -> tuple[Meaning, str]:
+    """Compare the expected gap with the threshold, and return the meaning with a sentence."""
     said = (
         f"with the size in the other recording, {seconds:.6g} s of data would show a gap of about {expected:.1f} "
-        f"({seen.lens}), and the threshold of {seen.threshold:.1f} is not passed"
+        f"({gap.lens}), and the threshold of {gap.threshold:.1f} is not passed"
     )
-    # a gap has a standard deviation of one, and so has the gap from which the expectation is scaled
-    enough = seen.threshold + MIN_EXCESS_SIGMA * hypot(1.0, growth)
+    # both the expected gap before scaling and the observed gap have a standard deviation of one
+    enough = gap.threshold + MIN_EXCESS_SIGMA * hypot(1.0, growth)
     return ("contradiction" if expected > enough else "too_faint"), said
 
 
-def _gap_ratio(step: AddedOrResizedEffect, seconds: float, other_s: float, seen: DiagnosticGap) -> float | None:
-    """Return the expected gap of the other recording relative to the first one, for an effect of the same size.
+def _gap_ratio(step: AddedOrResizedEffect, seconds: float, other_s: float, gap: DiagnosticGap) -> float | None:
+    """Return the ratio of the expected gap in the other recording to the gap in the recording of ``step``.
 
-    The result is None if the effect cannot be visible there.
+    The result is None if the other recording contains no change of temperature.
     """
     longer = other_s / seconds
     if step.effect == "rate_ramp":
@@ -110,7 +109,7 @@ def _gap_ratio(step: AddedOrResizedEffect, seconds: float, other_s: float, seen:
         return min(sqrt(longer), longer * sqrt(longer))
     if step.effect not in TEMPERATURE_EFFECTS:
         return sqrt(longer)
-    here, there = step.before.where.temperature, seen.where.temperature
+    here, there = step.before.where.temperature, gap.where.temperature
     if there is None or not there[1] > there[0]:
         return None
     swing = 1.0 if here is None or not here[1] > here[0] else (there[1] - there[0]) / (here[1] - here[0])
@@ -118,7 +117,10 @@ def _gap_ratio(step: AddedOrResizedEffect, seconds: float, other_s: float, seen:
 
 
 def _confused_effect(step: AddedOrResizedEffect, axis_result: AxisResult, other_axis_result: AxisResult) -> str:
-    """Return an effect that only the other recording has if one of the two effects was the runner-up of the other."""
+    """Return an effect of the other recording that is hard to distinguish from the effect of ``step``, or "".
+
+    Two effects are hard to distinguish if one of them was a runner-up when the other one was added.
+    """
     mine = {one.effect for one in axis_result.steps}
     for one in other_axis_result.steps:
         rivals = step.effect in _runner_up_names(one) or one.effect in _runner_up_names(step)
@@ -128,5 +130,5 @@ def _confused_effect(step: AddedOrResizedEffect, axis_result: AxisResult, other_
 
 
 def _runner_up_names(step: AddedOrResizedEffect) -> set[str]:
-    """Return the names of the alternatives of a step."""
+    """Return the names of the runners-up."""
     return {one.effect for one in step.runners_up}

@@ -1,13 +1,13 @@
-"""Comparison of several recordings of one sensor with one model: effects that all of them show, and effects of some.
+"""Comparison of the results of several recordings of one sensor that were reconciled with the same model.
 
-The reconciliations of the recordings with the same model give a ``Comparison``. Steps of two recordings are the same
-effect if they have the same name, the same kind and matching identifying parameters (``effect_matching``). An effect is
-common if every recording with the axis shows this effect. The parameters of a common effect are pooled. Every other
-effect is single, and the absence in each other recording is explained. The sample rate error is common to all axes of a
+Two recordings show the same effect if the effects have the same name, the same kind and matching identifying parameters
+(``effect_matching``). An effect is **common** if every recording of the axis shows the effect. Every other effect is
+**single**. The parameters of an effect are pooled over the recordings that show the effect. For a single effect,
+``absence`` explains why the other recordings do not show the effect. A sample rate error belongs to all axes of a
 recording.
 
-The resulting model is the model under test with the common effects. An effect that only one recording shows is not yet
-a property of the sensor.
+The common effects are added to the model under test. Single effects are not added, because a single effect may be a
+property of one recording and not of the sensor.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +47,7 @@ from monitor.reconcile.several_recordings.pooled_parameters import (
 )
 
 NON_SIZE_PARAMETERS: Final = ("phase", "reference", "order")
-"""Parameters that are not a size: they are chosen, or have no meaning in another recording."""
+"""Parameters that are not sizes, because they are chosen or random."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,9 +64,9 @@ class MatchedEffect:
 
     effect: str
     kind: StepKind
-    steps: Mapping[str, AddedOrResizedEffect]  # recording -> its step
+    steps: Mapping[str, AddedOrResizedEffect]  # by name of the recording
     parameters: Mapping[str, PooledParameter]
-    p: float | None  # probability that sizes as different as these come from one size; None: nothing to compare
+    p: float | None  # probability of an equal or larger scatter if the size is the same in all recordings
     absent: tuple[Absence, ...] = ()
 
     @property
@@ -75,7 +75,7 @@ class MatchedEffect:
         return None if self.p is None else self.p >= MIN_AGREEMENT_PROBABILITY
 
     def pooled_step(self) -> AddedOrResizedEffect:
-        """Return the step of the first recording with the pooled parameters."""
+        """Return the effect of the first recording with the pooled parameters."""
         first = next(iter(self.steps.values()))
         return replace(first, parameters={name: one.bounds for name, one in self.parameters.items()})
 
@@ -85,7 +85,7 @@ class AxisComparison:
     """One axis in all recordings that contain it."""
 
     axis: str
-    results: Mapping[str, AxisResult]  # recording -> result of the axis
+    results: Mapping[str, AxisResult]  # by name of the recording
     common: tuple[MatchedEffect, ...]
     single: tuple[MatchedEffect, ...]
 
@@ -96,11 +96,11 @@ class Comparison:
 
     verdict: Decision
     runs: tuple[NamedResult, ...]
-    without_result: Mapping[str, str]  # recording without a result -> reason
+    without_result: Mapping[str, str]  # reason for each recording without a result
     axes: Mapping[str, AxisComparison]  # in AXES order
     baseline: NoiseModel  # the model under test
     model: NoiseModel  # with the common effects
-    fitted_to: str | None  # the recording that the five terms were fitted to; None: the model was given
+    fitted_to: str | None  # recording to which the model under test was fitted; None if the model was given
     seed: int
 
 
@@ -114,9 +114,9 @@ def compare_results(
     runs : sequence of NamedResult
         Two or more recordings with different names.
     fitted_to : str, optional
-        Recording to which the five terms of the model were fitted.
+        Recording to which the model under test was fitted.
     without_result : mapping of str to str, optional
-        Recordings without a result, with the reason.
+        Reason for each recording without a result.
     """
     baseline = runs[0].result.baseline
     axes = {axis: _compare_axis(axis, runs) for axis in AXES if any(axis in run.result.axes for run in runs)}
@@ -137,31 +137,31 @@ def _add_common_effects(
 ) -> NoiseModel:
     """Return the model under test with the common effects and their pooled parameters.
 
-    ``models`` holds the model of each recording, with all effects that were found.
+    ``models`` contains the extended model of each recording.
     """
     effects = dict(baseline.effects)
     for axis, one in axes.items():
-        for seen in one.common:
-            run, step = next(iter(seen.steps.items()))
-            made = _with_pooled_parameters(find_effect_of_step(models[run], axis, step), seen)
+        for matched in one.common:
+            run, step = next(iter(matched.steps.items()))
+            made = _with_pooled_parameters(find_effect_of_step(models[run], axis, step), matched)
             known = effects.get(axis, ())
-            if seen.kind == "added":
+            if matched.kind == "added":
                 effects[axis] = (*known, made)
             else:
-                old = find_closest_effect(known, seen.effect, parameters_of(made))
+                old = find_closest_effect(known, matched.effect, parameters_of(made))
                 effects[axis] = tuple(made if effect is old else effect for effect in known)
     return NoiseModel(effects, baseline.sample_rate_hz, baseline.temperature)
 
 
-def _with_pooled_parameters(effect: Effect, seen: MatchedEffect) -> Effect:
-    """Return the effect with the pooled value of each parameter that has an interval. The phase of a line is random."""
-    known = {name: one.bounds.value for name, one in seen.parameters.items() if one.bounds.lo is not None}
+def _with_pooled_parameters(effect: Effect, matched: MatchedEffect) -> Effect:
+    """Return the effect with the pooled values of the parameters. The phase of a line becomes random."""
+    known = {name: one.bounds.value for name, one in matched.parameters.items() if one.bounds.lo is not None}
     made: Effect = replace(effect, **known)  # type: ignore[type-var]
     return replace(made, phase=None) if isinstance(made, Sinusoidal) else made
 
 
 def _compare_axis(axis: str, runs: Sequence[NamedResult]) -> AxisComparison:
-    """Return the common and the single effects of one axis."""
+    """Match the effects of one axis between the recordings."""
     results = {run.name: run.result.axes[axis] for run in runs if axis in run.result.axes}
     groups: list[dict[str, AddedOrResizedEffect]] = []
     for run in runs:
@@ -173,7 +173,7 @@ def _compare_axis(axis: str, runs: Sequence[NamedResult]) -> AxisComparison:
 
 
 def _steps_of_axis(run: NamedResult, axis: str, runs: Sequence[NamedResult]) -> list[AddedOrResizedEffect]:
-    """Return the steps of one axis.
+    """Return the added and resized effects of one axis.
 
     A sample rate error belongs to the first axis on which any recording shows it.
     """
@@ -183,19 +183,14 @@ def _steps_of_axis(run: NamedResult, axis: str, runs: Sequence[NamedResult]) -> 
 
 
 def _sample_rate_steps(run: NamedResult) -> list[AddedOrResizedEffect]:
-    """Return the steps that correct the sample rate."""
+    """Return the sample rate errors of a recording."""
     return [step for one in run.result.axes.values() for step in one.steps if step.effect == SAMPLE_RATE_EFFECT]
 
 
 def _sample_rate_axis(runs: Sequence[NamedResult]) -> str:
     """Return the first axis on which any recording shows a sample rate error, or ""."""
-    shown = {
-        axis
-        for run in runs
-        for axis, one in run.result.axes.items()
-        if any(s.effect == SAMPLE_RATE_EFFECT for s in one.steps)
-    }
-    return next((axis for axis in AXES if axis in shown), "")
+    results = [(axis, run.result.axes.get(axis)) for axis in AXES for run in runs]
+    return next((axis for axis, one in results if one and any(s.effect == SAMPLE_RATE_EFFECT for s in one.steps)), "")
 
 
 def _add_to_group(
@@ -205,7 +200,7 @@ def _add_to_group(
     axis: str,
     runs: Sequence[NamedResult],
 ) -> None:
-    """Add a step to the closest group of the same effect in other recordings, or start a new group."""
+    """Add an effect to the group with the closest matching effect, or start a new group."""
     models = {one.name: one.result.model for one in runs}
     here = identifying_parameter(step, axis, models[run])
     best: tuple[float, dict[str, AddedOrResizedEffect]] | None = None
@@ -225,7 +220,7 @@ def _add_to_group(
 def _summarise_group(
     group: Mapping[str, AddedOrResizedEffect], axis: str, runs: Sequence[NamedResult]
 ) -> MatchedEffect:
-    """Return the effect that a group of steps describes."""
+    """Return the summary of one effect from the steps of the recordings that show the effect."""
     first = next(iter(group.values()))
     parameters = _pool_parameters(group)
     sizes = [
@@ -236,17 +231,21 @@ def _summarise_group(
     having = [run for run in runs if axis in run.result.axes or first.effect == SAMPLE_RATE_EFFECT]
     strongest = max((run for run in runs if run.name in group), key=lambda run: group[run.name].before.gap)
     step = group[strongest.name]
-    # the sample rate error may be on another axis in that recording
-    of = next(one for one in strongest.result.axes.values() if any(own is step for own in one.steps))
-    shown = ClearestOccurrence(step, of, _gap_of_effect(step, axis, strongest.result), strongest.result.duration_s)
+    # the recording may show the sample rate error on another axis
+    axis_result = next(one for one in strongest.result.axes.values() if any(own is step for own in one.steps))
+    shown = ClearestOccurrence(
+        step, axis_result, _gap_of_effect(step, axis, strongest.result), strongest.result.duration_s
+    )
+    p = agreement_probability(sizes or parameters.values())  # an effect without a size: compare all parameters
     absent = tuple(Absence(run.name, *explain_absence(shown, run.result)) for run in having if run.name not in group)
-    return MatchedEffect(first.effect, first.kind, dict(group), parameters, _size_agreement(sizes, parameters), absent)
+    return MatchedEffect(first.effect, first.kind, dict(group), parameters, p, absent)
 
 
 def _gap_of_effect(step: AddedOrResizedEffect, axis: str, result: Reconciliation) -> float:
-    """Return the gap that an effect itself causes.
+    """Return the gap that is due to an effect.
 
-    For a changed size, return the distance of the size in the model from its interval, in standard deviations.
+    For a resized effect, the result is the difference between the fitted size and the size in the model, in standard
+    deviations.
     """
     if step.kind == "added":
         return sqrt(max(step.before.gap**2 - step.after.gap**2, 0.0))
@@ -256,16 +255,8 @@ def _gap_of_effect(step: AddedOrResizedEffect, axis: str, result: Reconciliation
     return max(distance_in_sigma(one, getattr(given, name)) for name, one in step.parameters.items())
 
 
-def _size_agreement(sizes: Sequence[PooledParameter], parameters: Mapping[str, PooledParameter]) -> float | None:
-    """Return the probability that the sizes agree.
-
-    For an effect without a size, such as a bandwidth limit, all parameters are compared.
-    """
-    return agreement_probability(sizes or parameters.values())
-
-
 def _pool_parameters(group: Mapping[str, AddedOrResizedEffect]) -> dict[str, PooledParameter]:
-    """Return the pooled parameters of a group of steps."""
+    """Return the pooled parameters of the effects of several recordings."""
     steps = [_at_common_reference(step, next(iter(group.values()))) for step in group.values()]
     names = dict.fromkeys(name for step in steps for name in step.parameters if name != "phase")
     return {
@@ -274,9 +265,9 @@ def _pool_parameters(group: Mapping[str, AddedOrResizedEffect]) -> dict[str, Poo
 
 
 def _at_common_reference(step: AddedOrResizedEffect, first: AddedOrResizedEffect) -> AddedOrResizedEffect:
-    """Return a step whose quadratic temperature dependence refers to the temperature of the first recording.
+    """Convert a quadratic temperature effect to the reference temperature T₁ of the first recording.
 
-    The coefficient becomes c + 2 q (T₁ − T₀).
+    With the quadratic coefficient q, the linear coefficient c at the temperature T₀ becomes c + 2 q (T₁ − T₀).
     """
     own = step.parameters
     if "quadratic" not in own or "reference" not in first.parameters:

@@ -1,10 +1,10 @@
 """JSON report of a comparison of several recordings: schema imu-monitor/reconcile-runs/1.
 
-The same comparison always gives the same bytes. Numbers are in SI units of their axis, and a number that is not finite
-becomes null. The ``parameters`` of an effect are pooled over the recordings that show it. Each has the probability
-``p`` that values as different as these come from one value. ``consistent`` and ``p`` of the effect refer to its size.
-``each`` contains the values of the single recordings. All further results of a recording are in its own
-``report.json``, in ``folder``.
+Equal comparisons give equal bytes. Numbers are in SI units, and a number that is not finite becomes null. The
+``parameters`` of an effect are pooled over the recordings that show the effect. The entry ``p`` of a parameter is the
+probability of an equal or larger scatter if the true value is the same in all recordings. The entries ``consistent``
+and ``p`` of an effect refer to the size. ``each`` contains the values of each recording. The file ``report.json`` in
+``folder`` contains the complete result of a recording.
 """
 
 from typing import Any, Final
@@ -16,7 +16,6 @@ from monitor.reconcile.result import AddedOrResizedEffect
 from monitor.reconcile.several_recordings.comparison import AxisComparison, Comparison, MatchedEffect, NamedResult
 
 SCHEMA: Final = "imu-monitor/reconcile-runs/1"
-"""Name and version of the JSON schema."""
 
 
 def encode_comparison(c: Comparison) -> bytes:
@@ -50,30 +49,30 @@ def _axis_entry(one: AxisComparison) -> dict[str, Any]:
     """Return the report entry of one axis."""
     return {
         "verdicts": {run: result.verdict for run, result in one.results.items()},
-        "common": [_effect_entry(seen) for seen in one.common],
+        "common": [_effect_entry(matched) for matched in one.common],
         "single": [
             {
-                **_effect_entry(seen),
-                "absent": [{"run": a.run, "meaning": a.meaning, "because": a.because} for a in seen.absent],
+                **_effect_entry(matched),
+                "absent": [{"run": a.run, "meaning": a.meaning, "because": a.because} for a in matched.absent],
             }
-            for seen in one.single
+            for matched in one.single
         ],
     }
 
 
-def _effect_entry(seen: MatchedEffect) -> dict[str, Any]:
+def _effect_entry(matched: MatchedEffect) -> dict[str, Any]:
     """Return the report entry of one effect."""
     return {
-        "effect": seen.effect,
-        "kind": seen.kind,
-        "recordings": list(seen.steps),
+        "effect": matched.effect,
+        "kind": matched.kind,
+        "recordings": list(matched.steps),
         "parameters": {
             name: {**parameter_entry(one.bounds), **({} if one.p is None else {"p": finite_or_none(one.p)})}
-            for name, one in seen.parameters.items()
+            for name, one in matched.parameters.items()
         },
-        "consistent": seen.consistent,
-        "p": finite_or_none(seen.p),
-        "each": {run: _step_entry(step) for run, step in seen.steps.items()},
+        "consistent": matched.consistent,
+        "p": finite_or_none(matched.p),
+        "each": {run: _step_entry(step) for run, step in matched.steps.items()},
     }
 
 

@@ -1,9 +1,9 @@
 """Matching of effects between recordings of one sensor.
 
-An identifying parameter distinguishes effects of the same name. It is a frequency, a time constant or a source axis.
-Two identifying parameters match if their intervals overlap. Before this test, the intervals are stretched and widened
-by a share that allows for the drift of real sensors. An effect without an identifying parameter occurs only once on an
-axis.
+An identifying parameter, such as a frequency, a time constant or a source axis, distinguishes effects of the same name.
+Two identifying parameters match if the intervals overlap. Before this test, the intervals are stretched, and widened by
+a share of the value that allows for the drift of real sensors. An effect without an identifying parameter occurs at
+most once on an axis.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,12 +27,12 @@ IDENTIFYING_PARAMETERS: Final[Mapping[str, tuple[str, float]]] = {
     "g_sensitivity": ("source", 0.0),
     "cross_axis": ("source", 0.0),
 }
-"""For each effect, the parameter that identifies it and the share by which its interval is widened on both sides.
+"""Identifying parameter of each effect, and the share of the value by which the interval is widened on both sides.
 
 Motors and clocks drift by a few percent, and time constants vary within a factor of two.
 """
 INTERVAL_STRETCH: Final = 2.0
-"""Factor by which a 95 % interval is stretched, so that one effect is not taken for two by chance."""
+"""Factor by which a 95 % interval is stretched, so that one effect rarely appears as two effects."""
 SAMPLE_RATE_EFFECT: Final = "sample_rate_error"
 """Name of the effect that is common to all axes of a recording."""
 
@@ -45,7 +45,7 @@ def identifying_parameter_name(effect: str) -> str:
 def identifying_parameter(step: AddedOrResizedEffect, axis: str, model: NoiseModel) -> ParameterInterval | None:
     """Return the parameter that identifies an effect among effects of the same name.
 
-    A step that changes a known effect contains only the size. The model of the recording then provides the parameter.
+    A resized effect contains only the size. The identifying parameter is then read from the model of the recording.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ def identifying_parameter_distance(
 
 
 def find_effect_of_step(model: NoiseModel, axis: str, step: AddedOrResizedEffect) -> Effect:
-    """Return the effect that a step added or changed, from the model of its recording.
+    """Return the effect that a step added or resized, from the extended model of the recording.
 
     Parameters
     ----------

@@ -1,10 +1,11 @@
 """Weighted mean of one parameter over several recordings, and a test of whether the recordings agree.
 
-The mean is weighted with the inverse variances of the single recordings, which follow from the 95 % intervals. χ²
-measures the scatter of the recordings about the mean. If the intervals are symmetric as factors (a standard deviation,
-a time constant), the logarithm is averaged. If the recordings disagree, the interval of the mean is widened by √(χ²/ν)
-(Birge, "The calculation of errors by the method of least squares", Phys. Rev. 40, 1932). A parameter without an
-interval (the name of an axis, an order) is taken from the first recording.
+Each value is weighted by the inverse of the variance, which follows from the 95 % interval of the recording. χ² is the
+weighted scatter of the values about the mean. The intervals of standard deviations and time constants are symmetric on
+a logarithmic scale. The logarithms of such parameters are averaged. If the recordings disagree, the interval of the
+mean is widened by √(χ²/ν) with the degrees of freedom ν (Birge, "The calculation of errors by the method of least
+squares", Phys. Rev. 40, 1932). The value of a parameter without an interval, such as an order, is the value of the
+first recording.
 """
 
 from collections.abc import Iterable, Sequence
@@ -20,9 +21,9 @@ from monitor.common.distributions import Z95
 from monitor.reconcile.result import ParameterInterval
 
 MIN_AGREEMENT_PROBABILITY: Final = 0.01
-"""Probability below which recordings disagree. It is small because a report contains many parameters."""
+"""Probability below which recordings disagree. The value is small because a report contains many parameters."""
 MIN_RELATIVE_ERROR: Final = 1e-6
-"""Smallest standard deviation relative to the value, because sample times and numbers in files are rounded."""
+"""Smallest standard deviation relative to the value. Sample times and numbers in files are rounded."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,16 +36,12 @@ class PooledParameter:
 
     @property
     def p(self) -> float | None:
-        """Probability of a larger χ² if all recordings measure the same value, or None if fewer than two have an
-        interval.
-        """
+        """Probability of a larger χ² if the true value is the same in all recordings. None: too few values."""
         return agreement_probability([self])
 
 
 def agreement_probability(parameters: Iterable[PooledParameter]) -> float | None:
-    """Return the probability of a larger total χ² of all parameters, treated as independent, or None without degrees of
-    freedom.
-    """
+    """Return the probability of a larger sum of the χ² values of independent parameters. None: too few values."""
     every = list(parameters)
     freedom = sum(one.freedom for one in every)
     return float(chdtrc(freedom, sum(one.chi2 for one in every))) if freedom else None
@@ -109,7 +106,7 @@ def _finite_interval(bounds: ParameterInterval) -> tuple[float, float, float] | 
 
 
 def _symmetric_scale(ends: Floats) -> tuple[Floats, bool]:
-    """Return intervals, shape (k, 3), on the scale on which they are symmetric, and True if it is logarithmic."""
+    """Return intervals, shape (k, 3), on a symmetric scale, and True if the scale is logarithmic."""
     lo, value, hi = ends.T
     if np.any(lo <= 0.0) or np.abs(value - np.sqrt(lo * hi)).sum() >= np.abs(value - 0.5 * (lo + hi)).sum():
         return ends, False

@@ -60,8 +60,8 @@ def without_refit() -> Iterator[None]:
     from monitor.reconcile.likelihood import hypothesis
     from monitor.reconcile.search import search
 
-    def stiff(axis: Any, found: Sequence[Any], model: tuple[Any, ...]) -> Any:
-        return hypothesis.Hypothesis(model, axis.fit((*model, *found), hypothesis.noise_indices(model)))
+    def stiff(axis: Any, added: Sequence[Any], model: tuple[Any, ...]) -> Any:
+        return hypothesis.Hypothesis(model, axis.fit((*model, *added), hypothesis.noise_indices(model)))
 
     name = "fit_with_fewest_changes"
     with patch.object(search, name, stiff), patch.object(hypothesis, name, stiff):

@@ -133,7 +133,7 @@ def test_verdicts_follow_from_steps_and_what_is_left():
     left = describe_axis(found("line"), STRICT, ALWAYS)
     assert left.verdict == "partly_explained"
     assert {score.lens for score in left.left_over} == {
-        lens for lens, one in found("line").findings.items() if one.gain
+        lens for lens, one in found("line").final.findings.items() if one.gain
     }
     assert describe_axis(found("line"), STRICT, UNREACHED).left_over == ()
 
@@ -149,5 +149,5 @@ def test_gaps_before_are_beside_the_model_that_decided_and_after_beside_the_new_
 def test_what_did_not_shrink_is_still_told():
     """A search whose last look sees as much as its first has a step and is partly explained."""
     one = found("line")
-    again = replace(one, findings=one.rounds[0].findings)
+    again = replace(one, final=one.rounds[0].before)
     assert describe_axis(again, STRICT, STRICT).verdict == "partly_explained"

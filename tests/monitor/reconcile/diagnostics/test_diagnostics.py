@@ -96,7 +96,7 @@ def test_autocorrelation_is_the_sum_of_products():
 def test_power_over_frequency_is_at_least_that_of_every_bin():
     view = seen(axis(drawn(6)), MODEL)
     bins = view.axis.bins
-    each = free_variance_gain_nats(bins.sums(view.coefficients**2) / bins.count, bins.count)
+    each = free_variance_gain_nats(bins.sum_over_bins(view.coefficients**2) / bins.count, bins.count)
     whole = free_variance_gain_nats(np.array([np.mean(view.coefficients**2)]), np.array([n - 1.0]))[0]
     found = diagnostics.diagnose_psd(view)
     assert found.gain >= each.max() - 1e-9

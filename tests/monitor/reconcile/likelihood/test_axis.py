@@ -150,7 +150,7 @@ def test_a_stop_band_is_not_heard():
     effects = (WHITE, BandwidthLimit(cutoff=0.8, order=4))
     y = NoiseModel({"gz": effects}).simulate(n, RATE_HZ, 1)[:, 2].copy()
     one = axis(y, effects)
-    power = one.bins.sums(one.coefficients**2) / one.bins.count
+    power = one.bins.sum_over_bins(one.coefficients**2) / one.bins.count
     below = power < 1e-5 * np.median(power)
     assert not one.used_bins[below].any()
     assert one.used_bins[one.bins.f_hz < 1.0].all()

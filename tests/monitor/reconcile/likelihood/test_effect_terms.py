@@ -10,7 +10,6 @@ from monitor.reconcile.likelihood.effect_terms import (
     NOISE_SIZE_PARAMETERS,
     size,
     unit_regressors,
-    unit_spectrum,
     with_regressor_factors,
     with_size,
 )
@@ -39,9 +38,11 @@ def test_every_source_has_its_place():
 def test_a_spectrum_grows_with_the_square_of_the_size(kind):
     one = effect(kind.name)
     f_hz, tau0_s = np.geomspace(0.01, 0.5 * RATE_HZ, 40), 1.0 / RATE_HZ
-    np.testing.assert_allclose(size(one) ** 2 * unit_spectrum(one, f_hz, tau0_s), one.psd(f_hz, tau0_s), rtol=1e-12)
+    np.testing.assert_allclose(
+        size(one) ** 2 * with_size(one, 1.0).psd(f_hz, tau0_s), one.psd(f_hz, tau0_s), rtol=1e-12
+    )
     bigger = with_size(one, 7.0)
-    np.testing.assert_allclose(49.0 * unit_spectrum(one, f_hz, tau0_s), bigger.psd(f_hz, tau0_s), rtol=1e-12)
+    np.testing.assert_allclose(49.0 * with_size(one, 1.0).psd(f_hz, tau0_s), bigger.psd(f_hz, tau0_s), rtol=1e-12)
     assert size(with_size(one, -7.0)) == 7.0
 
 

@@ -13,7 +13,7 @@ from monitor.reconcile.likelihood.event_process_comparison import (
     block_means,
     fit_event_process,
     kalman_log_likelihood,
-    maximise,
+    maximise_log_likelihood,
     prior_level_variance,
     state_space_noise,
 )
@@ -65,7 +65,7 @@ def test_maximum_and_its_width():
         x = np.log([a, b]) - target
         return 7.0 - 0.5 * x @ inverse @ x
 
-    height, at = maximise(likelihood, (5e-4, 9.0))
+    height, at = maximise_log_likelihood(likelihood, (5e-4, 9.0))
     assert height == pytest.approx(7.0, abs=0.02)
     assert at == pytest.approx(target, abs=0.05)
     found = fit_event_process(lambda a, b, odds: likelihood(a, b) + 12.0 * np.log(odds), {"a": 5e-4, "b": 9.0})
@@ -85,7 +85,7 @@ def test_no_interval_without_a_peak():
 
 
 def test_search_does_not_leave_the_neighbourhood_of_its_start():
-    _, (at,) = maximise(np.log, (2.0,))
+    _, (at,) = maximise_log_likelihood(np.log, (2.0,))
     assert 2.0 < np.exp(at) <= 60.0 * (1.0 + 1e-9)
 
 

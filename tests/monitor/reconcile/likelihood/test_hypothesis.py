@@ -76,23 +76,22 @@ def test_a_shape_is_at_the_top_of_its_profile():
     rng = np.random.default_rng(4)
     one = axis(white(n, rng) + correlated(n, rng, 4e-4, 0.5))
     effects = (WHITE, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.8))
-    found = refine_shape(one, effects, 1, ["correlation_time"], 3.0)
+    found = refine_shape(one, effects[:1], effects[1], "correlation_time", 3.0)
 
     def loss(x):
         return -one.fit(_with_shape(effects, 1, "correlation_time", float(np.exp(x)))).log_likelihood
 
     best = minimize_scalar(loss, bounds=(np.log(0.2), np.log(2.0)), method="bounded", options={"xatol": 1e-4})
-    assert found[1].correlation_time == pytest.approx(np.exp(best.x), rel=0.05)
-    assert loss(np.log(found[1].correlation_time)) == pytest.approx(best.fun, abs=0.05)
+    assert found.correlation_time == pytest.approx(np.exp(best.x), rel=0.05)
+    assert loss(np.log(found.correlation_time)) == pytest.approx(best.fun, abs=0.05)
     assert effects[1].correlation_time == 0.8
 
 
 def test_an_interval_of_a_shape_ends_where_its_profile_has_fallen():
     rng = np.random.default_rng(5)
     one = axis(white(n, rng) + correlated(n, rng, 4e-4, 0.5))
-    effects = refine_shape(
-        one, (WHITE, ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5)), 1, ["correlation_time"]
-    )
+    start = ExponentiallyCorrelated(sigma=1e-4, correlation_time=0.5)
+    effects = (WHITE, refine_shape(one, (WHITE,), start, "correlation_time"))
     state = fit_with_fewest_changes(one, effects, ())
     found = shape_interval(state.fit, 1, "correlation_time")
     assert found.lo < found.value < found.hi
@@ -110,9 +109,8 @@ def test_intervals_of_a_line_hold_its_frequency():
         rng = np.random.default_rng(seed)
         y = white(n, rng) + 3e-4 * np.sin(2.0 * np.pi * 17.3 * time_s(n) + 1.0)
         one = axis(y)
-        effects = refine_shape(
-            one, (WHITE, Sinusoidal(amplitude=1e-4, frequency=17.3, phase=0.0)), 1, ["frequency"], 1.0001
-        )
+        start = Sinusoidal(amplitude=1e-4, frequency=17.3, phase=0.0)
+        effects = (WHITE, refine_shape(one, (WHITE,), start, "frequency", 1.0001))
         state = fit_with_fewest_changes(one, effects, ())
         found = shape_interval(state.fit, 1, "frequency")
         inside.append(found.lo < 17.3 < found.hi)

@@ -25,10 +25,8 @@ def test_outliers_show_share_and_scale(share, scale, unit):
     found = fit_outliers(unit * w)
     assert found.fraction.value == pytest.approx(share, rel=0.3)
     assert found.scale.value == pytest.approx(scale * unit, rel=0.3)
-    assert found.noise == pytest.approx(unit, rel=0.02)
     assert found.gain > 50.0
-    assert found.over_student > 10.0
-    assert found.vuong_z > 2.0
+    assert found.gain_over_student > 10.0
     assert found.clustering_z < 3.5
     assert found.misfit_z < 3.5
     far = np.abs(w) > 6.0
@@ -54,9 +52,7 @@ def test_a_gaussian_gains_little():
 def test_noise_of_students_t_is_not_a_mixture(freedom):
     found = fit_outliers(np.random.default_rng(0).standard_t(freedom, 4 * N))
     assert found.gain > 100.0
-    assert found.over_student < -5.0
-    assert found.vuong_z < -2.0
-    assert found.freedom == pytest.approx(freedom, rel=0.25)
+    assert found.gain_over_student < -5.0
 
 
 def test_laplacian_noise_fits_no_mixture():

@@ -73,7 +73,9 @@ def test_nothing_is_no_step():
 
 def test_no_more_than_are_asked_for():
     y = stepped((500.0, 1500.0, 2500.0), (4e-4, 4e-4, 4e-4), np.random.default_rng(2))
-    assert compare_poisson_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5, most=2).single_steps == 2
+    assert (
+        compare_poisson_with_single_steps(y, TAU0_S, BackgroundNoise(N * N), 1e-5, max_single_steps=2).single_steps == 2
+    )
 
 
 def test_one_step_is_no_process():

