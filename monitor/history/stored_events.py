@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 import msgspec
-from drivers.quantities import DAY_S
 
+from drivers.number_ranges import DAY_S
 from monitor.history.time_ranges import TimeRange
 
 MAX_EVENTS: Final = 20_000
