@@ -82,7 +82,7 @@ def check_effects(axis_effects: Mapping[str, tuple[Effect, ...]], true_hz: float
                     raise ConfigError(f"{axis} has no angle_random_walk to multiply")
                 if isinstance(effect, Source) and effect.uses_temperature and not temperature:
                     raise ConfigError(
-                        "no temperature: neither the model has a table [temperature], nor does a recording provide one"
+                        "no temperature: the model has no table [temperature], and no recording provides one"
                     )
 
 

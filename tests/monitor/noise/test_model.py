@@ -116,7 +116,7 @@ def test_what_is_wrong_is_said_in_one_line(text, says):
 
 def test_temperature_is_needed_by_the_stream_and_not_by_the_file():
     model = NoiseModel.from_toml("sample_rate = 100\n[gz.temperature_bias]\ncoefficient = 1\nreference = 20")
-    with pytest.raises(ConfigError, match=r"^gz.temperature_bias: no temperature: .* no \[temperature\]"):
+    with pytest.raises(ConfigError, match=r"^gz.temperature_bias: no temperature: .* no table \[temperature\]"):
         model.stream(100.0, 0)
     assert model.simulate(2, 100.0, 0, np.array([21.0, 22.0]))[:, 2].tolist() == [1.0, 2.0]
 
