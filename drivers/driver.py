@@ -15,10 +15,10 @@ from typing import Final, Literal
 
 import numpy as np
 
+from drivers.data_types import AXES, Chunk, Event, SampleBlock, SenderTimedFormat, make_block
 from drivers.decoders.base import Decoder, LateFrameCountingDecoder
 from drivers.errors import ConfigError, LinkEnded, LinkError, LinkLost
 from drivers.links.base import Link
-from drivers.sample import AXES, Chunk, Event, SampleBlock, SenderTimedFormat, make_block
 from drivers.timing.sample_clock import SampleClock
 
 READ_TIMEOUT_S: Final = 0.2

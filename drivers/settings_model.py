@@ -28,8 +28,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from drivers import file_access
-from drivers.discovery import format_choices, format_suggestion
 from drivers.errors import ConfigError
+from drivers.module_lookup import format_choices, format_suggestion
 from drivers.number_ranges import format_value
 
 MAX_PASSES: Final = 4

@@ -9,8 +9,8 @@ import math
 from collections.abc import Mapping
 from typing import Final, TypeVar
 
-from drivers.discovery import format_choices
 from drivers.errors import ConfigError
+from drivers.module_lookup import format_choices
 from drivers.number_ranges import HOUR_S
 
 G0: Final = 9.80665

@@ -15,14 +15,14 @@ import pytest
 import typer
 
 import drivers.decoders
-from drivers import discovery
+from drivers import module_lookup as discovery
+from drivers.data_types import EVENT_KINDS, make_block
 from drivers.recordings import FORMATS
-from drivers.sample import EVENT_KINDS, make_block
 from drivers.zenoh.sample_message import encode_samples
 from monitor.cli import app
 from monitor.common import topics
 from monitor.noise.model import NoiseModel
-from monitor.noise.model_catalogue import read_model
+from monitor.noise.model_loading import read_model
 from monitor.publishing.messages.results import CoefficientsMessage
 from monitor.publishing.rerun.sinks import server_url
 from monitor.publishing.zenoh.publisher import ZenohPublisher

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from drivers.extras import EXTRAS
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.zenoh_sessions import session

@@ -18,7 +18,7 @@ from typing import ClassVar, Final, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import NO_TICK, Chunk, Floats, Ints, SampleBlock, Timing, make_block
+from drivers.data_types import NO_TICK, Chunk, Floats, Ints, SampleBlock, Timing, make_block
 
 MAX_GYRO_RAD_S: Final = 1000.0
 """Largest plausible angular rate in rad/s. The widest range of MEMS gyroscopes is 4000 °/s, which is 70 rad/s."""

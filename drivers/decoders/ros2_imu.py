@@ -22,9 +22,9 @@ from typing import ClassVar, Final
 
 import numpy as np
 
+from drivers.data_types import NO_TICK, Chunk, Floats, SampleBlock, SenderTimedFormat, Timing
 from drivers.decoders.base import Decoder, RejectingDecoder
 from drivers.errors import DecodeError
-from drivers.sample import NO_TICK, Chunk, Floats, SampleBlock, SenderTimedFormat, Timing
 from drivers.settings_model import SettingsModel
 
 HEADER_BYTES: Final = 4

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import ClassVar, Final
 
+from drivers.data_types import Chunk, SampleBlock, SenderTimedFormat, Timing
 from drivers.decoders.base import Decoder, RejectingDecoder
 from drivers.errors import DecodeError
-from drivers.sample import Chunk, SampleBlock, SenderTimedFormat, Timing
 from drivers.settings_model import SettingsModel
 from drivers.zenoh.sample_message import decode_samples, encode_samples
 

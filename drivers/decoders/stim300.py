@@ -27,10 +27,10 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field
 
+from drivers.data_types import Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
 from drivers.errors import ConfigError
 from drivers.number_ranges import RATE_HZ
-from drivers.sample import Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.settings_model import Conflict, SettingsModel, WordOr, checked_by
 from drivers.units import DEGREE, G0
 

@@ -21,11 +21,11 @@ import numpy as np
 from pydantic import AfterValidator, Field
 
 from drivers import units
+from drivers.data_types import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.discovery import format_choices
 from drivers.errors import ConfigError
+from drivers.module_lookup import format_choices
 from drivers.number_ranges import COUNTER_MODULUS, HEADER_LINES, SCALE
-from drivers.sample import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.settings_model import ListOf, SettingsModel, checked_by, one_of
 
 MAX_LINE_BYTES: Final = 4096

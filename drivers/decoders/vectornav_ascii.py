@@ -19,8 +19,8 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
+from drivers.data_types import ArrivalTimedFormat, Chunk, Floats, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.sample import ArrivalTimedFormat, Chunk, Floats, SampleBlock, Timing
 from drivers.settings_model import SettingsModel
 
 LONGEST: Final = 256

@@ -19,9 +19,9 @@ from typing import Annotated, Final, Literal
 import numpy as np
 from pydantic import Field
 
+from drivers.data_types import ArrivalTimedFormat, Chunk, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
 from drivers.number_ranges import FULL_SCALE
-from drivers.sample import ArrivalTimedFormat, Chunk, Floats, Ints, SampleBlock, Timing
 from drivers.settings_model import SettingsModel
 from drivers.units import DEGREE, G0
 

@@ -22,8 +22,8 @@ from typing import Final, Literal
 import numpy as np
 from pydantic import Field
 
+from drivers.data_types import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
-from drivers.sample import NO_TICK, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.settings_model import SettingsModel
 
 SYNC: Final = b"\xfa\xff\x36"

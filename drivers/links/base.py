@@ -15,9 +15,9 @@ from typing import Annotated, Literal, Protocol, runtime_checkable
 
 from pydantic import Field
 
+from drivers.data_types import Chunk
 from drivers.errors import LinkLost
 from drivers.number_ranges import SILENCE_S
-from drivers.sample import Chunk
 from drivers.settings_model import SettingsModel
 
 Carrier = Literal["bytes", "frames", "messages"]

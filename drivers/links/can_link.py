@@ -27,12 +27,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 
 from pydantic import Field, SkipValidation
 
-from drivers.discovery import format_choices
+from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
+from drivers.module_lookup import format_choices
 from drivers.number_ranges import BIT_RATE, format_value
-from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk
 from drivers.settings_model import checked_by
 
 if TYPE_CHECKING:

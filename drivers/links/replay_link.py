@@ -4,7 +4,7 @@ The chunks depend on the kind of file:
 
 - A recording (``drivers.recordings``: CSV, .npz, Parquet, Arrow, or a folder) becomes messages for the decoder
   ``samples``.
-- A CAN log (``drivers.links.can_log``) becomes CAN frames.
+- A CAN log (``drivers.links.can_log_reader``) becomes CAN frames.
 - A file of captured bytes (.bin, .raw or .txt, also with .gz) becomes bytes.
 - Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages, as the
   original link has received them.
@@ -32,13 +32,14 @@ from typing import IO, Annotated, Any, Final, Literal, cast
 from pydantic import Field
 
 from drivers import file_access
-from drivers.discovery import format_choices
+from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError, describe_error
 from drivers.extras import check_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
+from drivers.module_lookup import format_choices
 from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
-from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples, segment
-from drivers.sample import Chunk
+from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples
+from drivers.recordings import segment_file as segment
 from drivers.settings_model import FilePath, WordOr
 from drivers.zenoh.sample_message import encode_samples
 
@@ -205,7 +206,7 @@ def _relative_times(chunks: Iterator[Chunk]) -> Generator[TimedChunk]:
 
 def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
     """Yield the data frames of a CAN log."""
-    from drivers.links import can_log
+    from drivers.links import can_log_reader as can_log
 
     suffix = _plain_suffix(path)
     with _open_binary(path) as stream:

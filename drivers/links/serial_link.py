@@ -23,11 +23,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
 from pydantic import Field
 
 from drivers.credential_masking import mask_secrets
-from drivers.discovery import format_choices
+from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
+from drivers.module_lookup import format_choices
 from drivers.number_ranges import BIT_RATE, READ_TIMEOUT_S
-from drivers.sample import Chunk
 from drivers.settings_model import checked_by
 
 if TYPE_CHECKING:

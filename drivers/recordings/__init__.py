@@ -22,6 +22,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.data_types import AXES, Floats, SampleBlock, make_block
 from drivers.errors import ConfigError, RecordingError, describe_error, format_one_line
 from drivers.file_access import check_regular
 from drivers.number_ranges import DURATION_S, RATE_HZ
@@ -29,7 +30,6 @@ from drivers.recordings import memory_check
 from drivers.recordings.formats import FORMATS, find_format, is_recording
 from drivers.recordings.table import EXAMPLE_HEADER, T_LIMIT_S, Table
 from drivers.recordings.writing import open_recording_writer, save_samples
-from drivers.sample import AXES, Floats, SampleBlock, make_block
 
 __all__ = [
     "FORMATS",

@@ -24,10 +24,10 @@ from typing import IO, Final, cast
 
 import numpy as np
 
+from drivers.data_types import AXES, Floats
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular
 from drivers.recordings import memory_check, table
-from drivers.sample import AXES, Floats
 
 READ_BYTES: Final = 1 << 20
 MAX_LINE_BYTES: Final = 1 << 20

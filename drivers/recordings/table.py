@@ -7,10 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
+from drivers.data_types import AXES, Floats
 from drivers.errors import RecordingError
 from drivers.file_access import open_regular
 from drivers.recordings import memory_check
-from drivers.sample import AXES, Floats
 
 COLUMNS: Final = ("t", *AXES, "temperature")
 """Names of the known columns."""

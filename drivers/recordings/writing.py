@@ -13,10 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
+from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, RecordingError
 from drivers.recordings.formats import find_format
 from drivers.recordings.table import PARTIAL_SUFFIX, T_LIMIT_S, format_names
-from drivers.sample import AXES, Floats
 
 
 class AppendSamples(Protocol):

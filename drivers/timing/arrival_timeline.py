@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import NS_PER_S, Ints, SampleBlock, make_block
+from drivers.data_types import NS_PER_S, Ints, SampleBlock, make_block
 from drivers.timing.arrival_regression import ArrivalRegression
 from drivers.timing.earliest_sample_time import EarliestSampleTime
 

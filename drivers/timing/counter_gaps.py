@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import NS_PER_S, CounterTimedFormat, Ints, SampleBlock
+from drivers.data_types import NS_PER_S, CounterTimedFormat, Ints, SampleBlock
 from drivers.timing.arrival_regression import ArrivalRegression
 from drivers.timing.arrival_timeline import JUMP_S, MAX_GAP_SAMPLES, MAX_RATE_HZ, PERIOD_TOLERANCE, ArrivalTimeline
 from drivers.timing.event_rate_limiter import EventRateLimiter

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import (
+from drivers.data_types import (
     NO_TICK,
     NS_PER_S,
     CounterTimedFormat,

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from drivers.sample import NS_PER_S, Event
+from drivers.data_types import NS_PER_S, Event
 
 MIN_EVENT_INTERVAL_S: Final = 1.0
 """Shortest time between two events of one kind."""

@@ -1,6 +1,6 @@
 """Sample clock, which assigns a time to each sample and detects missing samples.
 
-Sample times have one of three sources, depending on the wire format (``drivers.sample.Timing``):
+Sample times have one of three sources, depending on the wire format (``drivers.data_types.Timing``):
 
 - A device counter (``counter_gaps``) gives the exact number of missing samples.
 - If there are only arrival times (``arrival_timeline``), missing samples are detected from rejected frames, from the
@@ -19,8 +19,8 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import NO_TICK, CounterTimedFormat, Event, Ints, SampleBlock, SenderTimedFormat, Timing
 from drivers.number_ranges import RATE_HZ
-from drivers.sample import NO_TICK, CounterTimedFormat, Event, Ints, SampleBlock, SenderTimedFormat, Timing
 from drivers.timing.arrival_regression import MIN_SAMPLES, MIN_SPAN_S, snap_to_standard_rate
 from drivers.timing.arrival_timeline import MAX_RATE_HZ, ArrivalTimeline
 from drivers.timing.counter_gaps import CounterGaps

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import NS_PER_S, Floats, Ints, SampleBlock
+from drivers.data_types import NS_PER_S, Floats, Ints, SampleBlock
 from drivers.timing.arrival_regression import MIN_SPAN_S
 from drivers.timing.arrival_timeline import JUMP_S, MAX_GAP_SAMPLES, ArrivalTimeline, split_at_gaps
 from drivers.timing.duplicate_rows import SEARCH_ROWS, RowFilter

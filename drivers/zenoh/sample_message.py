@@ -17,8 +17,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.data_types import AXES, Floats, Ints, SampleBlock, make_block, ns_to_seconds, seconds_to_ns
 from drivers.errors import DecodeError
-from drivers.sample import AXES, Floats, Ints, SampleBlock, make_block, ns_to_seconds, seconds_to_ns
 
 SCHEMA: Final = "imu-monitor/samples/1"
 SCHEMAS: Final = (SCHEMA, "imu-monitor/compensated/1")

@@ -19,7 +19,6 @@ import typer
 
 from monitor.cli import (
     analyze,
-    check_config,
     compensate,
     demo,
     doctor,
@@ -27,12 +26,13 @@ from monitor.cli import (
     history,
     reconcile,
     run,
-    simulate_recording,
     thermal,
     view,
     warm_up,
     watch,
 )
+from monitor.cli import check as check_config
+from monitor.cli import simulate as simulate_recording
 from monitor.cli.shared.errors import DEBUG, INTERRUPTED, message_and_status
 
 # This must precede the import of NumPy. The matrices are small, and the program has its own threads for the work.

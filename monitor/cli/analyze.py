@@ -31,7 +31,7 @@ def analyze(
 ) -> None:
     """Print the Allan deviation of a recording, Q, N, B, K, R with confidence intervals, motion and changes."""
     from monitor.commands import analyze as offline
-    from monitor.publishing.messages.analysis import AnalysisMessage, FailedAnalysisMessage
+    from monitor.publishing.messages.analysis_json import AnalysisMessage, FailedAnalysisMessage
 
     output.check_output_file("--plot", plot, ".png", ".html")
     window_s = options.parse_duration("--window", window)

@@ -34,7 +34,7 @@ def compensate(
     from rich.console import Console
 
     from monitor.commands import compensate as compensating
-    from monitor.publishing.terminal import compensate_text as text
+    from monitor.publishing.terminal import compensate_output as text
 
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--out", out)

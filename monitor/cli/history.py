@@ -13,8 +13,8 @@ from monitor.cli.shared import options, output
 from monitor.cli.shared.errors import name_option
 
 if TYPE_CHECKING:
-    from monitor.history.query import HistoryQuery
-    from monitor.history.reading import HistoryTable
+    from monitor.history.history_table import HistoryTable
+    from monitor.history.query_parameters import HistoryQuery
     from monitor.history.time_ranges import TimeRange
 
 MAX_TABLE_ROWS: Final = 24
@@ -52,11 +52,11 @@ def history(
     """Print past coefficients, temperatures, lost samples and events, over periods from hours to years."""
     from rich.console import Console
 
+    from drivers.data_types import AXES
     from drivers.recordings.formats import find_format
-    from drivers.sample import AXES
-    from monitor.estimation.fit.coefficients import SYMBOLS
-    from monitor.history.query import PARTS, HistoryQuery
-    from monitor.history.reading import bucket_width_s as width_of
+    from monitor.estimation.fit.coefficient_values import SYMBOLS
+    from monitor.history.history_table import bucket_width_s as width_of
+    from monitor.history.query_parameters import PARTS, HistoryQuery
     from monitor.history.time_ranges import parse_duration_s
     from monitor.publishing.terminal import history_text
 
@@ -106,7 +106,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
 
 def _from_file(source: Path | None, name: str | None) -> Get:
     """Return a function that reads results from a history file. A daemon may write to the file at the same time."""
-    from monitor.history import reading as past
+    from monitor.history import history_table as past
     from monitor.history.sqlite_store import open_history
 
     if source is None:
@@ -158,8 +158,8 @@ def _select_device(name: str | None, there: list[str], where: str) -> str:
     ConfigError
         If no device has this name, or if a name is needed to choose between devices.
     """
-    from drivers.discovery import format_suggestion
     from drivers.errors import NotReady
+    from drivers.module_lookup import format_suggestion
 
     if not there:
         raise NotReady(f"{where}: there is no history yet")

@@ -36,10 +36,10 @@ def reconcile(
     from rich.console import Console
 
     from monitor.commands import reconcile as reconciling
-    from monitor.noise.model_catalogue import load_model
+    from monitor.noise.model_loading import load_model
     from monitor.publishing.terminal import reconcile_text as text
-    from monitor.reconcile import report
-    from monitor.reconcile.several_recordings import comparison_report
+    from monitor.reconcile import json_report as report
+    from monitor.reconcile.several_recordings import comparison_json as comparison_report
 
     last_s = options.parse_duration("--last", last)
     output.check_output_file("--json", json)

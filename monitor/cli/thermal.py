@@ -31,7 +31,7 @@ def thermal_fit(
     from rich.console import Console
 
     from monitor.commands import thermal
-    from monitor.publishing.terminal import thermal_text as text
+    from monitor.publishing.terminal import thermal_output as text
 
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--json", json)
@@ -64,7 +64,7 @@ def thermal_predict(
     from rich.console import Console
 
     from monitor.commands import thermal
-    from monitor.publishing.terminal import thermal_text as text
+    from monitor.publishing.terminal import thermal_output as text
 
     output.check_output_file("--plot", plot, ".png")
     output.check_output_file("--json", json)

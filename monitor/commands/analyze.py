@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
+from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
-from drivers.sample import AXES, Ints, SampleBlock
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.drift.thermal.temperature_removal import TemperatureRemoval, remove_temperature, temperature_varied
 from monitor.estimation.allan.batch import TauGrid
@@ -29,7 +29,7 @@ from monitor.estimation.analysis import Analysis, analyze, detect_events
 from monitor.estimation.regular_grid import resample_with_temperature
 from monitor.publishing.plots.allan_figure import other_deviations
 from monitor.publishing.plots.dynamic_figure import ChangeMark
-from monitor.publishing.terminal.thermal_text import temperature_notes
+from monitor.publishing.terminal.thermal_output import temperature_notes
 
 
 class TooFewSamples(NotReady):

@@ -13,11 +13,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.discovery import format_suggestion
+from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError, NotReady
+from drivers.module_lookup import format_suggestion
 from drivers.recordings import iter_blocks, load_samples
 from drivers.recordings.writing import open_recording_writer
-from drivers.sample import AXES, Floats
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.drift.compensation.arma import ORDERS, Order, fit_arma
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult

@@ -35,7 +35,7 @@ from drivers.extras import find_missing_packages
 from drivers.links.can_link import describe_missing_package
 from drivers.links.replay_link import ReplayLink
 from drivers.number_ranges import DAY_S
-from monitor.commands.check_config import check_configuration
+from monitor.commands.check import check_configuration
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, lock_holder
 from monitor.common.units import format_count
 from monitor.settings.file_permissions import contains_secret
@@ -367,7 +367,7 @@ def recorded_bytes_per_day(config: Config) -> float | None:
     Examples
     --------
     >>> import dataclasses
-    >>> from monitor.common.shipped_file_paths import CONFIG_FOLDER
+    >>> from monitor.common.shipped_config_paths import CONFIG_FOLDER
     >>> from monitor.settings.loading import load
     >>> one = load(CONFIG_FOLDER / "demo.toml")
     >>> kept = Storage(folder=Path("kept"))

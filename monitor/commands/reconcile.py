@@ -18,20 +18,20 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.file_access import real_path
 from drivers.recordings import FORMATS, iter_blocks, load_samples
 from drivers.recordings import Recording as Samples
 from drivers.recordings.writing import atomic_write_path
-from drivers.sample import AXES
 from monitor.commands.progress import ProgressCallback, ignore_progress
 from monitor.estimation.regular_grid import resample_with_temperature
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.preparation.recording import Recording
+from monitor.reconcile.json_report import SCHEMA, encode_report
+from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.reconcile import reconcile
-from monitor.reconcile.report import SCHEMA, encode_report
 from monitor.reconcile.result import Reconciliation
-from monitor.reconcile.several_recordings import comparison_report
+from monitor.reconcile.several_recordings import comparison_json as comparison_report
 from monitor.reconcile.several_recordings.comparison import Comparison, NamedResult, compare_results
 
 REPORT: Final = "report.json"

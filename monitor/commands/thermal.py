@@ -13,15 +13,15 @@ import msgspec
 import numpy as np
 
 from drivers import file_access
+from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.number_ranges import DURATION_S, FIT_NUMBER
 from drivers.recordings import iter_blocks, load_samples
-from drivers.sample import AXES
 from monitor.drift.thermal.interval_means import IntervalMeans, compute_interval_means
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import ThermalModel
 from monitor.drift.thermal.thermal_response import ThermalModelForm
-from monitor.drift.thermal.thermal_study import (
+from monitor.drift.thermal.thermal_results import (
     ThermalFitReport,
     ThermalPredictionReport,
     choose_interval_s,

@@ -12,8 +12,8 @@ from typing import Final, Literal
 
 import numpy as np
 
+from drivers.data_types import AXES
 from drivers.number_ranges import DAY_S, HOUR_S
-from drivers.sample import AXES
 from drivers.units import G0
 
 Kind = Literal["gyro", "accel"]

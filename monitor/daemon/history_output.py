@@ -5,14 +5,14 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from drivers.data_types import Event, Ints, SampleBlock
 from drivers.errors import NotReady, RecordingError
-from drivers.sample import Event, Ints, SampleBlock
-from monitor.common.health import Health
+from monitor.common.device_health import Health
 from monitor.daemon.output import Output
 from monitor.estimation.estimate import Estimate
+from monitor.history.history_table import HistoryTable, read_history
 from monitor.history.minute_aggregation import MinuteAggregator
-from monitor.history.query import parse_query
-from monitor.history.reading import HistoryTable, read_history
+from monitor.history.query_parameters import parse_query
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange

@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from drivers.sample import Event, Ints, SampleBlock
-from monitor.common.health import Health
+from drivers.data_types import Event, Ints, SampleBlock
+from monitor.common.device_health import Health
 
 
 class Output:

@@ -10,17 +10,17 @@ from typing import Any, Final
 
 import numpy as np
 
+from drivers.data_types import Event, SampleBlock, merge_contiguous_blocks
 from drivers.driver import Driver
 from drivers.errors import NotReady
-from drivers.sample import Event, SampleBlock, merge_contiguous_blocks
 from monitor.daemon.device.device_timeline import DeviceTimeline
 from monitor.daemon.device.pipeline import DevicePipeline
-from monitor.daemon.operations.limits import LimitMonitor
+from monitor.daemon.operations.coefficient_limits import LimitMonitor
 from monitor.daemon.output import Output
 from monitor.daemon.schedule import Schedule
 from monitor.drift.compensation.live_compensation import LiveCompensation
-from monitor.estimation.detection.model_agreement import ModelAgreement
-from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.detection.model_agreement_monitor import ModelAgreement
+from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings.loading import Device

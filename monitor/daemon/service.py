@@ -21,10 +21,11 @@ import structlog
 
 from drivers.errors import ConfigError
 from drivers.links.replay_link import ReplayLink
-from drivers.recordings.segment import SegmentMetadata
-from monitor.common.health import Health, format_service_status
-from monitor.daemon import reload
+from drivers.recordings.segment_file import SegmentMetadata
+from monitor.common.device_health import Health, format_service_status
+from monitor.daemon import config_changes as reload
 from monitor.daemon.command_handler import CommandHandler
+from monitor.daemon.config_changes import ConfigChange
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.history_output import HistoryOutput
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
@@ -33,18 +34,17 @@ from monitor.daemon.operations.log_level import set_log_level
 from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.output import Output
-from monitor.daemon.output_classes import TableOutput, ViewerOutput, ZenohOutput
-from monitor.daemon.reload import ConfigChange
+from monitor.daemon.result_outputs import TableOutput, ViewerOutput, ZenohOutput
 from monitor.daemon.storage.recorder import Recorder, segment_metadata
-from monitor.history.reading import HistoryTable
+from monitor.history.history_table import HistoryTable
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.terminal.queued_writer import QueuedWriter
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings.loading import Config, Device, Storage, VirtualTable
 
 if TYPE_CHECKING:
-    from monitor.daemon.operations.metrics import MetricsOutput
-    from monitor.publishing.rerun.view import RerunView
+    from monitor.daemon.operations.prometheus_metrics import MetricsOutput
+    from monitor.publishing.rerun.queued_view import RerunView
 
 MAX_IDLE_S: Final = 0.05
 """Longest sleep of the main loop if no samples arrive."""
@@ -393,7 +393,9 @@ def _build_metrics_output(config: Config) -> "MetricsOutput | None":
     """Return the output for Prometheus, or None if it is not configured."""
     if config.metrics is None:
         return None
-    from monitor.daemon.operations.metrics import MetricsOutput  # imports http.server, so only if it is needed
+    from monitor.daemon.operations.prometheus_metrics import (
+        MetricsOutput,  # imports http.server, so only if it is needed
+    )
 
     return MetricsOutput(config.metrics)
 
@@ -402,7 +404,7 @@ def _build_view(config: Config, recall: Callable[[str], HistoryTable | None]) ->
     """Return the Rerun view, or None if the viewer is off."""
     if config.viewer.mode == "none":
         return None
-    from monitor.publishing.rerun.view import RerunView
+    from monitor.publishing.rerun.queued_view import RerunView
 
     own = config.viewer
     return RerunView(

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Ints
+from drivers.data_types import Ints
 
 MAX_SLEW_RATE: Final = 5e-4
 """Maximum rate of a correction, 0.5 ms per second."""

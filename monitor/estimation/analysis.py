@@ -16,8 +16,8 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import Floats, Ints, SampleBlock
 from drivers.errors import NotReady
-from drivers.sample import Floats, Ints, SampleBlock
 from monitor.estimation import analysis_notes
 from monitor.estimation.allan.batch import (
     EachAxis,
@@ -30,7 +30,7 @@ from monitor.estimation.allan.batch import (
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.detection.change_detection import Change, ChangeDetector
-from monitor.estimation.detection.line_detection import detect_lines, outlier_share
+from monitor.estimation.detection.line_and_outlier_detection import detect_lines, outlier_share
 from monitor.estimation.detection.motion_detection import Motion, detect_motion
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit, make_design

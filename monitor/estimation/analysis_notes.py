@@ -11,14 +11,14 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.common.units import format_rate, format_two_digits
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.line_detection import OUTLIER_SIGMA, Line, line_share
+from monitor.estimation.detection.line_and_outlier_detection import OUTLIER_SIGMA, Line, line_share
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.coefficient_fit import Fit
-from monitor.estimation.fit.coefficients import Status
+from monitor.estimation.fit.coefficient_values import Status
 from monitor.estimation.fit.least_squares import K, Q
 from monitor.estimation.fit.low_pass_search import LowPass
 

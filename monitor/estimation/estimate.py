@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.fit.coefficients import Coefficients, Status
+from monitor.estimation.fit.coefficient_values import Coefficients, Status
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.data_types import Floats, Ints, SampleBlock
 from drivers.errors import NotReady
-from drivers.sample import Floats, Ints, SampleBlock
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve

@@ -20,7 +20,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 
 ROWS_BESIDE_GAP: Final = 60

@@ -15,16 +15,16 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import AXES, NS_PER_S, Floats, Ints, SampleBlock, SenderTimedFormat
 from drivers.errors import ConfigError, NotReady, RecordingError
 from drivers.number_ranges import RATE_HZ
-from drivers.sample import AXES, NS_PER_S, Floats, Ints, SampleBlock, SenderTimedFormat
 from drivers.timing.arrival_regression import snap_to_standard_rate
 from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
 from drivers.timing.sender_times import FORWARD_JUMP_S
 from monitor.common.units import format_rate, format_two_digits
+from monitor.estimation.detection.coarse_quantization import QuantizationStep, find_coarse_axes
 from monitor.estimation.detection.repeated_share import estimate_repeated_share
-from monitor.estimation.detection.resolution import QuantizationStep, find_coarse_axes
 from monitor.estimation.missing_sample_count import count_missing_samples
 
 MIN_RATE_DEVIATION: Final = 0.002

@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import AXES, Floats, Ints
+from drivers.data_types import AXES, Floats, Ints
 from monitor.estimation.allan.window import AllanWindow
 
 MAX_GROUP_UNITS: Final = 2.0

@@ -19,8 +19,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.data_types import Floats, Ints
 from drivers.errors import RecordingError
-from drivers.sample import Floats, Ints
 
 Singles = NDArray[np.float32]
 

@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
-from monitor.common.health import Health
+from drivers.data_types import Floats
+from monitor.common.device_health import Health
 from monitor.estimation.estimate import Estimate
 from monitor.history.bucket import STATES, HistoryRow, RunningStatistics
-from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
+from monitor.history.column_conversion import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
 
 MINUTE_S: Final = 60
 LATE_TOLERANCE_S: Final = 5.0

@@ -22,10 +22,10 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from drivers.discovery import format_suggestion
+from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
+from drivers.module_lookup import format_suggestion
 from drivers.number_ranges import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, NumberRange
-from drivers.sample import AXES, Floats
 from monitor.noise.spectrum import Spectrum
 
 QUANTITIES: Final = {"s": DELAY_S, "Hz": EFFECT_FREQUENCY_HZ, "1/s": EFFECT_FREQUENCY_HZ}

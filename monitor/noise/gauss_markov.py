@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.spectrum import Spectrum
 
 MAX_SERIES_ARGUMENT: Final = 1e-3

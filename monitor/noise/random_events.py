@@ -9,7 +9,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 
 BATCH_SIZE: Final = 64
 MAX_LISTED_EVENTS: Final = 1000

@@ -20,9 +20,9 @@ from zlib import crc32
 
 import numpy as np
 
-from drivers.discovery import format_suggestion
+from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from drivers.sample import AXES, Floats
+from drivers.module_lookup import format_suggestion
 from monitor.noise.effect import (
     Effect,
     Leak,
@@ -38,7 +38,7 @@ from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
-from monitor.noise.model_file import error_location
+from monitor.noise.model_toml import error_location
 from monitor.noise.temperature import Temperature, recorded_temperature
 
 PIECE_SAMPLES: Final = 2048

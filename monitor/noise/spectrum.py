@@ -21,7 +21,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 
 Curve = Callable[[Floats], Floats]
 """Function of frequency (Hz) or averaging time (s)."""

@@ -4,9 +4,9 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.common.units import NO_VALUE, format_number, unit_of
-from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 
 TEMPERATURE_MARK: Final = "†"
 TEMPERATURE_MEANS: Final = "slow variance due to temperature"

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Final
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.common import topics
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import Coefficients
+from monitor.estimation.fit.coefficient_values import Coefficients
 from monitor.publishing.messages.message import Message, decode_message
 from monitor.publishing.messages.results import (
     CoefficientsMessage,

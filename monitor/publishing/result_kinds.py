@@ -2,19 +2,19 @@
 
 A row of ``RESULT_KINDS`` lists the messages that are published and the viewer panels that draw the result. It also
 states how often the panels draw, and how results are merged while they wait for a slow viewer. A new kind of result
-needs a row here, a message in ``monitor.publishing.messages.results``, a panel in ``monitor.publishing.rerun.panels``
-and the code that produces the result. The module does no I/O and does not import Rerun.
+needs a row here, a message in ``monitor.publishing.messages.results``, a panel in
+``monitor.publishing.rerun.result_panels`` and the code that produces the result. The module does no I/O and does not import Rerun.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
-from drivers.sample import Event, Floats
-from monitor.common.health import Health
+from drivers.data_types import Event, Floats
+from monitor.common.device_health import Health
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate, concatenate_coefficients
 from monitor.publishing.messages.message import Message
 from monitor.publishing.messages.results import (
@@ -100,7 +100,7 @@ class Drawing:
     """Rule for drawing one kind of result in one panel of the viewer."""
 
     panel: str
-    """Class in ``monitor.publishing.rerun.panels``."""
+    """Class in ``monitor.publishing.rerun.result_panels``."""
     merge: Merge = keep_all
     period_s: float = 0.0
     """Shortest interval between two drawings of a device [s]."""

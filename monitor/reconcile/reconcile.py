@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from scipy.special import expit
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.noise.effect import Leak
 from monitor.noise.effects import (
     AngleRandomWalk,
@@ -28,18 +28,18 @@ from monitor.noise.effects import (
 )
 from monitor.noise.model import NoiseModel
 from monitor.noise.standard_terms import UNIT_SOURCES
-from monitor.reconcile.description import describe_axis
+from monitor.reconcile.axis_result import describe_axis
 from monitor.reconcile.diagnostics.null_distribution import (
     AxisNull,
     Findings,
     estimate_null_distributions,
     run_diagnostics,
 )
-from monitor.reconcile.likelihood.axis import Axis, Effects, RegressorCache
-from monitor.reconcile.likelihood.effect_terms import with_size
+from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache
+from monitor.reconcile.likelihood.effect_roles import with_size
 from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import whiten_axis
-from monitor.reconcile.preparation.recording import Recording, select_usable_axes
+from monitor.reconcile.preparation.reconcile_input import Recording, select_usable_axes
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AxisResult,
@@ -51,7 +51,7 @@ from monitor.reconcile.result import (
 )
 from monitor.reconcile.search.axis_repair import build_repaired_axes
 from monitor.reconcile.search.candidates import PENALTY_NATS
-from monitor.reconcile.search.sample_rate_error import (
+from monitor.reconcile.search.sample_rate_from_spectrum import (
     SAMPLE_RATE_PENALTY_NATS,
     SampleRateErrorEstimate,
     convert_to_stated_time,

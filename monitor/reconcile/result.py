@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Literal
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.model import NoiseModel
 
 Decision = Literal["agrees", "explained", "partly_explained", "unexplained"]

@@ -16,7 +16,8 @@ from pydantic import AfterValidator, Field, ValidationInfo
 
 import drivers.decoders
 import drivers.links
-from drivers import discovery, number_ranges
+from drivers import module_lookup as discovery
+from drivers import number_ranges
 from drivers.decoders.base import AddressFilter, Decoder
 from drivers.errors import ConfigError
 from drivers.links.base import AddressFilteringLink, Link, LinkSettings
@@ -31,7 +32,7 @@ from drivers.settings_model import (
     check_table,
     fields_by_key,
 )
-from monitor.common.shipped_file_paths import model_path
+from monitor.common.shipped_config_paths import model_path
 from monitor.settings.field_types import Duration
 
 VIRTUAL: Final = "virtual"

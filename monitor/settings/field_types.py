@@ -7,8 +7,8 @@ from typing import Annotated, Any, Final, NamedTuple
 from pydantic import BeforeValidator
 
 from drivers import file_access
-from drivers.discovery import format_choices
 from drivers.errors import ConfigError
+from drivers.module_lookup import format_choices
 from drivers.number_ranges import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, format_value
 from drivers.settings_model import ReadAs, checked_by
 from monitor.common.topics import ENDPOINT

@@ -11,10 +11,10 @@ from typing import Any, Final, Literal, get_args, get_origin
 from pydantic.fields import FieldInfo
 
 import drivers.decoders
-from drivers import discovery
+from drivers import module_lookup as discovery
+from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from drivers.number_ranges import NumberRange
-from drivers.sample import AXES
 from drivers.settings_model import SettingsModel, fields_by_key, find_model
 from monitor.settings import driver_settings
 from monitor.settings.schema import ConfigFile, Device, Hook, Limit

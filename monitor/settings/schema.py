@@ -12,15 +12,16 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, Field, Strict, ValidationInfo, model_validator
 
-from drivers import discovery, file_access, number_ranges
+from drivers import file_access, number_ranges
+from drivers import module_lookup as discovery
+from drivers.data_types import AXES, EVENT_KINDS
 from drivers.decoders.base import Decoder
 from drivers.driver import AxisMap, parse_axis_map
 from drivers.errors import ConfigError
 from drivers.links.base import Link
 from drivers.number_ranges import DAY_S, NumberRange
-from drivers.sample import AXES, EVENT_KINDS
 from drivers.settings_model import Conflict, ListOf, ReadAs, SettingsModel, WordOr, checked_by, one_of
-from monitor.common.shipped_file_paths import model_path
+from monitor.common.shipped_config_paths import model_path
 from monitor.common.topics import ENDPOINT
 from monitor.settings.driver_settings import Driver, VirtualTable, read_driver
 from monitor.settings.field_types import (

@@ -1,7 +1,7 @@
 """Simulated IMU that sends a real wire format over a real link, with a noise model and with faults."""
 
-from monitor.simulator.scheduled_effect_parser import parse_effects
-from monitor.simulator.sensor import AMBIENT_C, DEFAULT_RATE_HZ, WARM_UP_C, WARM_UP_S, SimulatedSensor
+from monitor.simulator.effect_option_parser import parse_effects
+from monitor.simulator.encoding_sensor import AMBIENT_C, DEFAULT_RATE_HZ, WARM_UP_C, WARM_UP_S, SimulatedSensor
 from monitor.simulator.simulated_device import SimulatedDevice
 
 __all__ = [

@@ -8,8 +8,8 @@ import secrets
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
+from drivers.data_types import EXTENDED_ID, Chunk
 from drivers.links import can_link
-from drivers.sample import EXTENDED_ID, Chunk
 from monitor.simulator.port import Port
 
 if TYPE_CHECKING:

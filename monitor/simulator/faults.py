@@ -15,7 +15,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import Chunk, Floats
+from drivers.data_types import Chunk, Floats
 from monitor.settings.loading import FaultsTable
 
 SPAWN_KEY: Final = crc32(b"faults")

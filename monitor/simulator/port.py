@@ -6,8 +6,8 @@ Each carrier has a module with its port. ``Port.link`` is an ordinary link, as f
 import threading
 from collections.abc import Sequence
 
+from drivers.data_types import Chunk
 from drivers.links.base import Link
-from drivers.sample import Chunk
 
 
 class Port:

@@ -14,8 +14,8 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Final
 
+from drivers.data_types import Chunk
 from drivers.links import serial_link
-from drivers.sample import Chunk
 from monitor.simulator.port import Port
 
 WAIT_S: Final = 0.01

@@ -12,13 +12,13 @@ from typing import Final
 import numpy as np
 import structlog
 
+from drivers.data_types import Chunk
 from drivers.decoders.base import Decoder
 from drivers.errors import LinkUnavailable
-from drivers.sample import Chunk
 from monitor.settings.loading import VirtualTable
+from monitor.simulator.encoding_sensor import SimulatedSensor
 from monitor.simulator.faults import DrawnFaults, FaultCounts, Faults
 from monitor.simulator.port import create_port
-from monitor.simulator.sensor import SimulatedSensor
 
 BURST_S: Final = 0.01
 """Length of a burst of samples, as from a USB adapter."""

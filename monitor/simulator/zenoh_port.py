@@ -7,9 +7,9 @@ import socket
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, Final
 
+from drivers.data_types import Chunk
 from drivers.errors import LinkUnavailable
 from drivers.links import zenoh_link
-from drivers.sample import Chunk
 from drivers.zenoh.session_config import build_session_config, format_zenoh_error
 from monitor.simulator.port import Port
 

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from drivers import decoders, discovery
+from drivers import decoders
+from drivers import module_lookup as discovery
 from drivers.decoders.base import Decoder
 from tests.support.settings import read_settings
 

@@ -10,8 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.decoders.base import Decoder
-from drivers.sample import (
+from drivers.data_types import (
     NO_TICK,
     ArrivalTimedFormat,
     Chunk,
@@ -21,6 +20,7 @@ from drivers.sample import (
     concatenate_blocks,
     make_block,
 )
+from drivers.decoders.base import Decoder
 from tests.contracts.decoder_examples import EXAMPLES, NAMES, Example
 
 N = 16

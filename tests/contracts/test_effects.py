@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from scipy.signal import welch
 
 import monitor.noise.effects as folder
+from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.sample import AXES
 from monitor.noise.effect import Effect, Leak, Source, Transform, gyro_and_accel_units, required_parameters
 from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER, NoiseStep
 from monitor.noise.model import NoiseModel

@@ -15,10 +15,11 @@ from typing import Any
 
 import pytest
 
-from drivers import discovery, links
+from drivers import links
+from drivers import module_lookup as discovery
+from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links.base import Link, LinkSettings
-from drivers.sample import Chunk
 from tests.support.loopback_link import LoopbackLink
 from tests.support.ports import free_endpoint
 from tests.support.settings import read_settings

@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from drivers import decoders, links
-from drivers.discovery import format_suggestion, import_module, list_modules
 from drivers.errors import ConfigError
+from drivers.module_lookup import format_suggestion, import_module, list_modules
 
 
 @pytest.fixture

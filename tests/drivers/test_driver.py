@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from drivers import driver as driver_module
+from drivers.data_types import NO_TICK, Chunk, make_block
 from drivers.decoders import dbc, stim300, text, vectornav_binary
 from drivers.decoders import samples as samples_decoder
 from drivers.driver import MAX_UNDECODED_BYTES, AxisMap, Driver, parse_axis_map
 from drivers.errors import ConfigError
-from drivers.sample import NO_TICK, Chunk, make_block
 from drivers.timing.sample_clock import SampleClock
 from drivers.zenoh.sample_message import encode_samples
 from tests.support.loopback_link import LoopbackLink

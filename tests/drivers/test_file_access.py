@@ -7,7 +7,7 @@ import pytest
 from drivers import file_access
 from drivers.errors import ConfigError
 from monitor.commands import thermal
-from monitor.noise.model_catalogue import read_model
+from monitor.noise.model_loading import read_model
 from monitor.settings import loading
 
 

@@ -13,13 +13,14 @@ import pytest
 from drivers import file_access
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.links import replay_link
-from drivers.recordings import load_samples, segment
+from drivers.recordings import load_samples
+from drivers.recordings import segment_file as segment
 from drivers.recordings.writing import atomic_write_path
 from drivers.zenoh.session_config import build_session_config
 from monitor.commands import thermal
-from monitor.common import shipped_file_paths
+from monitor.common import shipped_config_paths as shipped_file_paths
 from monitor.history import sqlite_store
-from monitor.noise.model_catalogue import read_model
+from monitor.noise.model_loading import read_model
 from monitor.publishing.zenoh.subscriber import client_configurations
 from monitor.settings import loading
 from tests.support.waiting import PATIENCE_S

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from drivers.data_types import AXES, concatenate_blocks
 from drivers.errors import ConfigError, ImuError, RecordingError
 from drivers.recordings import (
     FORMATS,
@@ -34,7 +35,6 @@ from drivers.recordings import (
 from drivers.recordings.arrow_message_sizes import check_buffer_sizes, count_buffers, iter_batch_sizes
 from drivers.recordings.csv_format import MAX_LINE_BYTES, READ_BYTES
 from drivers.recordings.writing import atomic_write_path
-from drivers.sample import AXES, concatenate_blocks
 from tests.support.recordings import recordings
 
 SUFFIXES = tuple(FORMATS)

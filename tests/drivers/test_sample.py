@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, NO_TICK, concatenate_blocks, make_block, merge_contiguous_blocks
+from drivers.data_types import AXES, NO_TICK, concatenate_blocks, make_block, merge_contiguous_blocks
 
 
 def a_block(n=5, start=0, lost=0):

@@ -32,27 +32,27 @@ from urllib.parse import quote
 
 import numpy as np
 
+from drivers.data_types import Floats
 from drivers.recordings import save_samples
-from drivers.sample import Floats
 from monitor.commands.reconcile import Request, run_reconciliation
-from monitor.common import shipped_file_paths
+from monitor.common import shipped_config_paths as shipped_file_paths
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
 from monitor.history.minute_aggregation import MinuteAggregator
 from monitor.history.sqlite_store import FILE_NAME, HistoryStore
 from monitor.history.stored_events import StoredEvent
 from monitor.noise.model import NoiseModel
-from monitor.noise.model_catalogue import read_model
-from monitor.publishing.plots.diagnostic_figure import compared_diagnostic_svg
+from monitor.noise.model_loading import read_model
+from monitor.publishing.plots.reconcile_figures import compared_diagnostic_svg
 from monitor.publishing.rerun import sinks
 from monitor.publishing.rerun.fleet import FleetView
-from monitor.publishing.rerun.view import RerunView
+from monitor.publishing.rerun.queued_view import RerunView
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.reconcile.result import AxisResult
 from monitor.settings import loading
 from monitor.simulator import AMBIENT_C, WARM_UP_C, WARM_UP_S
-from monitor.simulator.demo import demo_config
+from monitor.simulator.demo_config import demo_config
 from tests.monitor.publishing.made import estimate, true_coefficients
 
 SIZE = (1600, 1000)

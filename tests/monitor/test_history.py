@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from drivers.data_types import Event, SampleBlock
 from drivers.recordings import save_samples
-from drivers.sample import Event, SampleBlock
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.common.units import format_utc
 from monitor.daemon.output import Output
 from monitor.daemon.service import Service
 from monitor.estimation.estimate import Estimate
-from monitor.history import reading as past
-from monitor.history.reading import HistoryTable
+from monitor.history import history_table as past
+from monitor.history.history_table import HistoryTable
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
-from monitor.noise.model_catalogue import read_model
+from monitor.noise.model_loading import read_model
 from monitor.publishing.messages.history import decode_history
 from monitor.settings import loading
 from tests.support.ports import free_endpoint

@@ -17,7 +17,7 @@ PROGRAM = """
 
     import numpy as np
 
-    from drivers.sample import make_block
+    from drivers.data_types import make_block
     from monitor.daemon import kernel_parts
     from monitor.common.compiled import Kernel
     from monitor.drift.compensation.compensator import Compensator

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 
 
 def nist_1000() -> Floats:

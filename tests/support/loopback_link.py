@@ -10,9 +10,9 @@ import time
 from collections import deque
 from typing import Literal
 
+from drivers.data_types import Chunk
 from drivers.errors import LinkEnded, LinkLost, LinkUnavailable
 from drivers.links.base import Carrier
-from drivers.sample import Chunk
 
 
 class LoopbackLink:

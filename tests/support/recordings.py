@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.sample import Floats, SampleBlock, make_block
+from drivers.data_types import Floats, SampleBlock, make_block
 
 
 def recordings() -> Path:

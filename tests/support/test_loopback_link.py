@@ -2,8 +2,8 @@
 
 import pytest
 
+from drivers.data_types import Chunk
 from drivers.errors import LinkEnded, LinkLost, LinkUnavailable
-from drivers.sample import Chunk
 from tests.support.loopback_link import LoopbackLink
 
 

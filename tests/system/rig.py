@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from drivers.sample import Event, SampleBlock, concatenate_blocks
-from monitor.common.health import Health
+from drivers.data_types import Event, SampleBlock, concatenate_blocks
+from monitor.common.device_health import Health
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.output import Output
 from monitor.daemon.service import Service
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings import loading

@@ -9,7 +9,7 @@ import psutil
 import pytest
 
 from drivers import driver
-from drivers.sample import concatenate_blocks
+from drivers.data_types import concatenate_blocks
 from tests.support.waiting import wait_for
 from tests.system.rig import Running, running
 

@@ -12,8 +12,8 @@ import can
 import numpy as np
 import pytest
 
+from drivers.data_types import AXES, Chunk
 from drivers.links.base import Link
-from drivers.sample import AXES, Chunk
 from tests.support.recordings import recordings
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.system.rig import Cable, paced, running

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.estimation.estimate import Estimate, PerSampleCoefficients
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from tests.support.waiting import wait_for

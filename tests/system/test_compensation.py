@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import zenoh
 
+from drivers.data_types import concatenate_blocks
 from drivers.recordings import load_samples, save_samples
-from drivers.sample import concatenate_blocks
 from drivers.zenoh.sample_message import SampleMessage, decode_samples
 from monitor.commands.compensate import Request, run_compensation
 from tests.support.ports import free_endpoint

@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 from structlog.testing import capture_logs
 
+from drivers.data_types import Event
 from drivers.decoders import samples
-from drivers.sample import Event
 from monitor.daemon.service import Service
 from monitor.settings.loading import VirtualTable
-from monitor.simulator.demo import demo_config
+from monitor.simulator.demo_config import demo_config
 from tests.support.paced_sensor import follow_reader
 from tests.support.waiting import PATIENCE_S
 from tests.system.rig import Caught

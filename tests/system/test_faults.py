@@ -20,7 +20,7 @@ import psutil
 import pytest
 import zenoh
 
-from drivers.sample import concatenate_blocks
+from drivers.data_types import concatenate_blocks
 from tests.support.ports import free_endpoint, free_port
 from tests.support.waiting import PATIENCE_S, wait_for
 from tests.support.zenoh_sessions import router, session

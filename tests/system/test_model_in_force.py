@@ -11,15 +11,15 @@ from typing import Any
 import numpy as np
 import zenoh
 
+from drivers.data_types import AXES, Event
 from drivers.recordings import load_samples
-from drivers.sample import AXES, Event
 from monitor.common import topics
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.service import Service
-from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.settings.loading import Config, VirtualTable, ZenohTable
-from monitor.simulator.demo import demo_config
+from monitor.simulator.demo_config import demo_config
 from tests.support.paced_sensor import follow_reader
 from tests.support.ports import free_endpoint
 from tests.support.waiting import PATIENCE_S, wait_for

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.preparation.recording import Recording
+from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.reconcile import reconcile
 from monitor.reconcile.result import AddedOrResizedEffect, Reconciliation
 from tests.support.recordings import recordings

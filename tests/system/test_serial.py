@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.data_types import Chunk
 from drivers.links.base import Link
-from drivers.sample import Chunk
 from monitor.estimation.allan.batch import overlapping_avar
 from tests.support.recordings import recordings
 from tests.support.waiting import wait_for

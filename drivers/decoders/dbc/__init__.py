@@ -4,9 +4,8 @@
 is extracted from the frames of many samples at once. The tests compare the extracted values with the values that
 cantools decodes.
 
-One sample may be spread over several messages, whose frames are joined in order of arrival
-(``drivers.decoders.dbc.join``). A sample is bad, and counts as missing, if one of its frames is missing, too short or
-not ``valid``. With ``partial = true``, the axes of a missing frame are only marked as not measured. A sample also
+One sample may be spread over several messages. ``drivers.decoders.dbc.sample_assembly`` joins the frames in order of
+arrival. A sample is bad, and counts as missing, if one of its frames is missing, too short or not ``valid``. With ``partial = true``, the axes of a missing frame are only marked as not measured. A sample also
 counts as missing if one of its frames arrived later than the time ``window`` allows. Such samples are counted in
 ``dropped_late_samples`` instead of ``bad``. A message that contains only the temperature may be sent less often than
 the other messages. Each sample then gets the newest temperature.
@@ -23,11 +22,11 @@ from typing import ClassVar, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.data_types import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock, Timing
 from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Bytes, Decoder
 from drivers.decoders.dbc.database import Database
-from drivers.decoders.dbc.join import Message, SampleAssembler, SampleFrames
+from drivers.decoders.dbc.sample_assembly import Message, SampleAssembler, SampleFrames
 from drivers.decoders.dbc.settings import COLUMNS, Settings, SignalSettings
-from drivers.sample import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock, Timing
 
 __all__ = ["DbcDecoder", "Settings", "SignalSettings", "build"]
 

@@ -12,13 +12,13 @@ from typing import Any, Final
 
 import drivers
 from drivers import file_access, units
-from drivers.decoders.dbc.bits import SignalBits
-from drivers.decoders.dbc.join import Column, Message
+from drivers.data_types import ArrivalTimedFormat, CounterTimedFormat, Timing
+from drivers.decoders.dbc.sample_assembly import Column, Message
 from drivers.decoders.dbc.settings import COLUMNS, TEMPERATURE, Settings, SignalSettings
-from drivers.discovery import format_suggestion
+from drivers.decoders.dbc.signal_bits import SignalBits
 from drivers.errors import ConfigError
 from drivers.extras import check_extra
-from drivers.sample import ArrivalTimedFormat, CounterTimedFormat, Timing
+from drivers.module_lookup import format_suggestion
 
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
 SHIPPED_PREFIX: Final = "shipped:"

@@ -5,9 +5,9 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import BeforeValidator, Field
 
+from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from drivers.number_ranges import DELAY_S, SCALE, SOURCE_ADDRESS, TICK_S, format_value
-from drivers.sample import AXES
 from drivers.settings_model import Conflict, FileOrName, SettingsModel, one_of
 
 TEMPERATURE: Final = "temperature"

@@ -53,7 +53,7 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
     from rich.console import Console
 
     from monitor.daemon.operations.systemd import SystemdNotifier
-    from monitor.daemon.output_classes import LogOutput, TableOutput
+    from monitor.daemon.result_outputs import LogOutput, TableOutput
     from monitor.daemon.service import STATUS_INTERVAL_S, Service
     from monitor.publishing.remote_devices import DeviceStates
     from monitor.publishing.terminal.live_table import LiveTable
@@ -137,7 +137,7 @@ def run_fleet_viewer(
     import threading
 
     from monitor.publishing.rerun.fleet import FleetView, full_device_key
-    from monitor.publishing.rerun.view import RerunView
+    from monitor.publishing.rerun.queued_view import RerunView
     from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
     from monitor.publishing.terminal.queued_writer import QueuedWriter
     from monitor.publishing.zenoh.subscriber import ZenohSubscriber

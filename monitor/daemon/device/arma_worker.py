@@ -5,8 +5,8 @@ The identification of one axis takes about 50 ms. In the main loop, the identifi
 
 import threading
 
+from drivers.data_types import Floats
 from drivers.errors import NotReady
-from drivers.sample import Floats
 from monitor.drift.compensation.arma import ArmaModel, fit_arma
 from monitor.drift.compensation.compensator import Compensator
 from monitor.drift.compensation.live_compensation import LiveCompensation

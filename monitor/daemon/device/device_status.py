@@ -2,7 +2,7 @@
 
 import time
 
-from monitor.common.health import Health
+from monitor.common.device_health import Health
 from monitor.daemon.device.latency_meter import LatencyMeter
 from monitor.daemon.device.ring_buffer import RingBuffer
 from monitor.daemon.device.window_restore import WindowRestore

@@ -9,8 +9,8 @@ import time
 from collections import deque
 from typing import Final
 
+from drivers.data_types import Event, Ints, SampleBlock
 from drivers.driver import Driver
-from drivers.sample import Event, Ints, SampleBlock
 from monitor.daemon.slewed_clock import MAX_SLEW_RATE, SlewedClock
 
 MAX_UNTIMED_EVENTS: Final = 100

@@ -10,18 +10,18 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Final
 
+from drivers.data_types import Chunk, Floats, SampleBlock
 from drivers.driver import Driver
 from drivers.links.base import Link
 from drivers.links.replay_link import ReplayLink
-from drivers.sample import Chunk, Floats, SampleBlock
 from drivers.timing.sample_clock import SampleClock
-from monitor.common.health import Health
+from monitor.common.device_health import Health
 from monitor.daemon.device.device_status import DeviceStatus
 from monitor.daemon.device.pipeline import DevicePipeline
 from monitor.daemon.device.ring_buffer import RingBuffer
 from monitor.daemon.device.window_restore import WindowRestore
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
-from monitor.daemon.operations.limits import LimitMonitor, read_model_in_force
+from monitor.daemon.operations.coefficient_limits import LimitMonitor, read_model_in_force
 from monitor.daemon.output import Output
 from monitor.daemon.result_publisher import ResultPublisher
 from monitor.daemon.storage.recorder import Recorder

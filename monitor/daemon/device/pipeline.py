@@ -14,14 +14,14 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import AXES, Event, Floats, SampleBlock
 from drivers.errors import ConfigError
-from drivers.sample import AXES, Event, Floats, SampleBlock
 from monitor.common.compiled import interpreted
 from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.drift.thermal.live_thermal import LiveThermal, ThermalIntervalResult
-from monitor.estimation.detection.model_gap import PreparedModel
+from monitor.estimation.detection.model_comparison import PreparedModel
 from monitor.estimation.detection.signal_monitor import SignalMonitor
 from monitor.estimation.estimator import Estimator
 from monitor.estimation.window_snapshot import TemperatureRing, WindowSnapshot

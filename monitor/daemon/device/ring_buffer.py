@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from drivers.sample import SampleBlock, make_block
+from drivers.data_types import SampleBlock, make_block
 
 
 class RingBuffer:

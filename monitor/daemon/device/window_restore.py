@@ -10,9 +10,9 @@ from typing import Final
 import msgspec
 import numpy as np
 
+from drivers.data_types import AXES, Event, Ints, SampleBlock, make_block
 from drivers.errors import ImuError
-from drivers.recordings.segment import DaemonState
-from drivers.sample import AXES, Event, Ints, SampleBlock, make_block
+from drivers.recordings.segment_file import DaemonState
 from drivers.timing.sample_clock import LastSample, SampleClock
 from monitor.daemon.device.device_timeline import DeviceTimeline
 from monitor.daemon.device.pipeline import DevicePipeline

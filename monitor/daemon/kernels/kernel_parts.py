@@ -9,8 +9,8 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import SampleBlock, make_block
 from drivers.extras import find_missing_packages
-from drivers.sample import SampleBlock, make_block
 from monitor.drift.compensation.arma import fit_arma
 from monitor.drift.compensation.compensator import Compensator
 from monitor.drift.thermal import thermal_response
@@ -92,7 +92,7 @@ def _call_analysis() -> None:
 def _call_reconciliation() -> None:
     from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
     from monitor.noise.model import NoiseModel
-    from monitor.reconcile.preparation.recording import Recording
+    from monitor.reconcile.preparation.reconcile_input import Recording
     from monitor.reconcile.reconcile import reconcile  # imported here because the service does not need it
 
     model = NoiseModel({"gz": (AngleRandomWalk(N=1e-4), BiasInstability(B=3e-5), RateRandomWalk(K=1e-6))})

@@ -26,7 +26,7 @@ from typing import Final
 
 import structlog
 
-from drivers.sample import Event
+from drivers.data_types import Event
 from monitor.daemon.output import Output
 from monitor.publishing.messages.results import EventMessage
 from monitor.settings.loading import Hook

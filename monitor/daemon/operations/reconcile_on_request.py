@@ -27,7 +27,7 @@ from typing import Any, Final
 import msgspec
 import numpy as np
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.common.program import PROGRAM
 from monitor.estimation.window_snapshot import WindowSnapshot
 from monitor.publishing.messages.results import ReconcileReply

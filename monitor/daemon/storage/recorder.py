@@ -22,15 +22,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
+from drivers.data_types import AXES, Chunk, Ints, SampleBlock, make_block
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError, RecordingError
-from drivers.recordings import segment
-from drivers.recordings.segment import DaemonState, SegmentMetadata, SingleSegmentWriter
-from drivers.sample import AXES, Chunk, Ints, SampleBlock, make_block
+from drivers.recordings import segment_file as segment
+from drivers.recordings.segment_file import DaemonState, SegmentMetadata, SingleSegmentWriter
 from monitor.common.folder_lock import RECORDING_LOCK, FolderLock
 from monitor.daemon.storage import retention
+from monitor.daemon.storage.device_recording import RETRY_S, Opening, RecorderEvent, RecordingTrack, stopped_text
 from monitor.daemon.storage.recording_tail import RecordingTail, find_tail
-from monitor.daemon.storage.recording_track import RETRY_S, Opening, RecorderEvent, RecordingTrack, stopped_text
 from monitor.settings.loading import Storage
 
 WRITE_INTERVAL_S: Final = 0.5

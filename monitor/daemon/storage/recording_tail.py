@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.recordings import segment
-from drivers.recordings.segment import SegmentMetadata, SegmentPiece
+from drivers.recordings import segment_file as segment
+from drivers.recordings.segment_file import SegmentMetadata, SegmentPiece
 
 
 @dataclass(frozen=True, slots=True)

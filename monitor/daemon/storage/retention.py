@@ -7,7 +7,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Final
 
-from drivers.recordings import segment
+from drivers.recordings import segment_file as segment
 
 MIN_KEPT_SEGMENTS: Final = 2
 """Number of newest segments in a folder that are never deleted, because they are needed to rebuild the window."""

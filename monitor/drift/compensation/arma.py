@@ -21,8 +21,8 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import Floats
 from drivers.errors import NotReady
-from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.common.distributions import HALF_CHI2_95
 from monitor.common.minimization import minimize_bfgs

@@ -22,7 +22,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled, inlined
 
 MAX_MEMORY_S: Final = 10.0

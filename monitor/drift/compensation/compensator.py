@@ -17,8 +17,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from drivers.data_types import AXES, Floats, Ints
 from drivers.errors import NotReady
-from drivers.sample import AXES, Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import ORDERS, ArmaModel, Order, fit_arma

@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import AXES, Event, Floats, SampleBlock, make_block
+from drivers.data_types import AXES, Event, Floats, SampleBlock, make_block
 from monitor.common.units import format_rate
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.compensator import GYROS, Compensator, DriftInterval

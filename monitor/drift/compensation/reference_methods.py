@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import Floats
 from drivers.errors import ConfigError, NotReady
-from drivers.sample import Floats
 from monitor.common.compiled import compiled
 from monitor.common.distributions import NORMAL_QUARTILE
 

@@ -24,7 +24,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.common.compiled import compiled
 from monitor.drift.compensation.arma import ArmaModel, stationary_covariance
 

@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 
 PARTS_PER_INTERVAL: Final = 8
 """Number of parts of an interval. The scatter of the parts determines the standard error of the mean."""

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import AXES, Event, SampleBlock
+from drivers.data_types import AXES, Event, SampleBlock
 from monitor.common.units import format_rate
 from monitor.drift.thermal.interval_means import PARTS_PER_INTERVAL
 from monitor.drift.thermal.online_thermal_model import MAX_INTERVALS, OnlineThermalModel, PredictedAxisInterval

@@ -26,7 +26,7 @@ import numpy as np
 
 from drivers.errors import NotReady
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.recursive_least_squares import PredictionInterval, RecursiveThermalFit
+from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval, RecursiveThermalFit
 from monitor.drift.thermal.residual_alarm import ResidualAlarm, UnexplainedChange
 from monitor.drift.thermal.thermal_fit import StepwiseWork, fit_in_steps
 from monitor.drift.thermal.thermal_model import ThermalModel

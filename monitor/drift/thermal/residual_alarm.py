@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 
 from monitor.common.distributions import Z95
-from monitor.drift.thermal.recursive_least_squares import PredictionInterval
+from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 
 MIN_OUTSIDE: Final = 4
 """Number of intervals above, or below, their prediction intervals that causes a suspicion."""

@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.drift.thermal.interval_means import MIN_KNOWN_SHARE, PARTS_PER_INTERVAL, standard_error
 
 BUFFER_ROWS: Final = 1024

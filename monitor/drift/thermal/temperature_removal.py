@@ -15,16 +15,16 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import AXES, Floats
 from drivers.errors import NotReady
-from drivers.sample import AXES, Floats
+from monitor.drift.thermal.bias_temperature_tests import TemperatureDependence, find_dependence
 from monitor.drift.thermal.interval_means import compute_interval_means
-from monitor.drift.thermal.temperature_dependence import TemperatureDependence, find_dependence
 from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means_suffice, fit_thermal_model
 from monitor.drift.thermal.thermal_model import predict
-from monitor.drift.thermal.thermal_study import choose_interval_s
+from monitor.drift.thermal.thermal_results import choose_interval_s
 from monitor.estimation.allan.batch import EachAxis
 from monitor.estimation.analysis import Analysis, fit_other_samples
-from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 
 SLOW_LETTERS: Final = ("K", "R")
 

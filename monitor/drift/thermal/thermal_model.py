@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.common.distributions import Z95
 from monitor.drift.thermal.thermal_response import (
     ThermalModelForm,

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.common.compiled import compiled
 
 

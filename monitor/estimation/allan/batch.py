@@ -29,8 +29,8 @@ from typing import Final, Literal
 
 import numpy as np
 
+from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
-from drivers.sample import Floats, Ints
 from monitor.common.compiled import compiled
 
 TauGrid = Literal["octave", "decade10"] | tuple[float, ...]

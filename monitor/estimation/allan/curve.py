@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,8 +18,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.data_types import Floats
 from drivers.errors import ConfigError, NotReady
-from drivers.sample import Floats
 from monitor.estimation.allan.batch import TauGrid, cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH, AllanWindow

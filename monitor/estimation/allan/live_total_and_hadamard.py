@@ -25,12 +25,12 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
-from drivers.sample import Floats, Ints
 from monitor.estimation.allan import hadamard, total
 from monitor.estimation.allan.batch import octaves
-from monitor.estimation.allan.difference_moments import Moments, PhaseRing, variance_of_sums
 from monitor.estimation.allan.hadamard import HadamardCurve
+from monitor.estimation.allan.squared_difference_moments import Moments, PhaseRing, variance_of_sums
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.allan.window import FULL_SCALE, AllanWindow
 from monitor.estimation.allan.window_kernel import AXES

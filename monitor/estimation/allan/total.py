@@ -32,10 +32,10 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.batch import octaves
-from monitor.estimation.allan.difference_moments import (
+from monitor.estimation.allan.squared_difference_moments import (
     NUM_COEFFICIENTS,
     Moments,
     PhaseRing,

@@ -24,7 +24,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import chi2_quantile
 from monitor.noise.effects.ieee952.bias_instability import FLICKER_AVAR, BiasInstability

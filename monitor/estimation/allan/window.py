@@ -31,8 +31,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.data_types import Floats, Ints
 from drivers.errors import ConfigError
-from drivers.sample import Floats, Ints
 from monitor.estimation.allan.window_kernel import (
     AXES,
     LANES,

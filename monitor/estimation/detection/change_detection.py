@@ -39,9 +39,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.number_ranges import DAY_S
-from drivers.sample import AXES, Floats
 from monitor.common.units import format_rate
 from monitor.estimation.detection.change_kernel import (
     AFTER,

@@ -25,7 +25,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.standard_terms import unit_allan_variances
 
 CHANGE_SYMBOLS: Final = "QNBK"

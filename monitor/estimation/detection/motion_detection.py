@@ -20,7 +20,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import AXES, Floats, Ints, SampleBlock, make_block
+from drivers.data_types import AXES, Floats, Ints, SampleBlock, make_block
 from monitor.common.units import format_rate
 from monitor.estimation.detection.motion_kernel import (
     AXIS,

@@ -8,7 +8,7 @@ requests a restart of the estimate of one axis. The change detector never receiv
 from dataclasses import dataclass
 from typing import Final
 
-from drivers.sample import AXES, Event, SampleBlock
+from drivers.data_types import AXES, Event, SampleBlock
 from monitor.estimation.detection.change_detection import Change, ChangeDetector
 from monitor.estimation.detection.motion_detection import Motion, MotionDetector
 

@@ -34,17 +34,17 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.estimation.allan.uncertainty import NOISES, CovarianceTable
-from monitor.estimation.fit.coefficients import Coefficients, Status
-from monitor.estimation.fit.fit_arrays import (
+from monitor.estimation.fit.coefficient_values import Coefficients, Status
+from monitor.estimation.fit.fit_kernel import WHITE, fit_axes
+from monitor.estimation.fit.fit_kernel_types import (
     CurvesOfAxes,
     FitOptions,
     SharedInputs,
     empty_fit_output,
     empty_solution_maps,
 )
-from monitor.estimation.fit.fit_kernel import WHITE, fit_axes
 from monitor.estimation.fit.least_squares import N, R
 from monitor.noise.standard_terms import unit_allan_variances
 

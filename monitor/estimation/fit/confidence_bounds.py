@@ -4,10 +4,10 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
-from monitor.estimation.fit.fit_arrays import TermResults
+from monitor.estimation.fit.fit_kernel_types import TermResults
 from monitor.estimation.fit.least_squares import N, Q
 
 UPPER_BOUND_Z: Final = Z95

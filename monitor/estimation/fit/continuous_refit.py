@@ -26,7 +26,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled, inlined
 from monitor.estimation.allan.uncertainty import NOISES, UNLIMITED_SAMPLES, AxisCovarianceTables, CovarianceTable
 from monitor.estimation.allan.window import AllanWindow
@@ -44,8 +44,9 @@ from monitor.estimation.allan.window_kernel import (
     slope_of_thirds,
 )
 from monitor.estimation.fit.coefficient_fit import THRESHOLDS_WATCHED, TO_SI, Design, shared_inputs
-from monitor.estimation.fit.coefficients import Status
-from monitor.estimation.fit.fit_arrays import (
+from monitor.estimation.fit.coefficient_values import Status
+from monitor.estimation.fit.fit_kernel import fit_axes
+from monitor.estimation.fit.fit_kernel_types import (
     LIMIT_COUNT,
     CurvesOfAxes,
     FitOptions,
@@ -55,7 +56,6 @@ from monitor.estimation.fit.fit_arrays import (
     empty_fit_output,
     empty_solution_maps,
 )
-from monitor.estimation.fit.fit_kernel import fit_axes
 from monitor.estimation.fit.least_squares import Q, R, invert_on_subset, nonzero_term_bits, solve_nonnegative
 
 REFRESH: Final = 2

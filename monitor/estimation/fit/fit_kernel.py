@@ -11,11 +11,11 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES, PAIRS
 from monitor.estimation.fit.confidence_bounds import bound_by_first_point, limit_by_curve
-from monitor.estimation.fit.fit_arrays import (
+from monitor.estimation.fit.fit_kernel_types import (
     CurvesOfAxes,
     FitOptions,
     FitOutput,

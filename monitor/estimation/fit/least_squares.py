@@ -8,10 +8,10 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.estimation.allan.uncertainty import NOISES
-from monitor.estimation.fit.fit_arrays import LeastSquares
+from monitor.estimation.fit.fit_kernel_types import LeastSquares
 
 SINGULAR_COVARIANCE: Final = 1e-9
 """Pivots of the correlation matrix of the observations below this value are rounding errors."""

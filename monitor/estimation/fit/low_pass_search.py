@@ -19,12 +19,12 @@ from typing import Final, Literal
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.minimization import golden_section
 from monitor.estimation.allan.batch import MIN_PRESENT_SHARE
 from monitor.estimation.allan.uncertainty import CovarianceTable
 from monitor.estimation.fit.coefficient_fit import Design, Fit, MeasuredCurve, fit, replace_axis
-from monitor.estimation.fit.coefficients import Status
+from monitor.estimation.fit.coefficient_values import Status
 from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, upper_limit
 from monitor.estimation.fit.least_squares import N, Q
 

@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
 from monitor.estimation.allan.uncertainty import NOISES
 from monitor.estimation.fit.confidence_bounds import UPPER_BOUND_Z, interval_end, pearson_quantile
-from monitor.estimation.fit.fit_arrays import (
+from monitor.estimation.fit.fit_kernel_types import (
     LIMIT_COUNT,
     CurvesOfAxes,
     FitOptions,

@@ -16,16 +16,16 @@ from typing import Any, Final
 
 from drivers.errors import ConfigError
 from drivers.number_ranges import COEFFICIENT, INFLATION
-from monitor.publishing.exporters.gyroparams import gyroparams
-from monitor.publishing.exporters.kalibr import kalibr
-from monitor.publishing.exporters.kalman import kalman
-from monitor.publishing.exporters.noise import (
+from monitor.publishing.exporters.exported_coefficients import (
     NoiseCoefficients,
     Term,
     from_analysis,
     from_model,
     missing_coefficient_error,
 )
+from monitor.publishing.exporters.gyroparams import gyroparams
+from monitor.publishing.exporters.kalibr import kalibr
+from monitor.publishing.exporters.kalman import kalman
 
 __all__ = ["FORMATS", "NoiseCoefficients", "Term", "export", "from_analysis", "from_model"]
 

@@ -13,7 +13,7 @@ the bound.
 from typing import Final
 
 from monitor.common.units import Kind, axes_of
-from monitor.publishing.exporters.noise import (
+from monitor.publishing.exporters.exported_coefficients import (
     NoiseCoefficients,
     ascii_unit,
     header_comments,

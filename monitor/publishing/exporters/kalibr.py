@@ -11,7 +11,7 @@ from typing import Final
 
 from drivers.errors import ConfigError
 from monitor.common.units import Kind
-from monitor.publishing.exporters.noise import (
+from monitor.publishing.exporters.exported_coefficients import (
     COEFFICIENT_EFFECTS,
     NoiseCoefficients,
     Term,

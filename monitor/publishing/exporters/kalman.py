@@ -23,12 +23,12 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import Floats
 from drivers.errors import ConfigError
 from drivers.number_ranges import DURATION_S
-from drivers.sample import Floats
 from monitor.common.units import sensor_kind
 from monitor.noise.effects import BiasInstability
-from monitor.publishing.exporters.noise import (
+from monitor.publishing.exporters.exported_coefficients import (
     NoiseCoefficients,
     Term,
     ascii_unit,

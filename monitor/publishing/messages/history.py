@@ -13,13 +13,13 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 from numpy.typing import NDArray
 
-from drivers.sample import AXES, Floats, Ints
+from drivers.data_types import AXES, Floats, Ints
 from monitor.common import topics
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.history.bucket import COUNTS, STATES
-from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
-from monitor.history.query import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, HistoryQuery
-from monitor.history.reading import MAX_EVENTS, ColumnStatistics, HistoryTable
+from monitor.history.column_conversion import HEALTH_COLUMNS, TEMPERATURE_COLUMNS
+from monitor.history.history_table import MAX_EVENTS, ColumnStatistics, HistoryTable
+from monitor.history.query_parameters import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, HistoryQuery
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages.message import Message, decode_message, remove_control_characters, shared_fields

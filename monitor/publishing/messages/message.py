@@ -15,7 +15,7 @@ from typing import Annotated, Any, ClassVar, Final, Self, TypeVar
 import msgspec
 import numpy as np
 
-from drivers.sample import Ints
+from drivers.data_types import Ints
 from monitor.common.topics import Topic
 
 MAX_PAYLOAD_BYTES: Final = 1_000_000

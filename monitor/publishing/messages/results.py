@@ -9,17 +9,17 @@ import numpy as np
 from msgspec import UNSET, UnsetType
 
 from drivers.credential_masking import mask_secrets
-from drivers.sample import AXES, Event, Floats
+from drivers.data_types import AXES, Event, Floats
 from monitor.common import topics
-from monitor.common.health import Health
+from monitor.common.device_health import Health
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.drift.thermal.recursive_least_squares import PredictionInterval
+from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from monitor.noise.standard_terms import unit_allan_variances
 from monitor.publishing.messages.message import Count, Message, decode_message, remove_control_characters, shared_fields
 

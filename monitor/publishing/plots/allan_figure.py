@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.common.units import DEVIATION_UNITS, KIND_NAMES, Kind, axes_of
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.standard_terms import UNIT_SOURCES
 from monitor.publishing.plots.style import COLOURS, DARK, GREY, LABEL_BOX, draw_band, draw_legend_above, style_log_axis
 

@@ -11,12 +11,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KINDS, Kind, axes_of, format_duration
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.analysis import Analysis
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing.coefficient_cells import (
     TEMPERATURE_MARK,
     TEMPERATURE_MEANS,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.common.distributions import Z95
 from monitor.common.units import DEVIATION_UNITS, format_duration
 from monitor.drift.compensation.compensation_result import AxisCompensation, CompensationResult

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, Kind, axes_of
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing.plots import style
 
 if TYPE_CHECKING:

@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.data_types import AXES, Floats
 from drivers.errors import NotReady
 from drivers.number_ranges import DAY_S
-from drivers.sample import AXES, Floats
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KIND_NAMES, KINDS, Kind, axes_of
-from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.history.bucket import COUNTS, STATES
-from monitor.history.reading import HistoryTable
+from monitor.history.history_table import HistoryTable
 from monitor.history.stored_events import StoredEvent
 from monitor.publishing.plots import style
 from monitor.publishing.terminal.history_text import summary_line

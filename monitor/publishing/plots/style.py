@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
+from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from drivers.sample import AXES, Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

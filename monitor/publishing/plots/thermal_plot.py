@@ -8,7 +8,7 @@ import numpy as np
 from monitor.common.units import DEVIATION_UNITS, format_duration, sensor_kind
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_model import Prediction, predict
-from monitor.drift.thermal.thermal_study import ThermalFitReport, ThermalPredictionReport
+from monitor.drift.thermal.thermal_results import ThermalFitReport, ThermalPredictionReport
 from monitor.publishing.plots import style
 
 ROW_INCHES: Final = (11.0, 2.6)

@@ -8,12 +8,12 @@ SVG, so that the page stays below one megabyte.
 from pathlib import Path
 from typing import Any, Final
 
+from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.sample import AXES
 from monitor.common.units import COEFFICIENT_NAMES, KIND_NAMES, Kind, axes_of, format_duration, format_number
 from monitor.estimation.analysis import Analysis
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing.coefficient_cells import (
     TEMPERATURE_MARK,
     TEMPERATURE_MEANS,

@@ -7,7 +7,7 @@ was found in some recordings only, the page states for each other recording why 
 
 from monitor.common.units import format_duration
 from monitor.noise.effects import EFFECTS
-from monitor.publishing.plots.diagnostic_figure import interval_chart_svg
+from monitor.publishing.plots.reconcile_figures import interval_chart_svg
 from monitor.publishing.plots.style import axis_colour
 from monitor.publishing.reports import comparison_sentences, reconcile_sentences
 from monitor.publishing.reports.html_page import render_template

@@ -10,13 +10,13 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import Floats
 from drivers.recordings.formats import find_format
 from drivers.recordings.writing import atomic_write_path
-from drivers.sample import Floats
 from monitor.common.units import sensor_kind
 from monitor.history.bucket import COUNTS, STATES
-from monitor.history.reading import HistoryTable
-from monitor.publishing.exporters.noise import ascii_unit
+from monitor.history.history_table import HistoryTable
+from monitor.publishing.exporters.exported_coefficients import ascii_unit
 
 STATUS_UNITS: Final = {"rate": "Hz", "latency": "s", "memory": "B", "temperature": "degC"}
 STATE_COLUMN_NAME: Final = "state (" + "; ".join(f"{i} {name}" for i, name in enumerate(STATES)) + ")"

@@ -10,11 +10,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Final
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.common.units import format_duration
 from monitor.noise.effects import EFFECTS
-from monitor.publishing.plots import diagnostic_figure, style
-from monitor.publishing.plots.diagnostic_figure import compared_diagnostic_svg, detail_view, select_view
+from monitor.publishing.plots import reconcile_figures as diagnostic_figure
+from monitor.publishing.plots import style
+from monitor.publishing.plots.reconcile_figures import compared_diagnostic_svg, detail_view, select_view
 from monitor.publishing.reports import reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
 from monitor.reconcile.result import AxisResult, DiagnosticGap, DiagnosticSnapshot, PlotData, Reconciliation

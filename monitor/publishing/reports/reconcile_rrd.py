@@ -18,15 +18,15 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
-from drivers.sample import AXES, Floats
 from monitor.common.units import format_duration
-from monitor.publishing.plots import colours
-from monitor.publishing.plots.diagnostic_figure import MAX_MARKERS, DiagnosticPlot, to_field_units, value_limits
+from monitor.publishing.plots import axis_colours as colours
+from monitor.publishing.plots.reconcile_figures import MAX_MARKERS, DiagnosticPlot, to_field_units, value_limits
 from monitor.publishing.reports import reconcile_sentences as words
 from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH, Scale, clip_to_box, decade_range, finite_sections
 from monitor.publishing.rerun.allan_drawing import fill_band, log_grid, log_lines
-from monitor.publishing.rerun.views import collapsed_blueprint, drawing_view, markdown
+from monitor.publishing.rerun.shared_views import collapsed_blueprint, drawing_view, markdown
 from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation
 
 APPLICATION: Final = "imu-monitor"

@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 from math import floor, isfinite, log10, nan
 from typing import Any, Final
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEGREE,
@@ -27,7 +27,7 @@ from monitor.common.units import (
 from monitor.noise.effect import gyro_and_accel_units
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
-from monitor.publishing.exporters.noise import COEFFICIENT_EFFECTS
+from monitor.publishing.exporters.exported_coefficients import COEFFICIENT_EFFECTS
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AxisResult,

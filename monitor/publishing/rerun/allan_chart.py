@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 
 WIDTH: Final = 16.0
 HEIGHT: Final = 11.5

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.common.units import DEVIATION_UNITS, KINDS, Kind, axes_of, sensor_kind
-from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.publishing.plots import colours
-from monitor.publishing.plots.colours import Colour
+from monitor.publishing.plots import axis_colours as colours
+from monitor.publishing.plots.axis_colours import Colour
 from monitor.publishing.rerun.allan_chart import (
     FILL_STEPS,
     HEIGHT,

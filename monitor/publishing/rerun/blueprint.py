@@ -14,9 +14,7 @@ from rerun.blueprint.encodings import TimelineColumn
 from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, KIND_NAMES, KINDS, SAMPLE_UNITS, Kind, axes_of
 from monitor.publishing.rerun import dynamic_heat_map
 from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH
-from monitor.publishing.rerun.scene import PANELS
-from monitor.publishing.rerun.viewer_settings import DeviceInfo
-from monitor.publishing.rerun.views import (
+from monitor.publishing.rerun.shared_views import (
     RAW_SAMPLES_S,
     TIMELINE,
     collapsed_blueprint,
@@ -24,6 +22,8 @@ from monitor.publishing.rerun.views import (
     temperature_view,
     time_series_view,
 )
+from monitor.publishing.rerun.viewer_content import PANELS
+from monitor.publishing.rerun.viewer_settings import DeviceInfo
 
 NOW_COEFFICIENTS: Final = ("N", "B")
 DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 
 ROWS_PER_S: Final = 200.0
 BUCKETS_PER_S: Final = 95.0  # two rows per bucket, and some rows for the buckets that a flush divides

@@ -14,11 +14,11 @@ import numpy as np
 import rerun as rr
 from PIL import Image  # installed with rerun-sdk
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.common.units import format_utc
-from monitor.publishing.plots import colours
+from monitor.publishing.plots import axis_colours as colours
 from monitor.publishing.rerun.allan_drawing import Log, label_points
-from monitor.publishing.rerun.allan_history import COLUMNS, AllanHistory
+from monitor.publishing.rerun.allan_history_table import COLUMNS, AllanHistory
 
 HEIGHT: Final = 60  # approximate height of an image [pixels]; three images fit into a tab
 COLOUR_SCALE_RATIO: Final = 2.0  # ends of the colour scale: half and twice the median

@@ -18,7 +18,7 @@ from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import AllanMessage, EventMessage, StatusMessage
 from monitor.publishing.remote_devices import DeviceStates, split_key
 from monitor.publishing.rerun.panel_text import fleet_text
-from monitor.publishing.rerun.view import RerunView
+from monitor.publishing.rerun.queued_view import RerunView
 from monitor.publishing.result_kinds import DeviceTableText, SampleRows
 from monitor.publishing.terminal.watch import connection_note
 from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber

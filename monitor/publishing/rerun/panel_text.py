@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from monitor.common.health import Health
+from monitor.common.device_health import Health
 from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEVIATION_UNITS,
@@ -25,7 +25,7 @@ from monitor.common.units import (
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import measured_axes

@@ -9,7 +9,7 @@ from rich.text import Text
 
 from monitor.common.units import COEFFICIENT_UNITS, KIND_NAMES, KINDS, NO_VALUE, Kind, axes_of, format_duration
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.publishing.coefficient_cells import (
     TEMPERATURE_MARK,
     TEMPERATURE_MEANS,

@@ -13,7 +13,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.common.units import (
     KIND_NAMES,
     KINDS,
@@ -26,7 +26,7 @@ from monitor.common.units import (
     unit_of,
 )
 from monitor.history.bucket import COUNTS, STATES
-from monitor.history.reading import ColumnStatistics, HistoryTable
+from monitor.history.history_table import ColumnStatistics, HistoryTable
 from monitor.publishing.terminal.tables import plain_table
 
 LETTERS: Final = ("N", "B", "K")

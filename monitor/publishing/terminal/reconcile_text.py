@@ -14,7 +14,7 @@ from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.common.units import format_duration
 from monitor.publishing.reports import comparison_sentences
 from monitor.publishing.reports import reconcile_sentences as words

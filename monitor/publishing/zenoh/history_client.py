@@ -10,10 +10,10 @@ from typing import Any, Final
 
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError, LinkUnavailable, NotReady
-from drivers.zenoh.connection_errors import explain_refusals
+from drivers.zenoh.connection_diagnosis import explain_refusals
 from drivers.zenoh.session_config import format_zenoh_error
 from monitor.common import topics
-from monitor.history.reading import HistoryTable
+from monitor.history.history_table import HistoryTable
 from monitor.publishing.messages.history import decode_history
 from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.zenoh.subscriber import client_configurations
@@ -36,7 +36,7 @@ def query_histories(
     device
         Name of the device; ``*`` for all devices.
     parameters
-        Parameters of the selector, see ``monitor.history.query``.
+        Parameters of the selector, see ``monitor.history.query_parameters``.
     prefix
         Prefix of the daemon's keys.
     file

@@ -17,7 +17,7 @@ from typing import Final
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.effects import (
     PoissonSteps,
     RandomSampleHold,

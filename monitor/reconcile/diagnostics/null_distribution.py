@@ -19,7 +19,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS, Finding
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 from monitor.reconcile.result import DiagnosticGap

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtri, erfc
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.distributions import Z95
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 from monitor.noise.spectrum import allan_of_density

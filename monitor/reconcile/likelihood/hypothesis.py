@@ -15,8 +15,8 @@ import numpy as np
 
 from monitor.common.distributions import HALF_CHI2_95, Z95
 from monitor.noise.effect import Effect
-from monitor.reconcile.likelihood.axis import Axis, AxisFit, Effects
-from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS, size
+from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
+from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS, size
 from monitor.reconcile.result import ParameterInterval
 
 RESIZE_PENALTY_NATS: Final = 5.0

@@ -23,7 +23,7 @@ import numpy as np
 from scipy.fft import fft
 from scipy.special import gammaincc, gammaln, polygamma, psi
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
 from monitor.reconcile.preparation.value_statistics import ValueWithInterval

@@ -10,11 +10,11 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.noise.effect import Effect, first_sample_index
 from monitor.noise.effects import NoiseStep
-from monitor.reconcile.likelihood.axis import Axis, AxisFit, Effects
-from monitor.reconcile.likelihood.outlier_statistics import OutlierFit, fit_outliers
+from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
+from monitor.reconcile.likelihood.outlier_fit import OutlierFit, fit_outliers
 from monitor.reconcile.likelihood.variance_history import (
     LeastConstantTiles,
     VarianceChangeFit,

@@ -19,7 +19,7 @@ from typing import Final
 import numpy as np
 from scipy.fft import dct, idct
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 
 SINGLE_COEFFICIENT_BINS: Final = 48
 """Number of bins at the lowest frequencies that contain one coefficient each."""

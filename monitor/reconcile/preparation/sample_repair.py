@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 from scipy.special import log_ndtr, ndtr, ndtri
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 from monitor.reconcile.preparation.value_statistics import Mask
 

@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtr, xlogy
 
+from drivers.data_types import Floats
 from drivers.number_ranges import HOUR_S
-from drivers.sample import Floats
 from drivers.units import DEGREE, G0
 from monitor.common.compiled import compiled
 from monitor.common.distributions import Z95
-from monitor.estimation.detection.resolution import GRID_TOLERANCE, SIGMA_PER_MEAN_DISTANCE
+from monitor.estimation.detection.coarse_quantization import GRID_TOLERANCE, SIGMA_PER_MEAN_DISTANCE
 
 Mask = NDArray[np.bool_]
 

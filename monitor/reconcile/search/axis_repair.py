@@ -11,14 +11,14 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.effects import Outliers, RandomSampleHold, Saturation
-from monitor.reconcile.likelihood.axis import Axis, Effects, RegressorCache, ValueStatistics
+from monitor.reconcile.likelihood.axis_fit import Axis, Effects, RegressorCache, ValueStatistics
 from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
-from monitor.reconcile.likelihood.outlier_statistics import fit_outliers
+from monitor.reconcile.likelihood.outlier_fit import fit_outliers
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins
-from monitor.reconcile.preparation.recording import Recording
+from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.preparation.sample_repair import fill_missing, restore_clipped
 from monitor.reconcile.preparation.value_statistics import detect_clipping, detect_quantization, detect_repeats
 

@@ -33,7 +33,7 @@ from monitor.noise.effects import (
     TurnOnTransient,
 )
 from monitor.reconcile.diagnostics.diagnostics import find_line_peaks, free_variance_gain_nats, level_step_gains
-from monitor.reconcile.likelihood.axis import Axis, Effects
+from monitor.reconcile.likelihood.axis_fit import Axis, Effects
 from monitor.reconcile.likelihood.hypothesis import refine_shape
 from monitor.reconcile.likelihood.whitening import WhitenedAxis
 

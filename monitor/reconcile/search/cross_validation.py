@@ -14,13 +14,13 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Outliers, RandomSampleHold, Resolution, Saturation, Sinusoidal
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
-from monitor.reconcile.likelihood.axis import Axis, AxisFit, Effects, RegressorCache
-from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMETERS, ONE_TIME_EFFECTS, size
+from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects, RegressorCache
+from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, ONE_TIME_EFFECTS, size
 from monitor.reconcile.likelihood.hypothesis import Hypothesis, noise_indices
 from monitor.reconcile.likelihood.whitening import whiten_axis
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins, inverse_cosine_transform

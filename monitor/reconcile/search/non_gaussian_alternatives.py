@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Final
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.effects import (
     AngleRandomWalk,
     BiasInstability,
@@ -20,13 +20,13 @@ from monitor.noise.effects import (
     RandomTelegraph,
     RateRandomWalk,
 )
-from monitor.reconcile.likelihood.axis import AxisFit, Effects
-from monitor.reconcile.likelihood.effect_terms import size
-from monitor.reconcile.likelihood.event_process_comparison import BackgroundNoise
+from monitor.reconcile.likelihood.axis_fit import AxisFit, Effects
+from monitor.reconcile.likelihood.effect_roles import size
 from monitor.reconcile.likelihood.hypothesis import Hypothesis
-from monitor.reconcile.likelihood.poisson_steps import compare_poisson_with_random_walk
-from monitor.reconcile.likelihood.random_telegraph import compare_telegraph_with_correlated_noise
-from monitor.reconcile.likelihood.single_steps import compare_poisson_with_single_steps
+from monitor.reconcile.likelihood.poisson_steps_vs_random_walk import compare_poisson_with_random_walk
+from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
+from monitor.reconcile.likelihood.state_space_comparison import BackgroundNoise
+from monitor.reconcile.likelihood.telegraph_vs_correlated_noise import compare_telegraph_with_correlated_noise
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.search.candidates import PENALTY_NATS, fit_correlated_noise

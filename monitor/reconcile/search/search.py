@@ -17,8 +17,8 @@ from monitor.noise.effects import BiasStep, Outliers, RandomSampleHold, Saturati
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, run_diagnostics
 from monitor.reconcile.diagnostics.plot_data import plot_data
-from monitor.reconcile.likelihood.axis import Axis, Effects
-from monitor.reconcile.likelihood.effect_terms import (
+from monitor.reconcile.likelihood.axis_fit import Axis, Effects
+from monitor.reconcile.likelihood.effect_roles import (
     MOST_DIRECT_DIAGNOSTIC,
     NOISE_SIZE_PARAMETERS,
     ONE_TIME_EFFECTS,

@@ -35,7 +35,7 @@ from monitor.noise.effects import (
     ScaleFactor,
 )
 from monitor.reconcile.diagnostics.diagnostics import STEP_MARGIN_FRACTION
-from monitor.reconcile.likelihood.axis import Effects
+from monitor.reconcile.likelihood.axis_fit import Effects
 from monitor.reconcile.likelihood.hypothesis import (
     Hypothesis,
     find_maximum_by_golden_section,

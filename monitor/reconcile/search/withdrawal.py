@@ -25,7 +25,7 @@ import numpy as np
 from monitor.noise.effect import Effect, Leak
 from monitor.noise.effects import BandwidthLimit, BiasStep, ExponentiallyCorrelated, Narrowband, Sinusoidal
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings
-from monitor.reconcile.likelihood.axis import Effects
+from monitor.reconcile.likelihood.axis_fit import Effects
 
 MIN_COMB_LINES: Final = 4
 MAX_HARMONIC: Final = 60

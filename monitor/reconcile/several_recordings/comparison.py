@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from math import hypot, nan, sqrt
 from typing import Final
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.noise.effect import Effect
 from monitor.noise.effects import Sinusoidal
 from monitor.noise.model import NoiseModel

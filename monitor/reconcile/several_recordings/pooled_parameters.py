@@ -16,7 +16,7 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtrc
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.common.distributions import Z95
 from monitor.reconcile.result import ParameterInterval
 

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.data_types import Chunk
 from drivers.decoders import base
 from drivers.decoders.base import HINT_FRAMES, NEED_MORE, REJECT, BlockBuilder, FrameBuffer, Frames
-from drivers.sample import Chunk
 
 
 def match(buffer: bytes, at: int) -> int:

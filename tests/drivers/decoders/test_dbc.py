@@ -10,12 +10,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from drivers.decoders import dbc
-from drivers.decoders.dbc.bits import SignalBits
-from drivers.decoders.dbc.database import SHIPPED
-from drivers.errors import ConfigError, LinkEnded
-from drivers.links import replay_link
-from drivers.sample import (
+from drivers.data_types import (
     ANY_SOURCE,
     AXES,
     EXTENDED_ID,
@@ -27,6 +22,11 @@ from drivers.sample import (
     concatenate_blocks,
     make_block,
 )
+from drivers.decoders import dbc
+from drivers.decoders.dbc.database import SHIPPED
+from drivers.decoders.dbc.signal_bits import SignalBits
+from drivers.errors import ConfigError, LinkEnded
+from drivers.links import replay_link
 from drivers.units import DEGREE, G0
 from tests.support.recordings import recordings
 from tests.support.settings import read_settings

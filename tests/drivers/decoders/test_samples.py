@@ -4,9 +4,9 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.data_types import Chunk, SenderTimedFormat, concatenate_blocks, make_block
 from drivers.decoders import samples
 from drivers.decoders.base import HINT_FRAMES
-from drivers.sample import Chunk, SenderTimedFormat, concatenate_blocks, make_block
 from drivers.zenoh.sample_message import encode_samples
 
 

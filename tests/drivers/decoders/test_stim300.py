@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from drivers.data_types import Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks, make_block
 from drivers.decoders.base import MAX_BYTES_WITHOUT_FRAME
 from drivers.decoders.stim300 import IDENTIFIERS, SIZES, Settings, build, datagram_crc, has_valid_crc
 from drivers.errors import ConfigError
-from drivers.sample import Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks, make_block
 from tests.support.settings import read_settings
 
 PUBLISHED = bytes.fromhex(

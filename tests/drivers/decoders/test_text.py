@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from drivers.data_types import ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
 from drivers.decoders.base import xor_checksum
 from drivers.decoders.text import MAX_LINE_BYTES, Settings, build
 from drivers.errors import ConfigError
-from drivers.sample import ArrivalTimedFormat, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
 from tests.support.settings import read_settings
 
 SIX = ("gx", "gy", "gz", "ax", "ay", "az")

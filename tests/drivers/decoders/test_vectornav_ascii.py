@@ -6,9 +6,9 @@ import gzip
 import numpy as np
 import pytest
 
+from drivers.data_types import Chunk, SampleBlock, concatenate_blocks
 from drivers.decoders.base import xor_checksum
 from drivers.decoders.vectornav_ascii import Settings, build
-from drivers.sample import Chunk, SampleBlock, concatenate_blocks
 from tests.support.recordings import recordings
 
 IMU = (

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
+from drivers.data_types import ArrivalTimedFormat, Chunk, SampleBlock, concatenate_blocks, make_block
 from drivers.decoders.witmotion import Settings, build, encode_packet
 from drivers.errors import ConfigError
-from drivers.sample import ArrivalTimedFormat, Chunk, SampleBlock, concatenate_blocks, make_block
 from tests.support.settings import read_settings
 
 DEGREE, G = math.pi / 180.0, 9.80665

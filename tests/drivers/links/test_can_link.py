@@ -19,11 +19,11 @@ import can
 import numpy as np
 import pytest
 
+from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk, concatenate_blocks
 from drivers.decoders import dbc
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable
 from drivers.links import can_link
 from drivers.links.can_link import CanLink
-from drivers.sample import ANY_SOURCE, EXTENDED_ID, Chunk, concatenate_blocks
 from tests.support.settings import read_settings
 
 UNIQUE = itertools.count()

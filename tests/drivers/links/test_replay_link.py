@@ -8,12 +8,12 @@ import can
 import numpy as np
 import pytest
 
+from drivers.data_types import EXTENDED_ID, Chunk, concatenate_blocks
 from drivers.decoders import samples
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable
 from drivers.links import base, replay_link
 from drivers.links.base import Link
 from drivers.recordings import load_samples
-from drivers.sample import EXTENDED_ID, Chunk, concatenate_blocks
 from tests.support.settings import read_settings
 
 FRAMES = [(0x9, False, bytes(range(8))), (0x0CF02AE2, True, b"\x00\x7d\x00\x7d\x00\x7d\x00\x05")] * 20

@@ -12,10 +12,10 @@ from typing import Any
 import pytest
 import zenoh
 
+from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkUnavailable
 from drivers.links import zenoh_link
 from drivers.links.base import Link
-from drivers.sample import Chunk
 from tests.support.ports import free_endpoint
 from tests.support.settings import read_settings
 from tests.support.waiting import PATIENCE_S, wait_for

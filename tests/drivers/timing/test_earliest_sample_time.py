@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.sample import CounterTimedFormat, SampleBlock, make_block
+from drivers.data_types import CounterTimedFormat, SampleBlock, make_block
 from drivers.timing.earliest_sample_time import SETTLED_S, WINDOW_S, EarliestSampleTime
 from drivers.timing.sample_clock import LastSample, SampleClock
 

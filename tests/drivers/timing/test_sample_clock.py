@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.sample import NO_TICK, ArrivalTimedFormat, CounterTimedFormat, SenderTimedFormat, make_block
+from drivers.data_types import NO_TICK, ArrivalTimedFormat, CounterTimedFormat, SenderTimedFormat, make_block
 from drivers.timing.arrival_regression import FORGET_S, ArrivalRegression, snap_to_standard_rate
 from drivers.timing.sample_clock import LastSample, SampleClock
 from tests.support.recordings import recordings

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.data_types import AXES, SampleBlock, make_block
 from drivers.errors import DecodeError
-from drivers.sample import AXES, SampleBlock, make_block
 from drivers.zenoh import sample_message
 from drivers.zenoh.sample_message import decode_samples, encode_samples
 from tests.support.ports import free_endpoint

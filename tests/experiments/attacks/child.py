@@ -74,7 +74,8 @@ def deadline(seconds: float) -> Iterator[None]:
 def replace_endless_commands() -> None:
     """Let services, ``reconcile`` and long simulations end where their arguments have been accepted."""
     from monitor.cli.shared import service_in_terminal
-    from monitor.commands import reconcile, simulate_recording
+    from monitor.commands import reconcile
+    from monitor.commands import simulate as simulate_recording
     from monitor.publishing.terminal import watch
 
     places: list[tuple[Any, str]] = [

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 import imu_monitor
-from drivers.sample import AXES
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from drivers.data_types import AXES
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.daemon.operations import reconcile_on_request
 
 ROOT: Final = Path(imu_monitor.__file__).resolve().parent

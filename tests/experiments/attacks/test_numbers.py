@@ -20,15 +20,16 @@ import pytest
 
 import drivers.decoders
 import drivers.links
-from drivers import discovery, number_ranges
+from drivers import module_lookup as discovery
+from drivers import number_ranges
+from drivers.data_types import AXES
 from drivers.errors import ConfigError, ImuError
 from drivers.number_ranges import NumberRange
 from drivers.recordings import load_samples
-from drivers.sample import AXES
 from drivers.settings_model import SettingsModel, WordOr, fields_by_key
 from monitor import cli
 from monitor.commands.analyze import Request, run_analysis
-from monitor.common import shipped_file_paths
+from monitor.common import shipped_config_paths as shipped_file_paths
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature

@@ -17,14 +17,15 @@ import numpy as np
 import pytest
 import zenoh
 
+from drivers.data_types import make_block
 from drivers.errors import LinkUnavailable
 from drivers.links import serial_link
-from drivers.recordings import load_samples, segment
-from drivers.sample import make_block
+from drivers.recordings import load_samples
+from drivers.recordings import segment_file as segment
 from drivers.zenoh.sample_message import encode_samples
 from drivers.zenoh.session_config import build_session_config
 from monitor.common import topics
-from monitor.daemon.operations.metrics import MetricsOutput
+from monitor.daemon.operations.prometheus_metrics import MetricsOutput
 from monitor.publishing.zenoh.publisher import ZenohPublisher
 from monitor.settings.loading import Metrics, ZenohTable
 from tests.experiments.benchmarks import faults
@@ -258,7 +259,7 @@ def test_two_daemons_on_one_metrics_port() -> None:
 @pytest.mark.attack
 @pytest.mark.timeout(600)
 def test_two_daemons_on_one_viewer_port() -> None:
-    from monitor.publishing.rerun.view import RerunView
+    from monitor.publishing.rerun.queued_view import RerunView
     from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 
     settings = ViewerSettings("web", free_port(), free_port())

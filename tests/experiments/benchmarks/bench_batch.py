@@ -16,8 +16,8 @@ from typing import Final
 import allantools
 import numpy as np
 
+from drivers.data_types import AXES, Floats, Ints
 from drivers.recordings import Recording, iter_blocks
-from drivers.sample import AXES, Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, overlapping_avar_axis, slope_of_recording
 from monitor.estimation.analysis import analyze
 from tests.experiments.benchmarks.machine import Load, about, alternate, console, table

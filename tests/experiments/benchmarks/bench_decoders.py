@@ -16,7 +16,7 @@ from rich.table import Table
 
 sys.path.insert(0, str(Path(__file__).parents[3]))
 
-from drivers.sample import Chunk, SampleBlock, make_block
+from drivers.data_types import Chunk, SampleBlock, make_block
 from tests.contracts.decoder_examples import EXAMPLES, Example
 
 SAMPLES = 20_000

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 import zenoh
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from tests.experiments.benchmarks.machine import Load, about, console, table
 from tests.experiments.benchmarks.rig import PATIENCE_S, Daemon, Sensors, subscriber
 

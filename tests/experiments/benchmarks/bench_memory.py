@@ -33,7 +33,7 @@ import numpy as np
 said("NumPy")
 import numba
 said("Numba")
-from drivers.sample import make_block
+from drivers.data_types import make_block
 from monitor.daemon import kernel_compilation, kernel_parts
 from monitor.estimation.estimator import Estimator
 said("drivers and monitor.estimation")

@@ -21,7 +21,7 @@ from typing import Final, TypeVar
 
 import numpy as np
 
-from drivers.sample import Floats, Ints, make_block
+from drivers.data_types import Floats, Ints, make_block
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table as covariances
 from monitor.estimation.allan.window import AllanWindow

@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 import psutil
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import (
     AngleRandomWalk,

@@ -20,7 +20,7 @@ from typing import Final
 import numpy as np
 from allantools.realtime import oadev_realtime
 
-from drivers.sample import Floats, Ints, make_block
+from drivers.data_types import Floats, Ints, make_block
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.estimator import Estimator
 from tests.experiments.benchmarks.machine import Load, about, alternate, console, table
@@ -37,7 +37,7 @@ FIRST_USE: Final = """
 import time
 start = time.perf_counter()
 import numpy as np
-from drivers.sample import make_block
+from drivers.data_types import make_block
 from monitor.estimation.estimator import Estimator
 imported = time.perf_counter()
 estimator = Estimator(100.0, 60.0)

@@ -18,8 +18,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from scipy.signal import welch
 
-from drivers.sample import AXES, Floats
-from monitor.commands import analyze, simulate_recording
+from drivers.data_types import AXES, Floats
+from monitor.commands import analyze
+from monitor.commands import simulate as simulate_recording
 from monitor.common.units import (
     COEFFICIENT_UNITS,
     DEGREE,
@@ -31,8 +32,8 @@ from monitor.common.units import (
     sensor_kind,
 )
 from monitor.estimation.analysis import Analysis
-from monitor.estimation.detection.line_detection import detect_lines
-from monitor.noise.model_catalogue import load_model
+from monitor.estimation.detection.line_and_outlier_detection import detect_lines
+from monitor.noise.model_loading import load_model
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.plots.allan_figure import FIT_DASHES, MARKER_SIZES, MARKERS
 from monitor.publishing.plots.style import (

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.stats import chi2
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.window import AllanWindow
 from monitor.estimation.detection.change_detection import NOISE_SHARE, RATE_AT_ZERO, Change, ChangeDetector

@@ -18,8 +18,8 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.spatial.transform import Rotation
 
+from drivers.data_types import AXES, Floats, make_block
 from drivers.recordings import load_samples
-from drivers.sample import AXES, Floats, make_block
 from monitor.commands.compensate import METHODS, Request, run_compensation
 from monitor.daemon.device.arma_worker import ArmaWorker
 from monitor.drift.compensation import sage_husa
@@ -29,7 +29,7 @@ from monitor.drift.compensation.compensator import Compensator
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.drift.compensation.reference_methods import REFERENCE_METHODS, apply_reference_method
 from monitor.drift.thermal.interval_means import compute_interval_means
-from monitor.noise.model_catalogue import load_model
+from monitor.noise.model_loading import load_model
 from tests.experiments.benchmarks.joint import compiled_joint, joint
 from tests.experiments.benchmarks.machine import console, table
 from tests.experiments.benchmarks.motion_score import MotionScore, score_in_motion

@@ -26,9 +26,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import Ints, make_block
+from drivers.data_types import Ints, make_block
 from monitor.estimation.analysis import analyze
-from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from tests.experiments.benchmarks.records import (
     HOURS_3,
     MIN_45,

@@ -21,10 +21,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from drivers.data_types import make_block
 from drivers.decoders import vectornav_binary
-from drivers.sample import make_block
-from monitor.common import shipped_file_paths
-from monitor.noise.model_catalogue import read_model
+from monitor.common import shipped_config_paths as shipped_file_paths
+from monitor.noise.model_loading import read_model
 
 WARM_S = 25.0
 DEVICE = """

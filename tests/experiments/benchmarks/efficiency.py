@@ -29,11 +29,11 @@ from typing import Final
 import numpy as np
 from scipy.optimize import least_squares, nnls
 
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, rate_slope_per_tau, slope_of_recording
 from monitor.estimation.allan.uncertainty import CovarianceTable, covariance_table
 from monitor.estimation.fit.coefficient_fit import Design, MeasuredCurve, fit, make_design
-from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.estimation.fit.coefficient_values import SYMBOLS
 from tests.experiments.benchmarks.records import (
     HOURS_3,
     MIN_45,

@@ -26,8 +26,8 @@ from unittest import mock
 
 import numpy as np
 
-from drivers.recordings import segment
-from monitor.common.health import Health
+from drivers.recordings import segment_file as segment
+from monitor.common.device_health import Health
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.output import Output
 from monitor.daemon.service import Service
@@ -431,7 +431,7 @@ def slow_disk(folder: Path, times: int) -> Outcome:
         write(writer, *arguments)
 
     with (
-        mock.patch("drivers.recordings.segment.SingleSegmentWriter.write_samples", slowly),
+        mock.patch("drivers.recordings.segment_file.SingleSegmentWriter.write_samples", slowly),
         running(folder, _storage(folder / "store")) as rig,
     ):
         for _ in range(4):

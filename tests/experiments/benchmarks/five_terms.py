@@ -10,14 +10,14 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import AXES, Floats, make_block
+from drivers.data_types import AXES, Floats, make_block
 from monitor.estimation.analysis import DETECTOR_CHUNK_ROWS, Analysis, analyze
 from monitor.estimation.analysis_notes import LINE_FREQUENCY_TOLERANCE, MIN_OUTLIER_SHARE
 from monitor.estimation.detection.change_detection import Change, ChangeDetector
-from monitor.estimation.detection.line_detection import Line, detect_lines, outlier_share
+from monitor.estimation.detection.coarse_quantization import find_coarse_axes
+from monitor.estimation.detection.line_and_outlier_detection import Line, detect_lines, outlier_share
 from monitor.estimation.detection.motion_detection import detect_motion
-from monitor.estimation.detection.resolution import find_coarse_axes
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.effects import Narrowband, Sinusoidal
 from monitor.noise.model import NoiseModel
 

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.optimize import minimize, nnls
 from scipy.stats import chi2
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 
 TERMS: Final = ("WN", "QN", "RW", "DR")
 """Those of one parameter: white noise, quantization noise, random walk, drift."""

@@ -18,12 +18,12 @@ from pathlib import Path
 import numpy as np
 
 from monitor.estimation.estimate import Estimate
-from monitor.history import reading as past
+from monitor.history import history_table as past
 from monitor.history.bucket import HistoryRow, pack_count_min_max_last
-from monitor.history.columns import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
+from monitor.history.column_conversion import HEALTH_COLUMNS, TEMPERATURE_COLUMNS, ColumnConverter
+from monitor.history.history_table import HistoryTable
 from monitor.history.minute_aggregation import MinuteAggregator
-from monitor.history.query import PARTS, HistoryQuery
-from monitor.history.reading import HistoryTable
+from monitor.history.query_parameters import PARTS, HistoryQuery
 from monitor.history.sqlite_store import HistoryStore, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange

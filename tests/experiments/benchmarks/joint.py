@@ -11,7 +11,7 @@ from typing import Any, cast
 import numba
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 
 
 def joint(

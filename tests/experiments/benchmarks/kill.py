@@ -22,8 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.recordings import load_samples, segment
-from drivers.sample import Floats, Ints
+from drivers.data_types import Floats, Ints
+from drivers.recordings import load_samples
+from drivers.recordings import segment_file as segment
 from monitor.history.sqlite_store import open_history
 from monitor.history.time_ranges import TimeRange
 from tests.support.terminal import LineTerminal

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar
 from monitor.estimation.allan.window import AllanWindow
 from tests.experiments.benchmarks.machine import about, console

@@ -7,7 +7,7 @@ import statistics
 import time
 import urllib.request
 
-from monitor.daemon.operations.metrics import MetricsOutput
+from monitor.daemon.operations.prometheus_metrics import MetricsOutput
 from monitor.settings.loading import Metrics
 from tests.monitor.publishing import made
 

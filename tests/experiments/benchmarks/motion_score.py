@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 
 
 @dataclass(frozen=True, slots=True)

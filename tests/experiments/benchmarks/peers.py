@@ -30,9 +30,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.preparation.recording import Recording
+from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.reconcile import reconcile
 from tests.experiments.benchmarks import five_terms, gmwm
 from tests.experiments.blind import run

@@ -29,8 +29,8 @@ import numpy as np
 from scipy.fft import dct, fft, next_fast_len
 from scipy.special import ndtri, sici
 
-from drivers.sample import Floats, Ints
-from monitor.estimation.fit.coefficients import SYMBOLS
+from drivers.data_types import Floats, Ints
+from monitor.estimation.fit.coefficient_values import SYMBOLS
 
 RATE_HZ: Final = 100.0
 AXES: Final = 6

@@ -23,8 +23,8 @@ import numpy as np
 import psutil
 import zenoh
 
+from drivers.data_types import Ints, make_block
 from drivers.decoders import vectornav_binary
-from drivers.sample import Ints, make_block
 from tests.support.ports import free_port
 from tests.support.waiting import wait_for
 

@@ -20,17 +20,17 @@ from typing import Final, Literal
 import numpy as np
 import psutil
 
+from drivers.data_types import Chunk, make_block
 from drivers.decoders import vectornav_binary
 from drivers.driver import Counts
 from drivers.errors import LinkEnded, LinkLost
 from drivers.links.base import Carrier
-from drivers.recordings import segment
-from drivers.sample import Chunk, make_block
-from monitor.common import shipped_file_paths
+from drivers.recordings import segment_file as segment
+from monitor.common import shipped_config_paths as shipped_file_paths
 from monitor.daemon.service import Service
 from monitor.history.sqlite_store import open_history
 from monitor.history.time_ranges import TimeRange
-from monitor.noise.model_catalogue import read_model
+from monitor.noise.model_loading import read_model
 from monitor.settings import loading
 
 ROWS: Final = 8192

@@ -11,7 +11,7 @@ import argparse
 
 import numpy as np
 
-from monitor.drift.thermal.temperature_dependence import find_dependence, find_hysteresis
+from monitor.drift.thermal.bias_temperature_tests import find_dependence, find_hysteresis
 from tests.experiments.benchmarks.machine import console, table
 from tests.monitor.drift.cycles import NOISES, SHAPES, chamber_means, drift
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from tests.experiments.benchmarks import gmwm
 
 pytestmark = pytest.mark.long

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.effects import AngleRandomWalk, QuantizationNoise, Sinusoidal
 from monitor.noise.model import NoiseModel
 from tests.experiments.benchmarks import five_terms, peers

@@ -12,7 +12,7 @@ from itertools import islice
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.drift.thermal.online_thermal_model import OnlineThermalModel, PredictedAxisInterval
 from monitor.drift.thermal.residual_alarm import UnexplainedChange
 from tests.experiments.benchmarks.machine import console, table

@@ -14,10 +14,10 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
-from monitor.estimation.allan.difference_moments import correct_bias, theta_per_sample
 from monitor.estimation.allan.hadamard import hadamard_moments, hadamard_variance
+from monitor.estimation.allan.squared_difference_moments import correct_bias, theta_per_sample
 from monitor.estimation.allan.total import total_moments, total_variance
 from monitor.estimation.allan.uncertainty import covariance_table
 from monitor.estimation.fit.coefficient_fit import MeasuredCurve, fit, make_design

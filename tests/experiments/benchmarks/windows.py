@@ -15,12 +15,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.sample import AXES, Floats, Ints
+from drivers.data_types import AXES, Floats, Ints
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import covariance_table as covariances
 from monitor.estimation.allan.window import AllanWindow, display_spans
 from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit, make_design
-from monitor.estimation.fit.coefficients import Status
+from monitor.estimation.fit.coefficient_values import Status
 from monitor.noise.effect import Source
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability

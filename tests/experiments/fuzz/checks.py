@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from drivers.data_types import NO_TICK, Chunk, CounterTimedFormat, SampleBlock, SenderTimedFormat
 from drivers.decoders.base import MAX_ACCEL_M_S2, MAX_GYRO_RAD_S, TEMPERATURE_LIMITS_C, Decoder
-from drivers.sample import NO_TICK, Chunk, CounterTimedFormat, SampleBlock, SenderTimedFormat
 
 LIMITS = (MAX_GYRO_RAD_S,) * 3 + (MAX_ACCEL_M_S2,) * 3
 LARGEST_LOSS = 10**10

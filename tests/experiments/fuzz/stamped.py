@@ -1,6 +1,6 @@
 """A ``SampleClock`` under watch: what must hold of the times it gives and of what it calls missing."""
 
-from drivers.sample import SampleBlock, SenderTimedFormat, Timing
+from drivers.data_types import SampleBlock, SenderTimedFormat, Timing
 from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
 from tests.experiments.fuzz.checks import LARGEST_LOSS

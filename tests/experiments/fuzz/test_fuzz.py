@@ -7,10 +7,10 @@ import psutil
 import pytest
 
 import drivers.decoders
-from drivers import discovery
+from drivers import module_lookup as discovery
+from drivers.data_types import Chunk
 from drivers.decoders.base import FrameBuffer, Frames
 from drivers.recordings import FORMATS
-from drivers.sample import Chunk
 from tests.experiments.fuzz import limits
 from tests.experiments.fuzz.limits import limited, tried
 from tests.experiments.fuzz.mutations import inputs

@@ -22,11 +22,11 @@ import numpy as np
 import psutil
 import pytest
 
+from drivers.data_types import AXES
 from drivers.recordings import save_samples
-from drivers.sample import AXES
 from monitor.cli import main, report_failed_thread
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
-from monitor.noise.model_catalogue import read_model
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
+from monitor.noise.model_loading import read_model
 from monitor.settings.loading import load
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for
 
@@ -1112,7 +1112,7 @@ main()
 COUNTED_DEMO = """
 import json, sys
 import monitor.daemon.service
-from drivers.sample import concatenate_blocks
+from drivers.data_types import concatenate_blocks
 from monitor.cli import main
 from tests.system.rig import Caught
 run = monitor.daemon.service.Service.run

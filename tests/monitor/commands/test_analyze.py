@@ -11,10 +11,10 @@ from drivers.recordings import save_samples
 from monitor.commands import analyze, thermal
 from monitor.commands.analyze import Request, TooFewSamples, run_analysis
 from monitor.common.units import MILLI_G
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing import exporters
-from monitor.publishing.messages.analysis import AnalysisMessage
-from monitor.publishing.terminal.thermal_text import notes_on_hysteresis
+from monitor.publishing.messages.analysis_json import AnalysisMessage
+from monitor.publishing.terminal.thermal_output import notes_on_hysteresis
 from tests.monitor.drift.cycles import cycle, loop, opening
 
 RATE_HZ = 100.0

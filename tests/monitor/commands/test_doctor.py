@@ -14,10 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.data_types import make_block
 from drivers.driver import AxisMap
-from drivers.recordings import segment
-from drivers.recordings.segment import DaemonState, SingleSegmentWriter
-from drivers.sample import make_block
+from drivers.recordings import segment_file as segment
+from drivers.recordings.segment_file import DaemonState, SingleSegmentWriter
 from monitor.commands import doctor
 from monitor.commands.doctor import (
     SAMPLE_BYTES,
@@ -30,9 +30,9 @@ from monitor.commands.doctor import (
 )
 from monitor.common.compiled import cache_folder
 from monitor.common.folder_lock import HISTORY_LOCK, RECORDING_LOCK, FolderLock
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.daemon.storage.recorder import segment_metadata
-from monitor.noise.model_catalogue import read_model
+from monitor.noise.model_loading import read_model
 from monitor.settings import loading
 from monitor.settings.loading import Storage
 from tests.support.waiting import PATIENCE_S

@@ -12,8 +12,7 @@ import pytest
 
 from drivers.errors import ConfigError, NotReady, RecordingError
 from monitor.cli import main
-from monitor.commands import reconcile
-from monitor.commands import simulate_recording as simulate
+from monitor.commands import reconcile, simulate
 from monitor.commands.reconcile import ComparisonRequest, compare_recordings, unique_recording_names
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, BiasStep, Sinusoidal
 from monitor.noise.model import NoiseModel

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from drivers.recordings import FORMATS, load_samples, save_samples
-from drivers.sample import AXES
 from monitor.commands import analyze
-from monitor.commands.simulate_recording import CHUNK_ROWS, Request, run_simulation
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.commands.simulate import CHUNK_ROWS, Request, run_simulation
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.model import NoiseModel
 
 FIVE = {"Q": 2e-5, "N": 1.5e-4, "B": 3e-4, "K": 2e-4, "R": 3e-5}

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.sample import Floats, make_block
+from drivers.data_types import Floats, make_block
 from monitor.common.compiled import Kernel
 from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.drift.thermal.thermal_response import first_order_lag

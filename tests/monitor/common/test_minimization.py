@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize, rosen
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.common.minimization import golden_section, minimize_bfgs
 
 

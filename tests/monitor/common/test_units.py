@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.common.units import format_rate
 
 

@@ -7,18 +7,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drivers.data_types import concatenate_blocks, make_block
 from drivers.decoders import dbc, samples, text, vectornav_binary
 from drivers.errors import ConfigError
 from drivers.links import replay_link
-from drivers.sample import concatenate_blocks, make_block
 from monitor.daemon.device import device_worker
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import Status
+from monitor.estimation.fit.coefficient_values import Status
 from monitor.publishing.messages.results import SlowStatistics
 from monitor.settings import loading as settings
 from monitor.settings.loading import Device, Driver

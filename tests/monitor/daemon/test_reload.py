@@ -15,13 +15,13 @@ import pytest
 from rich.console import Console
 from structlog.testing import capture_logs
 
+from drivers.data_types import Event
 from drivers.errors import ConfigError
-from drivers.sample import Event
-from monitor.daemon import reload
+from monitor.daemon import config_changes as reload
 from monitor.daemon.output import Output
-from monitor.daemon.output_classes import TableOutput
+from monitor.daemon.result_outputs import TableOutput
 from monitor.daemon.service import Service
-from monitor.noise.model_catalogue import read_model
+from monitor.noise.model_loading import read_model
 from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.terminal import live_table
 from monitor.settings import loading

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.sample import make_block
+from drivers.data_types import make_block
 from monitor.daemon.device.ring_buffer import RingBuffer
 
 

@@ -12,17 +12,17 @@ import pytest
 from rich.console import Console
 from structlog.testing import capture_logs
 
+from drivers.data_types import Event
 from drivers.recordings import save_samples
-from drivers.sample import Event
-from monitor.common.health import Health
+from monitor.common.device_health import Health
 from monitor.daemon.kernels import kernel_compilation, kernel_parts
 from monitor.daemon.output import Output
-from monitor.daemon.output_classes import TableOutput
+from monitor.daemon.result_outputs import TableOutput
 from monitor.daemon.service import Service
-from monitor.estimation.detection.model_gap import ModelGap
+from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import Status
-from monitor.history import reading as past
+from monitor.estimation.fit.coefficient_values import Status
+from monitor.history import history_table as past
 from monitor.history.sqlite_store import FILE_NAME, open_history
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.remote_devices import DeviceStates

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from scipy.signal import lfilter
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.drift.thermal.interval_means import IntervalMeans
 
 COLDEST_C: Final = -18.0

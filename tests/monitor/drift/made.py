@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.drift.thermal.interval_means import IntervalMeans
 
 HOUR_S = 3600.0

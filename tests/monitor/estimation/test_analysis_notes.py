@@ -6,13 +6,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, make_block
+from drivers.data_types import AXES, make_block
 from monitor.estimation import analysis_notes
 from monitor.estimation.analysis import analyze
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.line_detection import Line, detect_lines
+from monitor.estimation.detection.line_and_outlier_detection import Line, detect_lines
 from monitor.estimation.detection.motion_detection import Motion
-from monitor.estimation.fit.coefficients import Status
+from monitor.estimation.fit.coefficient_values import Status
 from monitor.estimation.fit.low_pass_search import LowPass
 
 RATE_HZ = 100.0

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivers.sample import make_block
+from drivers.data_types import make_block
 from monitor.estimation.estimator import Estimator
 from monitor.estimation.window_snapshot import TemperatureRing
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.sample import AXES
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
-from monitor.history.columns import TAU_S, ColumnConverter
+from drivers.data_types import AXES
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.history.column_conversion import TAU_S, ColumnConverter
 from tests.monitor.publishing.made import estimate, terms, true_coefficients
 
 

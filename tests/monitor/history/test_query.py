@@ -3,7 +3,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from drivers.errors import ConfigError
-from monitor.history.query import DEFAULT_PARTS, HistoryQuery, parse_query
+from monitor.history.query_parameters import DEFAULT_PARTS, HistoryQuery, parse_query
 from monitor.history.time_ranges import TimeRange
 
 NOW = 1_763_700_000.0

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from drivers.errors import NotReady
-from monitor.history import reading as past
+from monitor.history import history_table as past
 from monitor.history.bucket import HistoryRow
-from monitor.history.reading import HistoryTable
+from monitor.history.history_table import HistoryTable
 from monitor.history.sqlite_store import HistoryStore, open_history
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import config
+from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.sample import AXES
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, Bias, GSensitivity, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.noise.temperature import Temperature

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import config
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.noise.effects import EFFECTS
 from monitor.noise.model import NoiseModel
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import kstest
 
+from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.sample import AXES
 from monitor.noise.effects import (
     TRANSFORM_ORDER,
     AngleRandomWalk,

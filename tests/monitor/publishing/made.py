@@ -4,19 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.sample import AXES
-from monitor.common.health import Health
+from drivers.data_types import AXES
+from monitor.common.device_health import Health
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
-from monitor.drift.thermal.recursive_least_squares import PredictionInterval
+from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
 from monitor.estimation.allan.total import TotalCurve, total_curve
 from monitor.estimation.analysis import Analysis
-from monitor.estimation.detection.model_gap import ModelGap, PreparedModel
+from monitor.estimation.detection.model_comparison import ModelGap, PreparedModel
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
-from monitor.estimation.fit.coefficients import Coefficients, Status
+from monitor.estimation.fit.coefficient_values import Coefficients, Status
 from monitor.noise.model import NoiseModel
 
 GYRO = np.array([2.0e-6, 1.5e-4, 4.0e-5, 1.5e-6, 0.0])  # Q N B K R in SI

@@ -5,9 +5,9 @@ import math
 import numpy as np
 import pytest
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.common.units import COEFFICIENT_UNITS, DEVIATION_UNITS, axes_of, format_number, unit_of
-from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from monitor.publishing.coefficient_cells import format_coefficient
 
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from drivers.data_types import AXES
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings.formats import FORMATS
-from drivers.sample import AXES
 from monitor.common.units import unit_of
-from monitor.estimation.fit.coefficients import SYMBOLS
+from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.history.bucket import STATES, HistoryRow
-from monitor.history.reading import HistoryTable, build_table
+from monitor.history.history_table import HistoryTable, build_table
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.plots.history_plot import save_history_plot

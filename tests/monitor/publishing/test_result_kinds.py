@@ -38,7 +38,7 @@ def test_the_schema_of_a_message_is_that_of_its_topic() -> None:
 
 def test_each_drawing_has_a_panel() -> None:
     pytest.importorskip("rerun", reason="rerun-sdk is not installed")
-    from monitor.publishing.rerun import panels
+    from monitor.publishing.rerun import result_panels as panels
 
     for kind in RESULT_KINDS:
         for drawing in kind.drawings:

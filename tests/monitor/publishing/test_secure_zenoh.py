@@ -20,7 +20,7 @@ from drivers.errors import LinkUnavailable, NotReady
 from drivers.links import zenoh_link
 from drivers.zenoh.session_config import build_session_config
 from monitor.common import topics
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.publishing.messages.results import StatusMessage
 from monitor.publishing.zenoh.history_client import query_histories
 from monitor.publishing.zenoh.publisher import ZenohPublisher

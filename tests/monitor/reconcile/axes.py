@@ -6,16 +6,16 @@ from typing import Any
 import numpy as np
 from scipy.signal import lfilter
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.noise.effect import Effect
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, BiasInstability, RateRandomWalk
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
-from monitor.reconcile.likelihood.axis import Axis, RegressorCache
+from monitor.reconcile.likelihood.axis_fit import Axis, RegressorCache
 from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, whiten_axis
-from monitor.reconcile.preparation.recording import Recording
+from monitor.reconcile.preparation.reconcile_input import Recording
 from monitor.reconcile.search.axis_repair import build_repaired_axes
 
 RATE_HZ = 100.0

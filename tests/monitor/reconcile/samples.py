@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from drivers.sample import AXES, Floats
+from drivers.data_types import AXES, Floats
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.result import (

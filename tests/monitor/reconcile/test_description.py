@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.description import describe_axis
+from monitor.reconcile.axis_result import describe_axis
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import NullDistribution
-from monitor.reconcile.report import encode_report
+from monitor.reconcile.json_report import encode_report
 from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.search.search import search_axis
 from tests.monitor.reconcile.axes import (

@@ -7,8 +7,8 @@ from functools import cache
 import numpy as np
 import pytest
 
+from drivers.data_types import AXES
 from drivers.errors import NotReady
-from drivers.sample import AXES
 from monitor.noise.effects import (
     AngleRandomWalk,
     Bias,
@@ -22,15 +22,15 @@ from monitor.noise.effects import (
     TemperatureBias,
 )
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.likelihood.axis import RegressorCache
-from monitor.reconcile.preparation.recording import (
+from monitor.reconcile.json_report import encode_report
+from monitor.reconcile.likelihood.axis_fit import RegressorCache
+from monitor.reconcile.preparation.reconcile_input import (
     MIN_SAMPLES,
     Recording,
     _smooth_temperature,
     select_usable_axes,
 )
 from monitor.reconcile.reconcile import RecordingContext, _effects_by_axis, fit_five_terms, reconcile
-from monitor.reconcile.report import encode_report
 from monitor.reconcile.result import combine_decisions
 from tests.monitor.reconcile.axes import (
     GYRO_AXES,

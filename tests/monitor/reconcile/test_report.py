@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from monitor.reconcile.report import encode_report
+from monitor.reconcile.json_report import encode_report
 from monitor.reconcile.result import (
     AddedOrResizedEffect,
     AxisResult,

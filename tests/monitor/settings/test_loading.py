@@ -7,11 +7,11 @@ import pytest
 
 import drivers.decoders
 import drivers.links
-from drivers import discovery
+from drivers import module_lookup as discovery
 from drivers.decoders.vectornav_ascii import VectornavAsciiDecoder
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
-from monitor.common.shipped_file_paths import CONFIG_FOLDER, model_path
+from monitor.common.shipped_config_paths import CONFIG_FOLDER, model_path
 from monitor.estimation.allan.window import MAX_LENGTH, MIN_LENGTH
 from monitor.settings.loading import (
     WINDOW_SAMPLES,

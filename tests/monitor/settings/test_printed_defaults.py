@@ -7,12 +7,12 @@ from typing import Any
 import pytest
 
 import drivers.decoders
-from drivers import discovery
+from drivers import module_lookup as discovery
 from drivers.decoders.dbc.settings import SignalSettings
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
 from drivers.settings_model import SettingsModel, fields_by_key, find_model
-from monitor.commands.check_config import check_configuration
+from monitor.commands.check import check_configuration
 from monitor.settings import printed_defaults
 from monitor.settings.driver_settings import FaultsTable, link_names, link_settings
 from monitor.settings.schema import (

@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from drivers.errors import ConfigError
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.settings.loading import WINDOW_SAMPLES, VirtualTable, load
-from monitor.simulator.demo import DEMO_CONFIG, demo_config
+from monitor.simulator.demo_config import DEMO_CONFIG, demo_config
 
 SHIPPED = sorted(path.stem for path in (CONFIG_FOLDER / "models").glob("*.toml"))
 

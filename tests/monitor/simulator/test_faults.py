@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivers.sample import Chunk
+from drivers.data_types import Chunk
 from monitor.settings.loading import FaultsTable
 from monitor.simulator.faults import FaultCounts, FaultKind, Faults
 

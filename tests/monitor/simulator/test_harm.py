@@ -8,10 +8,10 @@ from types import TracebackType
 import numpy as np
 import pytest
 
+from drivers.data_types import SampleBlock
 from drivers.driver import Driver
-from drivers.sample import SampleBlock
 from drivers.timing.sample_clock import SampleClock
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.settings.loading import FaultsTable, VirtualTable
 from monitor.simulator import SimulatedDevice
 from monitor.simulator.can_port import CanPort

@@ -2,8 +2,8 @@
 
 import pytest
 
+from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.sample import AXES
 from monitor.noise.effects import EFFECTS
 from monitor.simulator import parse_effects
 

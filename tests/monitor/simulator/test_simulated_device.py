@@ -11,7 +11,7 @@ from drivers.decoders import stim300, vectornav_binary, xsens_mtdata2
 from drivers.driver import Driver
 from drivers.errors import ConfigError
 from drivers.timing.sample_clock import SampleClock
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.settings.loading import VirtualTable
 from monitor.simulator import SimulatedDevice
 from tests.support.paced_sensor import follow_reader, is_open

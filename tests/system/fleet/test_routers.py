@@ -8,7 +8,7 @@ from typing import Any
 import zenoh
 
 from drivers.zenoh.session_config import build_session_config
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from tests.support.ports import free_endpoint
 from tests.support.waiting import wait_for
 from tests.support.zenoh_sessions import session

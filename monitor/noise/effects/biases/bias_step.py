@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.effect import SampleBlockContext, Source, StatelessSeries, first_sample_index, parameter
 from monitor.noise.spectrum import Spectrum, undefined_spectrum
 

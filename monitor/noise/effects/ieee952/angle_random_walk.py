@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 from monitor.noise.spectrum import Spectrum
 

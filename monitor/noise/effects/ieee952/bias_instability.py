@@ -13,7 +13,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.common.compiled import compiled
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 from monitor.noise.spectrum import Spectrum

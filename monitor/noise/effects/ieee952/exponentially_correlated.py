@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.common.compiled import compiled
 from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
 from monitor.noise.gauss_markov import gauss_markov_spectrum

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.common.compiled import compiled
 from monitor.noise.effect import RunningTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum

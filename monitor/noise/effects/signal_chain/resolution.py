@@ -5,7 +5,7 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from drivers.sample import Floats
+from drivers.data_types import Floats
 from monitor.noise.effect import MemorylessTransform, Transform, parameter
 from monitor.noise.spectrum import Spectrum, undefined_spectrum, white_noise_spectrum
 

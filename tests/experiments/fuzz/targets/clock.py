@@ -4,7 +4,7 @@ from typing import Final
 
 import numpy as np
 
-from drivers.sample import (
+from drivers.data_types import (
     NO_TICK,
     ArrivalTimedFormat,
     CounterTimedFormat,

@@ -20,7 +20,7 @@ from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.terminal.live_table import device_table
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
 from monitor.settings import loading
-from monitor.simulator.scheduled_effect_parser import parse_effects
+from monitor.simulator.effect_option_parser import parse_effects
 from tests.experiments.fuzz.checks import one_line
 from tests.experiments.fuzz.tape import Tape
 from tests.experiments.fuzz.target import target

@@ -5,8 +5,9 @@ from typing import Final
 
 import numpy as np
 
+from drivers.data_types import AXES, Chunk, make_block
 from drivers.errors import RecordingError
-from drivers.recordings.segment import (
+from drivers.recordings.segment_file import (
     DaemonState,
     SegmentMetadata,
     SingleSegmentWriter,
@@ -16,7 +17,6 @@ from drivers.recordings.segment import (
     read_metadata,
     read_samples,
 )
-from drivers.sample import AXES, Chunk, make_block
 from tests.experiments.fuzz.checks import LARGEST_LOSS, one_line
 from tests.experiments.fuzz.target import target
 from tests.experiments.fuzz.targets.files import LARGEST_NS, folder, replayed

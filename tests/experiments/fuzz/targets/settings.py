@@ -13,13 +13,13 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+from drivers.data_types import Chunk
 from drivers.decoders import dbc
 from drivers.errors import ConfigError
-from drivers.sample import Chunk
 from drivers.settings_model import SettingsModel
-from monitor.common import shipped_file_paths
+from monitor.common import shipped_config_paths as shipped_file_paths
 from monitor.noise.model import NoiseModel
-from monitor.noise.model_catalogue import read_model
+from monitor.noise.model_loading import read_model
 from monitor.settings import loading
 from tests.contracts.decoder_examples import CAN_DATABASE, CAN_SIGNALS
 from tests.experiments.fuzz.checks import fed, one_line

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sample import Event
+from drivers.data_types import Event
 from monitor.daemon.operations.hooks import BURST, MAX_QUEUED, RUN_INTERVAL_S, THREADS, Hooks
 from monitor.settings.loading import Hook
 from tests.support.waiting import FOREVER_S, PATIENCE_S, wait_for

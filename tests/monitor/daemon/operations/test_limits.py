@@ -7,11 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from drivers.data_types import AXES, Event
 from drivers.errors import ConfigError
-from drivers.sample import AXES, Event
-from monitor.daemon.operations.limits import LimitMonitor, make_bounds
+from monitor.daemon.operations.coefficient_limits import LimitMonitor, make_bounds
 from monitor.estimation.estimate import Estimate
-from monitor.estimation.fit.coefficients import SYMBOLS, Coefficients, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from monitor.noise.model import NoiseModel
 from monitor.publishing.messages.results import EventMessage
 from monitor.settings.loading import Limit

@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, Event
-from monitor.daemon.operations.metrics import MAX_SCRAPES, MISSING_LIBRARY_TEXT, MetricsOutput
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from drivers.data_types import AXES, Event
+from monitor.daemon.operations.prometheus_metrics import MAX_SCRAPES, MISSING_LIBRARY_TEXT, MetricsOutput
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.settings.loading import Metrics
 from tests.monitor.publishing import made
 from tests.support.waiting import PATIENCE_S, wait_for
@@ -110,7 +110,7 @@ def test_nothing_is_served_before_there_is_anything_and_nothing_but_the_numbers(
 
 
 def test_a_port_that_is_taken_is_said_and_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("monitor.daemon.operations.metrics.RETRY_S", 0.05)
+    monkeypatch.setattr("monitor.daemon.operations.prometheus_metrics.RETRY_S", 0.05)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         output = MetricsOutput(Metrics("127.0.0.1", port))
@@ -127,7 +127,7 @@ def test_a_port_that_is_taken_is_said_and_tried_again(monkeypatch: pytest.Monkey
 
 
 def test_those_who_connect_and_say_nothing_keep_nobody_out_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("monitor.daemon.operations.metrics.TIMEOUT_S", 1.0)
+    monkeypatch.setattr("monitor.daemon.operations.prometheus_metrics.TIMEOUT_S", 1.0)
     with serving() as output:
         wait_for(lambda: output.state == "ok")
         mute = [socket.create_connection(("127.0.0.1", output.port)) for _ in range(3 * MAX_SCRAPES)]

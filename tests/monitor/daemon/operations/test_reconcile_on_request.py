@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import imu_monitor
+from drivers.data_types import make_block
 from drivers.recordings import load_samples
-from drivers.sample import make_block
 from monitor.daemon.operations.reconcile_on_request import COMMAND, NICENESS_INCREASE, Job, Reconciler, format_result
 from monitor.estimation.estimator import Estimator
 from monitor.publishing.zenoh.publisher import Command

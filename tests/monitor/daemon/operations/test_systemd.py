@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from drivers.data_types import Chunk
 from drivers.errors import LinkLost
 from drivers.links.base import Carrier
-from drivers.sample import Chunk
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.daemon.operations.systemd import SystemdNotifier
 from monitor.daemon.service import Service
 from monitor.settings import loading

@@ -13,14 +13,16 @@ import msgspec
 import numpy as np
 import pytest
 
+from drivers.data_types import Chunk, SampleBlock, concatenate_blocks, make_block
 from drivers.decoders import text
 from drivers.driver import AxisMap
-from drivers.recordings import load_samples, segment
-from drivers.recordings.segment import DaemonState, SegmentMetadata, SingleSegmentWriter
-from drivers.sample import Chunk, SampleBlock, concatenate_blocks, make_block
+from drivers.recordings import load_samples
+from drivers.recordings import segment_file as segment
+from drivers.recordings.segment_file import DaemonState, SegmentMetadata, SingleSegmentWriter
 from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
-from monitor.daemon.storage import recorder, recording_track, retention
+from monitor.daemon.storage import device_recording as recording_track
+from monitor.daemon.storage import recorder, retention
 from monitor.daemon.storage.recorder import Recorder, segment_metadata
 from monitor.settings.loading import Device, Driver, Storage
 from tests.support.loopback_link import LoopbackLink

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivers.sample import make_block
+from drivers.data_types import make_block
 from monitor.drift.compensation.arma import ArmaModel
 from monitor.drift.compensation.live_compensation import EVENT_KIND, LiveCompensation
 

@@ -6,7 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.sample import make_block
+from drivers.data_types import make_block
 from monitor.drift.thermal.live_thermal import KIND, LiveThermal
 from tests.monitor.drift.made import COEFFICIENT, late, weather
 

@@ -8,7 +8,7 @@ from scipy.stats import t as student
 
 from monitor.common.distributions import Z95
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.recursive_least_squares import RecursiveThermalFit
+from monitor.drift.thermal.recursive_thermal_fit import RecursiveThermalFit
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import ThermalModel, predict
 from monitor.drift.thermal.thermal_response import ThermalModelForm

@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from monitor.drift.thermal.bias_temperature_tests import find_dependence, find_hysteresis, heating_direction
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.temperature_dependence import find_dependence, find_hysteresis, heating_direction
 from tests.monitor.drift.cycles import NOISES, SHAPES, chamber_means, drift
 
 COUNT = 75

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 
-from drivers.sample import make_block
+from drivers.data_types import make_block
 from monitor.drift.thermal.temperature_removal import interpolate_smoothly, remove_temperature, temperature_varied
 from monitor.estimation.analysis import analyze
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
-from monitor.publishing.terminal.thermal_text import temperature_notes
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+from monitor.publishing.terminal.thermal_output import temperature_notes
 
 RATE_HZ = 2.0
 N = 1e-4

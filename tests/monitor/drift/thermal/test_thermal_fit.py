@@ -10,7 +10,7 @@ from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_fit import fit_thermal_model
 from monitor.drift.thermal.thermal_model import predict
 from monitor.drift.thermal.thermal_response import ThermalModelForm
-from monitor.drift.thermal.thermal_study import compare_with_means
+from monitor.drift.thermal.thermal_results import compare_with_means
 from tests.monitor.drift.made import COEFFICIENT, first_intervals, hourly
 
 DAY = 24  # h, to fit; two more to judge

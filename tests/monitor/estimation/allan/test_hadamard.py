@@ -7,8 +7,8 @@ from allantools.ci import edf_greenhall
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor.estimation.allan.difference_moments import phase_autocovariance
 from monitor.estimation.allan.hadamard import hadamard_curve, hadamard_moments, hadamard_variance
+from monitor.estimation.allan.squared_difference_moments import phase_autocovariance
 from monitor.estimation.allan.total import total_moments
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, RateRandomWalk
 from tests.support.allan_references import columns, nist_1000

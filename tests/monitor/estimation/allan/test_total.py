@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from monitor.estimation.allan import difference_moments as moments_module
+from monitor.estimation.allan import squared_difference_moments as moments_module
 from monitor.estimation.allan.batch import octaves, overlapping_avar
 from monitor.estimation.allan.total import MIN_SHARE, total_curve, total_moments, total_variance
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from drivers.sample import AXES
 from monitor.estimation.detection.change_detection import LEARN_S, ChangeDetector
 from monitor.estimation.detection.change_kernel import TICK_SAMPLES, F, N, S
 from monitor.estimation.detection.changed_coefficients import HaarVariancesBeforeAfter, identify_noise_change

@@ -6,8 +6,8 @@ from scipy.signal import butter, lfilter
 
 from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.detection import line_detection
-from monitor.estimation.detection.line_detection import (
+from monitor.estimation.detection import line_and_outlier_detection as line_detection
+from monitor.estimation.detection.line_and_outlier_detection import (
     BLOCK,
     MAX_MISSING_SHARE,
     MIN_LINE_SHARE,

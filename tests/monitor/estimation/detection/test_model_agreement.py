@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from drivers.sample import Event
-from monitor.estimation.detection.model_agreement import KIND, RENEWED_SHARE, ModelAgreement
-from monitor.estimation.detection.model_gap import MIN_SAMPLES, AxisGap, ModelGap
+from drivers.data_types import Event
+from monitor.estimation.detection.model_agreement_monitor import KIND, RENEWED_SHARE, ModelAgreement
+from monitor.estimation.detection.model_comparison import MIN_SAMPLES, AxisGap, ModelGap
 
 STEP = 100  # samples from look to look
 WINDOW = 40_000

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from drivers.sample import AXES, make_block
+from drivers.data_types import AXES, make_block
 from monitor.estimation.allan.curve import AllanCurve
-from monitor.estimation.detection.model_gap import (
+from monitor.estimation.detection.model_comparison import (
     MIN_EDF,
     MIN_SAMPLES,
     PreparedModel,

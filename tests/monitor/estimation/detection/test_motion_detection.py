@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, make_block
+from drivers.data_types import AXES, make_block
 from monitor.estimation.detection.motion_detection import BLOCK_S, MotionDetector, block_size, detect_motion
 from monitor.estimation.detection.motion_kernel import REFERENCE_BLOCKS, REMOVED_AFTER
 from tests.support.recordings import recordings

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.estimation.detection.resolution import MIN_STEP_TO_NOISE, find_coarse_axes
+from monitor.estimation.detection.coarse_quantization import MIN_STEP_TO_NOISE, find_coarse_axes
 
 
 def noise(n=30_000, seed=0):

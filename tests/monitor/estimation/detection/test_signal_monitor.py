@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivers.sample import make_block
+from drivers.data_types import make_block
 from monitor.estimation.detection.signal_monitor import SignalMonitor
 
 RATE_HZ = 100.0

@@ -8,11 +8,11 @@ import pytest
 from scipy.signal import butter, sosfilt
 from scipy.stats import binom
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar, slope_of_recording
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit, make_design
-from monitor.estimation.fit.coefficients import SYMBOLS, Status
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.estimation.fit.fit_kernel import MIN_ROWS
 from monitor.noise.effect import Source
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk

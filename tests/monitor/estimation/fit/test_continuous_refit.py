@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, make_block
+from drivers.data_types import AXES, make_block
 from monitor.estimation.allan.batch import cluster_sizes
 from monitor.estimation.allan.uncertainty import AxisCovarianceTables
 from monitor.estimation.allan.window import AllanWindow

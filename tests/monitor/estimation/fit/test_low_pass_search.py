@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import butter, sosfilt
 
-from drivers.sample import make_block
+from drivers.data_types import make_block
 from monitor.estimation.allan.batch import overlapping_avar
 from monitor.estimation.analysis import analyze
 from monitor.estimation.estimator import Estimator

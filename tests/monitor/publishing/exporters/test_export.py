@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from scipy.optimize import minimize_scalar
 
 from drivers.errors import ConfigError, NotReady
-from monitor.common.shipped_file_paths import CONFIG_FOLDER
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.noise.model import NoiseModel
 from monitor.publishing import exporters
 from monitor.publishing.exporters.kalman import (

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
-from drivers.sample import Event
-from monitor.common.health import Health
+from drivers.data_types import Event
+from monitor.common.device_health import Health
+from monitor.drift.thermal.bias_temperature_tests import TemperatureDependence
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
-from monitor.drift.thermal.recursive_least_squares import PredictionInterval
-from monitor.drift.thermal.temperature_dependence import TemperatureDependence
+from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 from monitor.drift.thermal.temperature_removal import TemperatureRemoval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
@@ -17,16 +17,16 @@ from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.analysis import Analysis
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.model_gap import AxisGap, ModelGap
+from monitor.estimation.detection.model_comparison import AxisGap, ModelGap
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
-from monitor.estimation.fit.coefficients import Coefficients, Status
-from monitor.history.query import PARTS, HistoryQuery
-from monitor.history.reading import HistoryTable
+from monitor.estimation.fit.coefficient_values import Coefficients, Status
+from monitor.history.history_table import HistoryTable
+from monitor.history.query_parameters import PARTS, HistoryQuery
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
-from monitor.publishing.messages.analysis import AnalysisMessage, FailedAnalysisMessage
+from monitor.publishing.messages.analysis_json import AnalysisMessage, FailedAnalysisMessage
 from monitor.publishing.messages.history import HistoryMessage
 from monitor.publishing.messages.message import Message
 from monitor.publishing.messages.results import (

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, Event
+from drivers.data_types import AXES, Event
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import (

@@ -10,12 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from drivers.sample import AXES
-from monitor.estimation.fit.coefficients import SYMBOLS
+from drivers.data_types import AXES
+from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.history.bucket import STATES, HistoryRow, merge_rows
+from monitor.history.history_table import HistoryTable, build_table
 from monitor.history.minute_aggregation import MinuteAggregator
-from monitor.history.query import PARTS, HistoryQuery
-from monitor.history.reading import HistoryTable, build_table
+from monitor.history.query_parameters import PARTS, HistoryQuery
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 from monitor.publishing.messages.history import HistoryMessage, decode_history

@@ -7,15 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, Event
+from drivers.data_types import AXES, Event
 from monitor.common import topics
 from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan
 from monitor.estimation.allan.hadamard import hadamard_curve
 from monitor.estimation.allan.total import total_curve
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.detection.motion_detection import Motion
-from monitor.estimation.fit.coefficients import SYMBOLS
-from monitor.publishing.messages.analysis import AnalysisMessage
+from monitor.estimation.fit.coefficient_values import SYMBOLS
+from monitor.publishing.messages.analysis_json import AnalysisMessage
 from monitor.publishing.messages.results import (
     AllanMessage,
     CoefficientsMessage,

@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from monitor.publishing.messages import analysis, message
+from monitor.publishing.messages import analysis_json as analysis
+from monitor.publishing.messages import message
 from monitor.publishing.messages.history import MAX_HISTORY_BYTES
 from monitor.publishing.messages.results import ReconcileReply
 from tests.monitor.publishing.messages.made_messages import EXAMPLES, UNIX_S, messages

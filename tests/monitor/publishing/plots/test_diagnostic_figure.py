@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from monitor.publishing.plots.diagnostic_figure import (
+from monitor.publishing.plots.reconcile_figures import (
     compared_diagnostic_svg,
     detail_view,
     gap_chart_svg,

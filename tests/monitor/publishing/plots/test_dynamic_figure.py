@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
-from monitor.estimation.fit.coefficients import Status
+from monitor.estimation.fit.coefficient_values import Status
 from monitor.publishing.plots.dynamic_figure import (
     BAND_ENDS_INSIDE,
     MIN_LABEL_DISTANCE,

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, Event
+from drivers.data_types import AXES, Event
 from monitor.publishing.rerun.viewer_settings import DeviceInfo
 from tests.monitor.publishing import made
 
@@ -17,8 +17,8 @@ import rerun as rr
 from PIL import Image
 
 from monitor.publishing.rerun import blueprint, dynamic_heat_map
-from monitor.publishing.rerun.allan_history import COLUMNS
-from monitor.publishing.rerun.scene import Scene
+from monitor.publishing.rerun.allan_history_table import COLUMNS
+from monitor.publishing.rerun.viewer_content import Scene
 
 T0 = 1.76e9
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.sample import Event, make_block
+from drivers.data_types import Event, make_block
 from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.publishing.messages.results import AllanMessage, CoefficientsMessage, EventMessage, StatusMessage
@@ -25,7 +25,7 @@ from tests.support.zenoh_sessions import router
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
-from monitor.publishing.rerun.view import RerunView
+from monitor.publishing.rerun.queued_view import RerunView
 from tests.monitor.publishing.rerun.test_view import read
 
 

@@ -5,17 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.common.units import COEFFICIENT_UNITS, sensor_kind
 from monitor.history.bucket import HistoryRow
-from monitor.history.reading import HistoryTable, build_table
+from monitor.history.history_table import HistoryTable, build_table
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
 
 pytest.importorskip("rerun", reason="rerun-sdk is not installed")
 
-from monitor.publishing.rerun.past_points import history_points
-from monitor.publishing.rerun.view import RerunView
+from monitor.publishing.rerun.history_points import history_points
+from monitor.publishing.rerun.queued_view import RerunView
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from tests.monitor.publishing.rerun.test_view import column, read
 from tests.support.waiting import wait_for

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from drivers.sample import AXES, Event
-from monitor.publishing.rerun import view as rerun_view
-from monitor.publishing.rerun.view import MISSING, RerunView
+from drivers.data_types import AXES, Event
+from monitor.publishing.rerun import queued_view as rerun_view
+from monitor.publishing.rerun.queued_view import MISSING, RerunView
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.result_kinds import SampleRows
 from tests.monitor.publishing import made
@@ -191,7 +191,7 @@ def test_a_process_with_a_frozen_viewer_exits(server: sinks.ViewerProcess) -> No
     program = f"""
         import os, signal, time
         import numpy as np
-        from monitor.publishing.rerun.view import RerunView
+        from monitor.publishing.rerun.queued_view import RerunView
         from monitor.publishing.result_kinds import SampleRows
         from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
         view = RerunView(ViewerSettings("native", port={server.port}), [DeviceInfo("d")])
@@ -282,7 +282,7 @@ def test_a_killed_daemon_takes_its_viewer_along() -> None:
     port, web_port = free_port(), free_port()
     program = f"""
         import time
-        from monitor.publishing.rerun.view import RerunView
+        from monitor.publishing.rerun.queued_view import RerunView
         from monitor.publishing.result_kinds import SampleRows
         from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
         RerunView(ViewerSettings("web", {port}, {web_port}), [DeviceInfo("d")]).start()
@@ -342,7 +342,7 @@ def test_without_rerun_the_service_goes_on(monkeypatch: pytest.MonkeyPatch) -> N
 def test_mode_none_imports_and_starts_nothing() -> None:
     program = """
         import sys, threading
-        from monitor.publishing.rerun.view import RerunView
+        from monitor.publishing.rerun.queued_view import RerunView
         from monitor.publishing.result_kinds import SampleRows
         from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
         view = RerunView(ViewerSettings("none"), [DeviceInfo("d")])

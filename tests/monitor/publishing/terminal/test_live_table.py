@@ -10,8 +10,8 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
+from drivers.data_types import Event
 from drivers.errors import ConfigError
-from drivers.sample import Event
 from monitor.common import topics
 from monitor.publishing import remote_devices
 from monitor.publishing.messages.results import CoefficientsMessage, EventMessage, GapMessage, StatusMessage

@@ -23,7 +23,7 @@ from monitor.noise.effects import (
     TemperatureBias,
 )
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.likelihood.axis import RegressorCache
+from monitor.reconcile.likelihood.axis_fit import RegressorCache
 from monitor.reconcile.likelihood.hypothesis import fit_with_fixed_noise
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins
 from tests.monitor.reconcile.axes import (

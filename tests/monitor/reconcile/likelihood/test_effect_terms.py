@@ -5,7 +5,7 @@ import pytest
 
 from monitor.noise.effect import Leak, SampleBlockContext, Source
 from monitor.noise.effects import EFFECTS, CrossAxis, Sinusoidal, TemperatureBias
-from monitor.reconcile.likelihood.effect_terms import (
+from monitor.reconcile.likelihood.effect_roles import (
     DETERMINISTIC_SIZE_PARAMETERS,
     NOISE_SIZE_PARAMETERS,
     size,

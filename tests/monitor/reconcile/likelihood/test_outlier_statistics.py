@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.reconcile.likelihood.outlier_statistics import fit_outliers
+from monitor.reconcile.likelihood.outlier_fit import fit_outliers
 
 N = 60_000
 

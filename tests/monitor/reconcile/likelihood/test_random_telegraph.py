@@ -7,9 +7,9 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import norm
 
-from monitor.reconcile.likelihood import random_telegraph
-from monitor.reconcile.likelihood.event_process_comparison import BackgroundNoise, block_means, state_space_noise
-from monitor.reconcile.likelihood.random_telegraph import compare_telegraph_with_correlated_noise
+from monitor.reconcile.likelihood import telegraph_vs_correlated_noise as random_telegraph
+from monitor.reconcile.likelihood.state_space_comparison import BackgroundNoise, block_means, state_space_noise
+from monitor.reconcile.likelihood.telegraph_vs_correlated_noise import compare_telegraph_with_correlated_noise
 from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, two_levels, walk, wandering, white
 
 A, DWELL = 3.0, 20.0  # of the short series, beside white noise of density one

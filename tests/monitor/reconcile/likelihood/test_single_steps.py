@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from monitor.reconcile.likelihood import single_steps
-from monitor.reconcile.likelihood.event_process_comparison import BackgroundNoise, block_means, state_space_noise
-from monitor.reconcile.likelihood.single_steps import compare_poisson_with_single_steps
+from monitor.reconcile.likelihood import poisson_steps_vs_single_steps as single_steps
+from monitor.reconcile.likelihood.poisson_steps_vs_single_steps import compare_poisson_with_single_steps
+from monitor.reconcile.likelihood.state_space_comparison import BackgroundNoise, block_means, state_space_noise
 from tests.monitor.reconcile.event_noise import BLOCK_S, HOUR, TAU0_S, N, dense, jumps, white
 
 REST = BackgroundNoise(1.0, walk=0.01, correlated=((1.0, 30.0),))

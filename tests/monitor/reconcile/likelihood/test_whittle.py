@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
-from monitor.reconcile.likelihood.whittle import BinSums, maximise_whittle
+from monitor.reconcile.likelihood.whittle_fit import BinSums, maximise_whittle
 from monitor.reconcile.preparation.cosine_bins import cosine_transform, frequency_bins
 
 n = 160

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from drivers.sample import AXES
+from drivers.data_types import AXES
 from monitor.noise.effects import AngleRandomWalk, Outliers, RandomSampleHold, Resolution, Saturation
 from monitor.reconcile.search.axis_repair import (
     _may_leak,

@@ -6,8 +6,8 @@ import pytest
 from monitor.noise.effect import Leak, SampleBlockContext, Source
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, Narrowband, SampleRateError, Sinusoidal
 from monitor.noise.model import NoiseModel
-from monitor.reconcile.likelihood.effect_terms import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS
-from monitor.reconcile.search.sample_rate_error import convert_to_stated_time, detect_sample_rate_error
+from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS
+from monitor.reconcile.search.sample_rate_from_spectrum import convert_to_stated_time, detect_sample_rate_error
 from tests.contracts.effect_examples import effect
 from tests.monitor.reconcile.axes import GYRO_AXES, RATE_HZ, WALK, WHITE, axes, recording, warmth
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from monitor.reconcile.result import ParameterInterval
 from monitor.reconcile.several_recordings.comparison import Comparison, compare_results
-from monitor.reconcile.several_recordings.comparison_report import encode_comparison
+from monitor.reconcile.several_recordings.comparison_json import encode_comparison
 from tests.monitor.reconcile.runs_made import line, run, step
 
 

@@ -1,0 +1,243 @@
+"""Assembly of samples from the frames of several CAN messages, and detection of incomplete samples.
+
+A sample is complete when one frame of every message has arrived. The next sample starts with the first frame of a
+message that the current sample already contains, or with a message that contains only the counter. With
+``join = "counter"``, a frame with another counter value also starts the next sample. A sample that ends before all
+frames have arrived is bad, unless ``partial`` is True. Frames before the first complete sample are ignored, since the
+link may have been opened in the middle of a sample.
+
+A frame may arrive more than ``window`` after the first frame of the current sample. Such a frame is either late, or it
+starts the next sample because earlier frames were lost. If the frames contain counter values, a frame with the counter
+value of the current sample is late. Otherwise the order of the messages decides. The first message of a sample is the
+message with the longest median pause before its frames. A frame of the first message starts the next sample. A frame of
+any other message is late, unless a complete sample period has passed. While the order of the messages is unknown, the
+frame waits. If all frames of a sample have arrived, but some of them late, the sample is dropped. A dropped late sample
+counts as missing, but not as bad.
+"""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from statistics import median
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import AXES, EXTENDED_ID, NO_TICK
+from drivers.decoders.dbc.settings import Settings
+from drivers.decoders.dbc.signal_bits import SignalBits
+
+PAUSE_HISTORY: Final = 15
+"""Number of pauses per message over which the median is computed."""
+MIN_PAUSES: Final = 3
+"""Number of pauses per message that determine the order of the messages."""
+MAX_UNDECIDED_PER_MESSAGE: Final = 8
+"""Maximum number of waiting frames per message. Above this number, the order is estimated from the pauses so far."""
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """Signal of one axis, with the conversion to SI units."""
+
+    index: int  # in COLUMNS
+    bits: SignalBits
+    factor: float
+    offset: float
+
+
+@dataclass(slots=True)
+class Message:
+    """CAN message that contains a part of a sample."""
+
+    name: str
+    frame_id: int
+    extended: bool
+    j1939: bool
+    size: int  # number of bytes from the start of the message to the end of the last used signal
+    length: int  # number of bytes of the complete message
+    columns: list[Column]
+    valid: SignalBits | None = None
+    counter: SignalBits | None = None
+
+    @property
+    def address(self) -> int:
+        """Address of the frames, encoded as in ``Chunk.address``."""
+        return self.frame_id | (EXTENDED_ID if self.extended else 0)
+
+    @property
+    def only_counter(self) -> bool:
+        """True if the message contains only the counter."""
+        return self.counter is not None and not self.columns and self.valid is None
+
+    @property
+    def only_temperature(self) -> bool:
+        """True if the message contains only the temperature. Such a message may be sent less often than samples."""
+        indices = {column.index for column in self.columns}
+        return indices == {len(AXES)} and self.valid is None and self.counter is None
+
+
+@dataclass(slots=True)
+class SampleFrames:
+    """Frames of one sample by message. A missing frame is None, and a frame that is too short is empty."""
+
+    frames: list[bytes | None]
+    t_ns: int  # arrival time of the newest frame
+    start_ns: int  # arrival time of the first frame
+    count: int  # value of the counter; NO_TICK = no counter value has arrived
+    missing_before: int = 0  # number of bad and late samples since the last good sample
+    late: set[int] = field(default_factory=set)  # indices of the messages that arrived after the window
+    temperature: bytes | None = None  # newest frame of the message that contains only the temperature
+
+    @property
+    def complete(self) -> bool:
+        """True if every message has arrived."""
+        return None not in self.frames
+
+
+class SampleAssembler:
+    """Assembler of samples from frames in order of arrival.
+
+    Parameters
+    ----------
+    messages
+        Messages of a sample.
+    settings
+        Settings of the decoder.
+    """
+
+    def __init__(self, messages: Sequence[Message], settings: Settings) -> None:
+        self._n = len(messages)
+        self._by_count = settings.join == "counter"
+        self._counters = [m.counter for m in messages]
+        self._counter_message = next((i for i, m in enumerate(messages) if m.only_counter), None)
+        self._window_ns = round(settings.window * 1e9) or (1 << 62)
+        self._partial = settings.partial
+        self.dropped_late_samples = 0
+        """Number of samples dropped because some of their frames arrived after the window."""
+        self._delay_ns = 0  # time from the first frame of a sample to a late frame; 0 = no frame has been late
+        self.reset()
+
+    def reset(self) -> None:
+        """Discard the current sample, the known order of the messages and the synchronization."""
+        self._current: SampleFrames | None = None
+        self._synchronized = False
+        self._missing = 0
+        self._count_before = NO_TICK  # counter value of the previous sample
+        self._newest_ns: int | None = None  # arrival time of the newest frame
+        self._pauses: list[deque[int]] = [deque(maxlen=PAUSE_HISTORY) for _ in range(self._n)]  # ns before each message
+        self._undecided: deque[tuple[int, bytes, int]] = deque()
+        self.temperature: bytes | None = None
+
+    def take_missing_samples(self) -> int:
+        """Return the number of bad and late samples since the last good sample, and set the number to 0."""
+        missing, self._missing = self._missing, 0
+        return missing
+
+    def take_late_frame_delay_ns(self) -> int:
+        """Return the time from the first frame of a sample to the newest late frame of the sample, in ns.
+
+        The result is 0 if no frame has been late since the last call.
+        """
+        delay_ns, self._delay_ns = self._delay_ns, 0
+        return delay_ns
+
+    def add_frame(self, which: int, data: bytes, t_ns: int, done: list[SampleFrames]) -> None:
+        """Add one frame to the sample to which it belongs.
+
+        Parameters
+        ----------
+        which
+            Index of the message.
+        data
+            Bytes of the frame; b"" if it is too short.
+        t_ns
+            Arrival time in ns.
+        done
+            List to which finished samples are appended.
+        """
+        if self._newest_ns is not None:
+            self._pauses[which].append(t_ns - self._newest_ns)
+        self._newest_ns = t_ns
+        if not self._undecided and self._assign_frame(which, data, t_ns, done):
+            return
+        self._undecided.append((which, data, t_ns))
+        while self._undecided and self._assign_frame(*self._undecided[0], done):
+            self._undecided.popleft()
+
+    def _assign_frame(self, which: int, data: bytes, t_ns: int, done: list[SampleFrames]) -> bool:
+        """Add a frame to the current or the next sample. Return False if the order of the messages is unknown."""
+        count = self._read_count(which, data)
+        sample = self._current
+        if sample is not None:
+            delay_ns = t_ns - sample.start_ns
+            next_one = self._begins_next(sample, which, count, delay_ns)
+            if next_one is None:
+                return False
+            if next_one:
+                if NO_TICK != count == self._count_before:
+                    return True  # the frame belongs to the previous sample, which has already been counted
+                self._finish(sample, done)
+                sample = None
+            elif delay_ns > self._window_ns:
+                self._delay_ns = delay_ns
+                self._add_late_frame(sample, which, data, done)
+                return True
+        if sample is None:
+            sample = self._current = SampleFrames([None] * self._n, t_ns, t_ns, NO_TICK)
+        sample.frames[which] = data
+        sample.t_ns = t_ns
+        if count != NO_TICK:
+            sample.count = count
+        if sample.complete:
+            self._finish(sample, done)
+            self._current = None
+        return True
+
+    def _add_late_frame(self, sample: SampleFrames, which: int, data: bytes, done: list[SampleFrames]) -> None:
+        """Mark a message of the current sample as late."""
+        if data:
+            sample.late.add(which)
+        else:
+            sample.frames[which] = data  # the frame is too short, so the sample is bad
+        if sample.frames.count(None) == len(sample.late):
+            self._finish(sample, done)
+            self._current = None
+
+    def _read_count(self, which: int, data: bytes) -> int:
+        """Return the counter value in a frame; NO_TICK if the frame contains no counter."""
+        bits = self._counters[which]
+        if bits is None or not data or not self._by_count:
+            return NO_TICK
+        return int(bits.extract_raw(np.frombuffer(data, np.uint8)[None, :])[0])
+
+    def _begins_next(self, sample: SampleFrames, which: int, count: int, delay_ns: int) -> bool | None:
+        """Return True if a frame starts the next sample; None if this depends on the unknown order of the messages."""
+        if sample.frames[which] is not None or which in sample.late or which == self._counter_message:
+            return True
+        if NO_TICK not in (count, sample.count):
+            return count != sample.count
+        if delay_ns <= self._window_ns:
+            return False
+        fewest = min(map(len, self._pauses))
+        if fewest < MIN_PAUSES and len(self._undecided) < MAX_UNDECIDED_PER_MESSAGE * self._n:
+            return None
+        pauses = [median(newest) if newest else 0 for newest in self._pauses]
+        first = pauses.index(max(pauses)) if self._counter_message is None else self._counter_message
+        # the sum of the pauses before all messages is the sample period
+        return which == first or delay_ns >= sum(pauses)
+
+    def _finish(self, sample: SampleFrames, done: list[SampleFrames]) -> None:
+        """Append a good sample to ``done``, or count a late or bad sample."""
+        self._count_before = sample.count
+        whole = sample.complete and b"" not in sample.frames
+        if whole or (self._partial and any(sample.frames)):
+            sample.missing_before = self.take_missing_samples()
+            sample.temperature = self.temperature
+            self._synchronized = True
+            done.append(sample)
+        elif sample.late and b"" not in sample.frames and sample.frames.count(None) == len(sample.late):
+            self._synchronized = True
+            self.dropped_late_samples += 1
+            self._missing += 1
+        elif self._synchronized or sample.complete:
+            self._missing += 1

@@ -1,0 +1,219 @@
+"""Reading of CAN logs: .asc, .blf, .log and .trc files, CSV of python-can, and CSV with t, id_hex and data_hex.
+
+python-can parses the logs. python-can reads any amount of text to find the next frame, and allocates as much memory as
+a BLF log states. The readers in this module therefore limit the length of lines, the size of objects, and the amount of
+data between two frames. If a limit is exceeded, a reader raises ValueError.
+"""
+
+import csv
+import io
+import zlib
+from collections.abc import Callable, Generator, Iterator
+from typing import IO, Any, BinaryIO, Final, cast
+
+import can
+from can.io import blf
+
+from drivers.data_types import EXTENDED_ID, Chunk
+from drivers.recordings.table import T_LIMIT_S
+
+TEXT_READERS: Final[dict[str, type[can.io.generic.TextIOMessageReader]]] = {
+    ".asc": can.ASCReader, ".log": can.CanutilsLogReader, ".trc": can.TRCReader, ".csv": can.CSVReader,
+}  # fmt: skip
+MAX_STANDARD_ID: Final = 0x7FF
+MAX_EXTENDED_ID: Final = 0x1FFF_FFFF
+MAX_FRAME_BYTES: Final = 64  # of CAN FD
+READ_BYTES: Final = 4096
+MAX_LINE_BYTES: Final = 1 << 20
+MAX_BYTES_WITHOUT_FRAME: Final = 8_000_000
+"""Maximum length of text without a frame, such as comments. python-can needs seconds to read text of this length."""
+MAX_OBJECT_BYTES: Final = 64_000_000
+"""Maximum compressed or uncompressed size of an object in a BLF log. Typical objects have some hundred kilobytes."""
+MAX_OBJECTS_WITHOUT_FRAME_BYTES: Final = 256_000_000
+BLF_OBJECT: Final = b"LOBJ"
+BLF_HEADER_BYTES: Final = blf.OBJ_HEADER_BASE_STRUCT.size
+
+
+def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterator[Chunk]:
+    """Yield the data frames of a log in a format of python-can.
+
+    Parameters
+    ----------
+    stream
+        Decompressed content of the log.
+    suffix
+        File suffix of the format: ".blf" or a key of TEXT_READERS.
+    channel
+        Channel to read. None for all channels.
+
+    Raises
+    ------
+    ValueError
+        If the log is damaged or exceeds a limit.
+    """
+    try:
+        if suffix == ".blf":
+            reader = _ValidatingBlfReader(cast("BinaryIO", _BoundedReader(stream)))
+            yield from _data_frames(iter(reader), channel, lambda: None)
+        else:
+            lines = _BoundedLineReader(stream)
+            yield from _data_frames(iter(TEXT_READERS[suffix](lines.as_text(None))), channel, lines.note_frame)
+    except blf.BLFParseError as error:
+        raise ValueError(f"no BLF log: {error}") from error
+
+
+def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
+    """Yield the data frames of a CSV file with the columns t (s), id_hex and data_hex.
+
+    The columns channel or bus, and extended (0 or 1), are optional.
+
+    Parameters
+    ----------
+    stream
+        Decompressed content of the file.
+    channel
+        Channel to read. None for all channels.
+
+    Raises
+    ------
+    ValueError
+        If the file is damaged or exceeds a limit.
+    """
+    lines = _BoundedLineReader(stream)
+    rows = csv.reader(lines.as_text(""))
+    columns = {name: i for i, name in enumerate(next(rows))}
+    t, identifier, data = columns["t"], columns["id_hex"], columns["data_hex"]
+    channel_column = columns.get("channel", columns.get("bus"))
+    extended = columns.get("extended")
+    for row in rows:
+        if len(row) != len(columns):
+            raise ValueError(f"line {rows.line_num} has {len(row)} fields, not {len(columns)}")
+        lines.note_frame()
+        if channel is not None and (channel_column is None or row[channel_column] != channel):
+            continue
+        address = int(row[identifier], 16)
+        is_extended = address > MAX_STANDARD_ID if extended is None else row[extended] == "1"
+        yield _frame_chunk(bytes.fromhex(row[data]), float(row[t]), address | (EXTENDED_ID if is_extended else 0))
+
+
+def _data_frames(
+    messages: Iterator[can.Message], channel: str | None, note_frame: Callable[[], None]
+) -> Iterator[Chunk]:
+    """Yield the data frames of one channel. Call ``note_frame`` for every message of every channel."""
+    for message in messages:
+        note_frame()
+        if message.is_error_frame or message.is_remote_frame:
+            continue
+        if channel is None or str(message.channel) == channel:
+            address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
+            yield _frame_chunk(bytes(message.data), message.timestamp, address)
+
+
+def _frame_chunk(data: bytes, t_s: float, address: int) -> Chunk:
+    """Return a frame as a chunk. Raise ValueError if the identifier, the length or the time is invalid."""
+    if not abs(t_s) < T_LIMIT_S:
+        raise ValueError(f"{t_s:g} s is no time")
+    if not 0 <= address & ~EXTENDED_ID <= MAX_EXTENDED_ID or address < 0 or len(data) > MAX_FRAME_BYTES:
+        raise ValueError(f"no CAN frame: identifier 0x{address & ~EXTENDED_ID:X}, {len(data)} bytes")
+    return Chunk(data, round(t_s * 1e9), address)
+
+
+class _BoundedLineReader(io.RawIOBase):
+    """Reader that raises ValueError if a line is too long, or if too much text contains no frame."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream = stream
+        self._line_bytes = 0  # number of bytes since the last line end
+        self._bytes_without_frame = 0
+
+    def as_text(self, newline: str | None) -> io.TextIOWrapper:
+        """Return a text file. ``newline`` has the same meaning as in the function ``open``."""
+        return io.TextIOWrapper(io.BufferedReader(self), "utf-8", newline=newline)
+
+    def note_frame(self) -> None:
+        """Set the number of bytes without a frame to 0."""
+        self._bytes_without_frame = 0
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def readinto(self, buffer: Any, /) -> int:
+        """Read bytes into the buffer, and return their number."""
+        data = self._stream.read(min(len(buffer), READ_BYTES))
+        end = max(data.rfind(b"\n"), data.rfind(b"\r"))
+        self._line_bytes = len(data) - end - 1 if end >= 0 else self._line_bytes + len(data)
+        self._bytes_without_frame += len(data)
+        if self._line_bytes > MAX_LINE_BYTES:
+            raise ValueError(f"a line is longer than {MAX_LINE_BYTES} bytes")
+        if self._bytes_without_frame > MAX_BYTES_WITHOUT_FRAME:
+            raise ValueError(f"{MAX_BYTES_WITHOUT_FRAME} bytes hold no CAN frame")
+        buffer[: len(data)] = data
+        return len(data)
+
+
+class _BoundedReader:
+    """Binary file that raises ValueError for reads of a negative or too large size, as a damaged BLF log causes."""
+
+    def __init__(self, stream: IO[bytes]) -> None:
+        self._stream = stream
+
+    def read(self, size: int) -> bytes:
+        """Read ``size`` bytes, or fewer at the end of the file."""
+        if not 0 <= size <= MAX_OBJECT_BYTES:
+            stated = size + BLF_HEADER_BYTES
+            raise ValueError(f"an object has {stated} bytes, expected {BLF_HEADER_BYTES} to {MAX_OBJECT_BYTES}")
+        return self._stream.read(size)
+
+
+class _ValidatingBlfReader(can.BLFReader):
+    """BLF reader that rejects too large objects, and empty objects, which python-can would read forever."""
+
+    def __iter__(self) -> Generator[can.Message, None, None]:
+        bytes_without_frame = 0
+        while (container := self._read_container()) is not None:
+            bytes_without_frame += len(container)
+            for message in self._parse_container(container):
+                bytes_without_frame = 0
+                yield message
+            if bytes_without_frame > MAX_OBJECTS_WITHOUT_FRAME_BYTES:
+                raise blf.BLFParseError(f"{MAX_OBJECTS_WITHOUT_FRAME_BYTES} bytes hold no CAN frame")
+
+    def _read_container(self) -> bytes | None:
+        """Return the uncompressed content of the next container; None at the end of the file."""
+        while header := self.file.read(BLF_HEADER_BYTES):
+            mark, _, _, size, kind = blf.OBJ_HEADER_BASE_STRUCT.unpack(header)
+            if mark != BLF_OBJECT:
+                raise blf.BLFParseError("no object begins where the previous object ends")
+            body = self.file.read(size - BLF_HEADER_BYTES)
+            self.file.read(size % 4)  # padding
+            if kind == blf.LOG_CONTAINER:
+                return _unpack_container(body)
+        return None
+
+    def _parse_container(self, data: bytes) -> Iterator[can.Message]:
+        """Yield the messages of a container after checking the sizes of its objects."""
+        at = data.find(BLF_OBJECT)
+        while at >= 0:
+            size = data[at + 8 : at + 12]
+            if len(size) == 4 and int.from_bytes(size, "little") < BLF_HEADER_BYTES:
+                raise blf.BLFParseError("an object is shorter than its header")
+            at = data.find(BLF_OBJECT, at + 1)
+        if len(self._tail) > MAX_OBJECT_BYTES:
+            raise blf.BLFParseError(f"an object has more than {MAX_OBJECT_BYTES} bytes")
+        yield from super()._parse_container(data)
+
+
+def _unpack_container(container: bytes) -> bytes:
+    """Return the uncompressed content of a container; b"" if the compression method is unknown."""
+    method, _ = blf.LOG_CONTAINER_STRUCT.unpack_from(container)
+    data = container[blf.LOG_CONTAINER_STRUCT.size :]
+    if method == blf.NO_COMPRESSION:
+        return data
+    if method != blf.ZLIB_DEFLATE:
+        return b""
+    unzip = zlib.decompressobj()
+    data = unzip.decompress(data, MAX_OBJECT_BYTES)
+    if unzip.unconsumed_tail:
+        raise blf.BLFParseError(f"a container unpacks to more than {MAX_OBJECT_BYTES} bytes")
+    return data

@@ -1,0 +1,464 @@
+"""Segments, which are the recording files of the daemon. A segment is an Arrow IPC stream that grows during recording.
+
+The folder of a device contains segments such as ``00000042_2026-11-22T03-00-00Z.arrows``. The number gives the order of
+the segments independently of the clock of the host. The time in the file name is the time of the first sample. The
+columns are ``t`` (Unix time in s), six axes, ``temperature``, ``ticks`` (device counter) and ``lost`` (samples missing
+just before the row). Every batch contains the state of the daemon after the batch (``DaemonState``), so that the daemon
+can continue after a restart. A segment of raw data contains the received chunks, with the columns ``t_ns`` (Unix time),
+``address``, ``data`` and ``attachment``.
+
+The daemon appends small batches without compression, and all complete batches of an unfinished segment can be read.
+After a segment has ended, the daemon replaces the file by a copy with large compressed batches. The replacement is
+atomic.
+"""
+
+import errno
+import mmap
+import os
+import re
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from itertools import pairwise
+from pathlib import Path
+from typing import IO, Any, Final, Literal
+
+import msgspec
+import numpy as np
+
+from drivers.data_types import AXES, Chunk, SampleBlock, concatenate_blocks, make_block, ns_to_seconds, seconds_to_ns
+from drivers.errors import ImuError, RecordingError
+from drivers.file_access import open_regular
+from drivers.number_ranges import COUNTER_STEP, RATE_HZ
+from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, first_line, import_pyarrow
+from drivers.recordings.arrow_message_sizes import iter_batch_sizes
+from drivers.recordings.memory_check import ROW_BYTES
+from drivers.recordings.table import BATCH_ROWS, PARTIAL_SUFFIX, T_LIMIT_S
+
+SUFFIX: Final = ".arrows"
+NAME: Final = re.compile(r"(\d{8})_[0-9TZ-]+\.arrows")
+SCHEMA: Final = "imu-monitor/recording/1"
+RAW_BATCH_BYTES: Final = 4_000_000
+MAX_BATCH_BYTES: Final = 64_000_000
+"""Maximum unpacked size of a batch, far above the size of the batches that the daemon writes."""
+MAX_LOST_SAMPLES: Final = 10**11
+"""Maximum number of consecutive missing samples, more than the sample clock can report."""
+
+Kind = Literal["samples", "raw"]
+
+
+class SegmentMetadata(msgspec.Struct, frozen=True):
+    """Source of the data in a segment."""
+
+    device: str
+    kind: Kind
+    axes: str = ""  # mounting of the sensor; a change of the mounting begins a new recording
+    carrier: str = ""  # carrier of the link, for raw data
+    decoder: str = ""
+    packed: bool = False  # True if the segment has been written again with compression
+    schema: str = SCHEMA
+
+
+class DaemonState(msgspec.Struct, frozen=True):
+    """State of the daemon at the end of a batch, from which the daemon continues after a restart."""
+
+    rate: float | None = None  # sample rate in Hz
+    since: tuple[float | None, ...] = (None,) * 6
+    """Unix time in s before which the samples of an axis are not used, after a noise change or a cleared window."""
+    tick_step: float | None = None  # ticks of the device counter per sample
+    theta: tuple[float | None, ...] = ()
+    """Coefficients [5, 6] of the newest fit, row by row."""
+    entered: tuple[bool, ...] = ()
+    """True for each term that the newest fit includes [5, 6], row by row."""
+
+
+@dataclass(frozen=True, slots=True)
+class SegmentPiece:
+    """Consecutive samples in one batch of a segment."""
+
+    samples: SampleBlock  # t_ns are Unix times
+    state: DaemonState
+
+
+class SingleSegmentWriter:
+    """Writer that appends batches to one segment.
+
+    Parameters
+    ----------
+    path
+        New file, which appears with its first batch.
+    origin
+        Source of the data.
+
+    Raises
+    ------
+    OSError
+        If writing to the disk fails. Every method can raise this error. Complete batches remain readable.
+    """
+
+    def __init__(self, path: Path, origin: SegmentMetadata) -> None:
+        self.path = path
+        self._pa = import_pyarrow(path)
+        self._schema = _schema(self._pa, origin)
+        self._state = DaemonState()
+        self._temporary_path = path.with_name(path.name + PARTIAL_SUFFIX)
+        self._temporary_path.unlink(missing_ok=True)  # the file of a program that was killed
+        self._file: IO[bytes] = self._temporary_path.open("xb", buffering=0)
+        self._writer = self._pa.ipc.new_stream(self._file, self._schema)
+        self._valid_bytes = 0  # total length of all complete batches
+
+    def write_samples(self, blocks: Sequence[SampleBlock], state: DaemonState) -> None:
+        """Write one batch of samples.
+
+        Parameters
+        ----------
+        blocks
+            Blocks whose ``t_ns`` are Unix times.
+        state
+            State of the daemon after these samples.
+        """
+        self._write_batch(_sample_batch(self._pa, self._schema, blocks), {b"state": msgspec.json.encode(state)})
+
+    def write_chunks(self, chunks: Sequence[Chunk]) -> None:
+        """Write one batch of chunks whose ``t_ns`` are Unix times."""
+        self._write_batch(_chunk_batch(self._pa, self._schema, chunks), None)
+
+    def flush_to_disk(self) -> None:
+        """Flush the written data to the disk, so that a power failure does not destroy them."""
+        os.fdatasync(self._file.fileno())
+
+    def describe_external_change(self) -> str:
+        """Describe how another program has changed the open file; "" if the file is unchanged."""
+        try:
+            named = os.stat(self.path if self._valid_bytes else self._temporary_path, follow_symlinks=False)
+        except OSError:
+            return "was deleted or renamed"
+        own = os.fstat(self._file.fileno())
+        if not os.path.samestat(named, own):
+            return "was replaced by another file"
+        return "was cut or written by another program" if self._valid_bytes and own.st_size != self._valid_bytes else ""
+
+    def close_changed_file(self) -> None:
+        """Close a file that another program has changed. Write the end mark only if the length is unchanged."""
+        try:
+            if os.fstat(self._file.fileno()).st_size == self._valid_bytes:
+                self._writer.close()
+        finally:
+            self._file.close()
+
+    def close(self) -> None:
+        """Write the end of the stream and close the file. An error does not affect data that were already written."""
+        try:
+            self._writer.close()
+        finally:
+            self._file.close()
+            if not self._valid_bytes:
+                self._temporary_path.unlink(missing_ok=True)
+
+    def _write_batch(self, batch: Any, meta: dict[bytes, bytes] | None) -> None:
+        """Write one batch. After an error, truncate the file to the complete batches."""
+        try:
+            self._writer.write_batch(batch, custom_metadata=meta)
+        except OSError:
+            # an incomplete batch would hide all later batches
+            self._file.truncate(self._valid_bytes)
+            self._file.seek(self._valid_bytes)
+            raise
+        if not self._valid_bytes:
+            if os.path.lexists(self.path):
+                raise FileExistsError(errno.EEXIST, f"{self.path.name} exists already", str(self.path))
+            os.rename(self._temporary_path, self.path)
+            _sync_folder(self.path.parent)
+        self._valid_bytes = self._file.tell()
+
+
+def format_segment_name(number: int, unix_s: float) -> str:
+    """Return the file name of a segment.
+
+    Parameters
+    ----------
+    number
+        Number of the segment in its folder.
+    unix_s
+        Unix time of the first row in s.
+
+    >>> format_segment_name(42, 1_700_000_000.0)
+    '00000042_2023-11-14T22-13-20Z.arrows'
+    """
+    try:
+        when = f"{datetime.fromtimestamp(unix_s, UTC):%Y-%m-%dT%H-%M-%SZ}"
+    except (ValueError, OverflowError, OSError):  # the time of a sender may not be a valid date
+        when = "0000-00-00T00-00-00Z"
+    return f"{number:08d}_{when}{SUFFIX}"
+
+
+def parse_segment_start_s(path: Path) -> float:
+    """Return the Unix time in the name of a segment in s; 0 if the name contains no time.
+
+    >>> parse_segment_start_s(Path("00000042_2023-11-14T22-13-20Z.arrows"))
+    1700000000.0
+    """
+    try:
+        return datetime.strptime(path.stem.partition("_")[2], "%Y-%m-%dT%H-%M-%S%z").timestamp()
+    except ValueError:
+        return 0.0
+
+
+def list_segments(folder: Path) -> list[Path]:
+    """Return the segments in a folder, oldest first; an empty list if the folder does not exist."""
+    if not folder.is_dir():
+        return []
+    return sorted(path for path in folder.iterdir() if NAME.fullmatch(path.name))
+
+
+def parse_segment_number(path: Path) -> int:
+    """Return the number in the name of a segment; 0 if the file name is not the name of a segment."""
+    found = NAME.fullmatch(path.name)
+    return int(found[1]) if found else 0
+
+
+def read_metadata(path: Path) -> SegmentMetadata:
+    """Return the source of the data in a segment. Raise RecordingError if the file is not a segment."""
+    pa = import_pyarrow(path)
+    with _arrow_errors(path), open_regular(path) as file:
+        return _check_schema(path, pa.ipc.open_stream(file).schema)
+
+
+def read_last_piece(path: Path) -> SegmentPiece | None:
+    """Return the last piece of a segment that has ended; None if the segment is empty.
+
+    The file is mapped into memory, so that the other batches are not read. Raise RecordingError if the file is not a
+    segment.
+    """
+    last = deque(_read_batches(path, "samples", mapped=True), maxlen=1)
+    pieces = [piece for batch in last for piece in _split_batch(*batch)]
+    return pieces[-1] if pieces else None
+
+
+def read_samples(path: Path) -> Iterator[SegmentPiece]:
+    """Yield the pieces in the complete batches of a segment. Raise RecordingError for any other file."""
+    for batch, meta in _read_batches(path, "samples"):
+        yield from _split_batch(batch, meta)
+
+
+def _split_batch(batch: Any, meta: Any) -> Iterator[SegmentPiece]:
+    """Yield the samples of a batch, divided where samples are missing. Yield nothing if the batch is implausible."""
+    columns = {name: batch.column(name).to_numpy(zero_copy_only=False) for name in batch.schema.names}
+    values = np.column_stack([columns[axis] for axis in AXES])
+    if not _is_plausible(columns) or np.isinf(values).any():
+        return
+    state = _decode_state(meta)
+    rows = make_block(seconds_to_ns(columns["t"]), values, columns["temperature"].copy(), columns["ticks"].copy())
+    lost = columns["lost"]
+    edges = [0, *(np.flatnonzero(lost[1:]) + 1).tolist(), len(rows)]
+    for a, b in pairwise(edges):
+        part = rows[a:b]
+        yield SegmentPiece(make_block(part.t_ns, part.values, part.temperature_c, part.ticks, int(lost[a])), state)
+
+
+def _is_plausible(columns: Mapping[str, Any]) -> bool:
+    """Return True if times and numbers of lost samples are in the supported ranges."""
+    # a null value converts a column of integers to floats
+    lost, ticks = columns["lost"], columns["ticks"]
+    whole = lost.dtype == ticks.dtype == np.int64
+    return bool(whole and (np.abs(columns["t"]) < T_LIMIT_S).all() and ((lost >= 0) & (lost <= MAX_LOST_SAMPLES)).all())
+
+
+def _decode_state(meta: Any) -> DaemonState:
+    """Return the state in the metadata of a batch; an empty state if the metadata are invalid."""
+    try:
+        found = msgspec.json.decode(meta.get(b"state", b"{}"), type=DaemonState) if meta else DaemonState()
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return DaemonState()
+    sizes = len(found.theta) == len(found.entered) and len(found.theta) in (0, 5 * len(AXES))
+    rate = found.rate is None or RATE_HZ.supports(found.rate)
+    step = found.tick_step is None or COUNTER_STEP.supports(found.tick_step)
+    return found if sizes and len(found.since) == len(AXES) and rate and step else DaemonState()
+
+
+def read_chunks(path: Path) -> Iterator[Chunk]:
+    """Yield the chunks in the complete batches of a segment of raw data, with Unix times.
+
+    Raise RecordingError if the file is not a segment of raw data.
+    """
+    for batch, _ in _read_batches(path, "raw"):
+        for start in range(0, batch.num_rows, BATCH_ROWS):
+            part = batch.slice(start, BATCH_ROWS)
+            columns = (part.column(name).to_pylist() for name in ("t_ns", "address", "data", "attachment"))
+            for t_ns, address, data, attachment in zip(*columns, strict=True):
+                if None not in (t_ns, address, data, attachment) and abs(t_ns) < T_LIMIT_S * 1e9:
+                    yield Chunk(data, t_ns, address, attachment)
+
+
+def compress_segment(path: Path) -> Iterator[None]:
+    """Replace a segment that has ended by a compressed copy.
+
+    The generator yields after each batch, so that the caller can do other work between two batches.
+
+    Raises
+    ------
+    RecordingError
+        If the file is not a segment.
+    OSError
+        If the disk is full. The original segment remains unchanged.
+    """
+    pa = import_pyarrow(path)
+    own = read_metadata(path)
+    if own.packed:
+        return
+    schema = _schema(pa, msgspec.structs.replace(own, packed=True))
+    part = path.with_name(path.name + PARTIAL_SUFFIX)
+    options = pa.ipc.IpcWriteOptions(compression="zstd")
+    try:
+        part.unlink(missing_ok=True)
+        with part.open("xb") as file, pa.ipc.new_stream(file, schema, options=options) as writer:
+            for batch, meta in _merged_batches(pa, schema, path, own.kind):
+                writer.write_batch(batch, custom_metadata=meta)
+                yield
+        with open_regular(part) as written:
+            os.fsync(written.fileno())
+        os.replace(part, path)
+        _sync_folder(path.parent)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Flush the entries of a folder to the disk, so that a power failure does not remove a new file."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _merged_batches(pa: Any, schema: Any, path: Path, kind: Kind) -> Iterator[tuple[Any, dict[bytes, bytes] | None]]:
+    """Yield large batches that are combined from small batches, each with the state after the last row."""
+    waiting: list[Any] = []
+    rows = size = 0
+    meta: dict[bytes, bytes] | None = None
+    for batch, found in _read_batches(path, kind):
+        waiting.append(batch)
+        rows, size = rows + batch.num_rows, size + batch.nbytes
+        meta = {b"state": found[b"state"]} if found and b"state" in found else meta
+        if rows >= BATCH_ROWS or size >= RAW_BATCH_BYTES:
+            yield _combine_batches(pa, schema, waiting), meta
+            waiting, rows, size = [], 0, 0
+    if waiting:
+        yield _combine_batches(pa, schema, waiting), meta
+
+
+def _combine_batches(pa: Any, schema: Any, batches: list[Any]) -> Any:
+    """Combine batches into one batch."""
+    table = pa.Table.from_batches(batches).combine_chunks()
+    return pa.RecordBatch.from_arrays([column.chunk(0) for column in table.columns], schema=schema)
+
+
+def _read_batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tuple[Any, Any]]:
+    """Yield the complete batches with their metadata. Stop before a batch with an implausible size.
+
+    If ``mapped`` is True, the file is mapped into memory, so that unused rows are not read from the disk.
+    """
+    pa = import_pyarrow(path)
+    # the file is opened only once, because the daemon may replace the file by a compressed file at any time
+    with _arrow_errors(path), open_regular(path) as file:
+        count = _count_regular_batches(file)
+        file.seek(0)
+        reader = pa.ipc.open_stream(_memory_map(pa, file) if mapped else file)
+        found = _check_schema(path, reader.schema)
+        if found.kind != kind:
+            raise RecordingError(f"{path}: is a segment of {found.kind}, expected a segment of {kind}")
+        for _ in range(count):
+            try:
+                batch, meta = reader.read_next_batch_with_custom_metadata()
+                batch.validate(full=not mapped)
+            except (StopIteration, pa.ArrowException, OSError):
+                return  # the stream has ended or is truncated
+            if batch.num_rows:
+                yield batch, meta
+
+
+def _count_regular_batches(file: IO[bytes]) -> int:
+    """Return the number of batches before the first batch with an implausible size."""
+    count = 0
+    for size in iter_batch_sizes(file):
+        large = max(size.rows * ROW_BYTES, sum(size.buffers), size.body_bytes) > MAX_BATCH_BYTES
+        if large or size.dictionary:  # the daemon writes no dictionaries
+            break
+        count += 1
+    return count
+
+
+def _memory_map(pa: Any, file: IO[bytes]) -> Any:
+    """Map a file into memory. Return an empty file unchanged, since an empty file cannot be mapped."""
+    if not os.fstat(file.fileno()).st_size:
+        return file
+    return pa.BufferReader(pa.py_buffer(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)))
+
+
+@contextmanager
+def _arrow_errors(path: Path) -> Iterator[None]:
+    """Convert the errors of pyarrow and msgspec for a file that is not a segment to RecordingError."""
+    try:
+        yield
+    except ImuError:
+        raise
+    except OSError as error:
+        if error.errno in (errno.EINVAL, errno.EISDIR):  # not a regular file
+            raise RecordingError(f"{path}: {error.strerror}") from error
+        if error.errno is not None:
+            raise
+        raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
+    except (import_pyarrow(path).ArrowException, UnicodeDecodeError, RecursionError, msgspec.DecodeError) as error:
+        raise RecordingError(f"{path}: is no segment of a recording ({first_line(error)})") from error
+    except MemoryError as error:  # in a file of another type, the first bytes may be read as a length of gigabytes
+        raise RecordingError(
+            f"{path}: is no segment of a recording (it claims more bytes than the memory holds)"
+        ) from error
+
+
+def _check_schema(path: Path, schema: Any) -> SegmentMetadata:
+    """Return the source of the data according to the schema. Raise RecordingError if the file is not a segment."""
+    meta = (schema.metadata or {}).get(METADATA_KEY)
+    if meta is None:
+        raise RecordingError(f"{path}: is no segment of a recording: it does not state its device")
+    found = msgspec.json.decode(meta, type=SegmentMetadata)
+    if found.schema != SCHEMA:
+        raise RecordingError(f'{path}: schema "{found.schema[:64]}" is not {SCHEMA}')
+    if not schema.equals(_schema(import_pyarrow(path), found), check_metadata=False):
+        raise RecordingError(f"{path}: is no segment of a recording: its columns differ")
+    return found
+
+
+def _schema(pa: Any, of: SegmentMetadata) -> Any:
+    """Return the schema of a segment."""
+    if of.kind == "samples":
+        fields = [(name, pa.float64()) for name in ("t", *AXES, "temperature")]
+        fields += [(name, pa.int64()) for name in SEGMENT_COLUMNS]
+    else:
+        fields = [("t_ns", pa.int64()), ("address", pa.uint32()), ("data", pa.binary()), ("attachment", pa.binary())]
+    return pa.schema(fields, metadata={METADATA_KEY: msgspec.json.encode(of)})
+
+
+def _sample_batch(pa: Any, schema: Any, blocks: Sequence[SampleBlock]) -> Any:
+    """Return blocks of samples as one record batch."""
+    rows = concatenate_blocks(blocks)
+    lost = np.zeros(len(rows), np.int64)
+    at = 0
+    for one in blocks:
+        lost[at] = one.lost
+        at += len(one)
+    columns = [ns_to_seconds(rows.t_ns), *rows.values.T, rows.temperature_c, rows.ticks, lost]
+    return pa.record_batch([pa.array(np.ascontiguousarray(column)) for column in columns], schema=schema)
+
+
+def _chunk_batch(pa: Any, schema: Any, chunks: Sequence[Chunk]) -> Any:
+    """Return chunks as one record batch."""
+    columns = (
+        [one.t_ns for one in chunks], [one.address for one in chunks],
+        [one.data for one in chunks], [one.attachment for one in chunks],
+    )  # fmt: skip
+    arrays = [pa.array(column, field.type) for column, field in zip(columns, schema, strict=True)]
+    return pa.record_batch(arrays, schema=schema)

@@ -1,0 +1,49 @@
+"""Command ``simulate``: writes a recording of a noise model."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from drivers.errors import ConfigError
+from drivers.file_access import real_path
+from monitor.cli.shared import options, output, service_in_terminal
+
+
+def simulate(
+    model: Annotated[str, typer.Argument(metavar="MODEL.toml|NAME", help="Model file, or name of a shipped model.")],
+    seconds: Annotated[str, typer.Option(metavar="S", help="Length in seconds; also 30min, 1h, 2d.")],
+    out: Annotated[
+        Path, typer.Option(metavar="FILE", help="Recording to write: .csv, .csv.gz, .npz, .parquet, .arrow, .feather.")
+    ],
+    seed: options.SimulationSeed = 1,
+    rate: options.ModelRate = None,
+    temperature_from: Annotated[
+        Path | None, typer.Option(metavar="RECORDING", help="Use the temperature of this recording.")
+    ] = None,
+    truth: Annotated[
+        bool,
+        typer.Option(
+            "--truth", help="Also write FILE.truth.json with the model and the random values drawn from the seed."
+        ),
+    ] = False,
+    json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
+) -> None:
+    """Write a recording of a noise model. An incomplete file never appears."""
+    from monitor.commands import simulate as simulation
+    from monitor.noise.model_loading import load_model
+
+    length_s = options.parse_duration("--seconds", seconds)
+    output.check_output_file("--json", json)
+    for option, path in (("--json", json), ("--temperature-from", temperature_from)):
+        if path is not None and real_path(path) == real_path(out):
+            raise ConfigError(f"{option}: {path} is also the output file of --out; choose another name")
+    noise = load_model(model, Path.cwd())
+    request = simulation.Request(noise, out, length_s, seed, rate, temperature_from, truth, model)
+    service_in_terminal.exit_on_sigterm()
+    with output.show_progress() as tell:
+        result = simulation.run_simulation(request, tell)
+    if json is not None:
+        output.write_bytes("--json", json, result.to_json() + b"\n")
+    if json != Path("-"):
+        typer.echo(result.text())

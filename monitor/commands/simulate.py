@@ -1,0 +1,213 @@
+"""Command ``simulate``: writes a recording of a noise model.
+
+The time series is drawn and written block by block, so that the memory does not grow with the length. The file has the
+column ``t`` (seconds from 0, at the nominal rate) and the axes that the model names. Other axes are absent, not zero.
+The column ``temperature`` is present if the model or a recording provides it.
+
+Recording and truth file are each written completely or not at all. The truth file contains the model, the seed, and
+random values such as the times of events.
+"""
+
+import tomllib
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Final
+
+import msgspec
+import numpy as np
+
+from drivers.data_types import AXES, Floats
+from drivers.errors import ConfigError
+from drivers.number_ranges import SAMPLE_COUNT
+from drivers.recordings import Recording, load_samples, open_recording_writer
+from drivers.recordings.writing import atomic_write_path
+from monitor.commands.progress import ProgressCallback, ignore_progress
+from monitor.noise.model import NoiseModel
+from monitor.noise.simulation import ModelStream, SimulatedSamples
+
+TRUTH_SCHEMA: Final = "imu-monitor/truth/1"
+RESULT_SCHEMA: Final = "imu-monitor/simulate/1"
+CHUNK_ROWS: Final = 1 << 16
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """Recording to simulate."""
+
+    model: NoiseModel
+    out: Path
+    seconds: float
+    seed: int
+    rate_hz: float | None = None  # None for the rate of the model
+    temperature_from: Path | None = None  # recording whose temperature replaces that of the model
+    truth: bool = False  # True if a file with the drawn random values is also written
+    name: str = "the model"  # name of the model in messages
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """Description of the written recording."""
+
+    out: Path
+    samples: int
+    rate_hz: float
+    seed: int
+    axes: tuple[str, ...]
+    temperature: bool
+    truth: Path | None
+
+    @property
+    def seconds(self) -> float:
+        """Length of the recording in seconds."""
+        return self.samples / self.rate_hz
+
+    def text(self) -> str:
+        """Return the description in one line of text."""
+        columns = " ".join([*self.axes, *(["temperature"] if self.temperature else [])])
+        beside = f"; truth in {self.truth}" if self.truth else ""
+        return (
+            f"{self.out}: {self.samples} samples at {self.rate_hz:g} Hz, {self.seconds:.6g} s, "
+            f"seed {self.seed}: {columns}{beside}"
+        )
+
+    def to_json(self) -> bytes:
+        """Return the description as JSON."""
+        return msgspec.json.encode(
+            {
+                "schema": RESULT_SCHEMA,
+                "out": str(self.out),
+                "samples": self.samples,
+                "rate": self.rate_hz,
+                "seconds": self.seconds,
+                "seed": self.seed,
+                "axes": self.axes,
+                "temperature": self.temperature,
+                "truth": None if self.truth is None else str(self.truth),
+            }
+        )
+
+
+def run_simulation(request: Request, tell: ProgressCallback = ignore_progress) -> Result:
+    """Simulate a recording and write it.
+
+    Parameters
+    ----------
+    request : Request
+        Recording to simulate.
+    tell : callable, optional
+        Progress callback.
+
+    Returns
+    -------
+    Result
+        Description of the written recording.
+
+    Raises
+    ------
+    ConfigError
+        If there is no rate or no axis, if the model cannot be simulated at this rate, or if the file cannot be written.
+    RecordingError
+        If the recording with the temperature cannot be read.
+    """
+    rate_hz = _rate_hz(request)
+    n = round(request.seconds * rate_hz)
+    try:
+        SAMPLE_COUNT.check(n)
+    except ConfigError as error:
+        raise ConfigError(f"{request.seconds:g} s at {rate_hz:g} Hz: {error}") from None
+    axes = tuple(axis for axis in AXES if axis in request.model.effects)
+    if not axes:
+        raise ConfigError(f"{request.name}: the model has no axis; possible are {' '.join(AXES)}")
+    tell("preparing", None)
+    temperature_c = _temperature(request, rate_hz, n)
+    try:
+        stream = request.model.stream(rate_hz, request.seed, temperature_c)
+    except ConfigError as error:
+        raise ConfigError(f"{request.name}: {error}") from error
+    first = stream.draw_with_temperature(min(n, CHUNK_ROWS))
+    temperature = not bool(np.isnan(first.temperature_c).all())
+    truth = request.out.with_name(request.out.name + ".truth.json") if request.truth else None
+    result = Result(request.out, n, rate_hz, request.seed, axes, temperature, truth)
+    if truth is None:
+        _write(result, stream, first, tell)
+    else:
+        with atomic_write_path(truth) as part:
+            _write(result, stream, first, tell)
+            part.write_bytes(_truth(result, request.model, stream))
+    return result
+
+
+def _write(result: Result, stream: ModelStream, first: SimulatedSamples, tell: ProgressCallback) -> None:
+    """Write the recording block by block."""
+    with open_recording_writer(result.out, result.axes, result.temperature) as append:
+        block, written = first, 0
+        while True:
+            append(np.arange(written, written + len(block.values)) / result.rate_hz, block.values, block.temperature_c)
+            written += len(block.values)
+            tell("simulating", written / result.samples)
+            if written == result.samples:
+                break
+            block = stream.draw_with_temperature(min(CHUNK_ROWS, result.samples - written))
+        tell("finishing the file", None)  # some formats are compressed only at the end
+
+
+def _rate_hz(request: Request) -> float:
+    """Return the requested sample rate, or else the rate of the model."""
+    rate_hz = request.rate_hz or request.model.sample_rate_hz
+    if rate_hz is None:
+        raise ConfigError(f"{request.name}: the model has no sample_rate; set the rate with --rate HZ")
+    return rate_hz
+
+
+def _temperature(request: Request, rate_hz: float, n: int) -> Floats | None:
+    """Return the temperature of the recording at the times of the samples, [≤ n] in °C, by linear interpolation.
+
+    None means that the temperature of the model is used.
+    """
+    if request.temperature_from is None:
+        return None
+    found = _load_recording(request.temperature_from, request.rate_hz)
+    known = np.isfinite(found.temperature_c)
+    if not known.any():
+        raise ConfigError(f"{request.temperature_from}: has no temperature; a column temperature in °C is needed")
+    t_s = np.arange(len(found)) / (found.rate_hz or rate_hz) if found.t_s is None else found.t_s - found.t_s[0]
+    t_s, temperature_c = t_s[known], found.temperature_c[known]
+    order = np.argsort(t_s, kind="stable")
+    length = min(n, int(t_s.max() * rate_hz) + 1)
+    return np.interp(np.arange(length) / rate_hz, t_s[order], temperature_c[order])
+
+
+def _load_recording(path: Path, rate_hz: float | None) -> Recording:
+    """Load the recording with the temperature. If it has no rate, its rows are assumed to have the requested rate."""
+    try:
+        return load_samples(path)
+    except ConfigError:
+        if rate_hz is None:
+            raise
+        return load_samples(path, rate_hz)
+
+
+def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:
+    """Return the truth as JSON."""
+    return msgspec.json.encode(
+        {
+            "schema": TRUTH_SCHEMA,
+            "version": _version(),
+            "model": tomllib.loads(model.to_toml()),
+            "seed": result.seed,
+            "rate": result.rate_hz,
+            "seconds": result.seconds,
+            "samples": result.samples,
+            "axes": result.axes,
+            "drawn": stream.drawn_values(),
+        }
+    )
+
+
+def _version() -> str | None:
+    """Return the version of this program; None if it runs from a folder without installation."""
+    try:
+        return version("imu-monitor")
+    except PackageNotFoundError:
+        return None

@@ -1,0 +1,362 @@
+"""Recording of one device: a bounded queue, and the segment file to which the queue is written.
+
+The reader thread of the device fills the queue. The recorder thread calls all other methods. If a write fails, the rows
+stay in the queue while the queue has space. Rows that do not fit are counted and leave a gap in the recording.
+"""
+
+import contextlib
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import NO_TICK, Chunk, SampleBlock
+from drivers.errors import ConfigError, RecordingError
+from drivers.file_access import check_folder_or_absent
+from drivers.recordings import segment_file as segment
+from drivers.recordings.segment_file import DaemonState, SegmentMetadata, SingleSegmentWriter
+from drivers.recordings.table import PARTIAL_SUFFIX
+from monitor.settings.loading import Storage
+
+RETRY_S: Final = 5.0
+"""Interval between two attempts to record after an error."""
+MAX_QUEUE_BYTES: Final = 16_000_000
+"""Capacity of the queue of one device, three minutes of samples at 1 kHz."""
+TIME_RESOLUTION_NS: Final = 1000
+"""Upper bound of the resolution of Unix times in a recording."""
+MAX_SAME_SAMPLE_NS: Final = 500_000_000
+"""Largest time difference of two rows with the same counter value that count as the same sample."""
+SAMPLE_BYTES: Final = 80
+"""Memory that one sample occupies in a queue."""
+CHUNK_OVERHEAD_BYTES: Final = 100
+"""Memory that a chunk occupies in a queue, in addition to its bytes."""
+RAW_FOLDER: Final = "raw"
+"""Name of the folder for raw bytes in the folder of a device."""
+
+Opening = Callable[[Path, SegmentMetadata], SingleSegmentWriter]
+"""Function that opens a new segment."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecorderEvent:
+    """Event about the recording of a device."""
+
+    device: str
+    kind: str  # recording_stopped | recording_back
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class _NewestRow:
+    """Newest row of a recording."""
+
+    t_ns: int  # Unix
+    tick: int = NO_TICK
+    rate_hz: float | None = None
+
+
+class RecordingTrack:
+    """Recording of the samples or of the raw bytes of one device.
+
+    Parameters
+    ----------
+    origin : SegmentMetadata
+        Device and kind of the recording.
+    storage : Storage
+        Folder and segment length.
+    opening : callable
+        Opens a segment.
+    events : deque of RecorderEvent
+        Receives the events of the recording.
+    finished : deque of Path
+        Receives the paths of finished segments.
+    """
+
+    def __init__(
+        self,
+        origin: SegmentMetadata,
+        storage: Storage,
+        opening: Opening,
+        events: deque[RecorderEvent],
+        finished: deque[Path],
+    ) -> None:
+        self.origin = origin
+        device_folder = storage.folder / origin.device
+        self.folder = device_folder if origin.kind == "samples" else device_folder / RAW_FOLDER
+        self.missed = 0
+        """Number of rows that are not in the recording."""
+        self.trouble = ""
+        """Reason why recording has stopped; empty while it works."""
+        self.leaving = False
+        """True if the device was removed. The track is deleted when the queue has been written."""
+        self._segment_s = storage.segment_s
+        self._opening = opening
+        self._events = events
+        self._finished = finished
+        self._lock = threading.Lock()  # protects the queue; held briefly, because the reader thread waits for the lock
+        self._queue: deque[SampleBlock | Chunk] = deque()  # with Unix times
+        self._queue_bytes = 0
+        self._dropped = 0  # dropped and missing rows before the oldest row in the queue
+        self._taken: list[SampleBlock | Chunk] = []  # taken from the queue and being written
+        self._writer: SingleSegmentWriter | None = None
+        self._begin_s = 0.0  # Unix time of the open segment's first row
+        self._number: int | None = None  # of the newest segment; None until the folder has been searched
+        self._rows = 0  # rows or chunks in the open segment
+        self._unsynced = False  # True if rows were written since the last flush to disk
+        self._stopped_s = 0.0  # monotonic time of the last failure
+
+    # --- queue
+
+    @property
+    def is_queue_filling_up(self) -> bool:
+        """True if more than a quarter of the queue is in use."""
+        return self._queue_bytes > MAX_QUEUE_BYTES // 4
+
+    def enqueue(self, entries: Sequence[SampleBlock | Chunk], count_dropped: bool) -> None:
+        """Append entries to the queue. If the queue is full, drop the oldest entries.
+
+        Parameters
+        ----------
+        entries : sequence of SampleBlock or Chunk
+            Entries with Unix times.
+        count_dropped : bool
+            True if dropped rows count as missing in the recording. False while another process records these rows.
+        """
+        with self._lock:
+            self._queue.extend(entries)
+            self._queue_bytes += sum(_size(one) for one in entries)
+            while self._queue_bytes > MAX_QUEUE_BYTES and len(self._queue) > 1:
+                dropped = self._queue.popleft()
+                self._queue_bytes -= _size(dropped)
+                if count_dropped:
+                    rows, lost = (len(dropped), dropped.lost) if isinstance(dropped, SampleBlock) else (1, 0)
+                    self._dropped += rows + lost
+                    self.missed += rows
+
+    def drop_recorded_rows(self) -> None:
+        """Drop queued rows that another process has recorded; rows missing after these rows become a gap."""
+        newest = self._find_newest_row()
+        with self._lock:
+            waiting = [*self._taken, *self._queue]
+            if newest is not None:
+                end_ns = _time_of(newest, waiting)
+                waiting = [part for one in waiting for part in _rows_after(one, end_ns)]
+                if waiting and isinstance(first := waiting[0], SampleBlock):
+                    gap_s = (int(first.t_ns[0]) - end_ns) / 1e9
+                    lost = max(round(gap_s * newest.rate_hz) - 1, 0) if newest.rate_hz else 0
+                    waiting[0] = replace(first, lost=lost)
+            self._taken, self._dropped = [], 0
+            self._queue = deque(waiting)
+            self._queue_bytes = sum(_size(one) for one in waiting)
+
+    def _take_queue(self) -> None:
+        """Move the queue to the rows to be written; rows that were dropped become a gap in the recording."""
+        with self._lock:
+            self._taken = list(self._queue)
+            self._queue.clear()
+            self._queue_bytes = 0
+            dropped, self._dropped = self._dropped, 0
+        if self._taken and isinstance(first := self._taken[0], SampleBlock):
+            self._taken[0] = replace(first, lost=first.lost + dropped)
+
+    def _find_newest_row(self) -> _NewestRow | None:
+        """Return the newest row in the folder; None if there is none."""
+        for path in reversed(segment.list_segments(self.folder)):
+            with contextlib.suppress(RecordingError, ConfigError, OSError):  # files that are no segments are skipped
+                if self.origin.kind == "raw":
+                    last = deque(segment.read_chunks(path), maxlen=1)
+                    if last:
+                        return _NewestRow(last[0].t_ns)
+                elif (piece := segment.read_last_piece(path)) is not None:
+                    rows = piece.samples
+                    span_s = int(rows.t_ns[-1] - rows.t_ns[0]) / 1e9
+                    rate_hz = piece.state.rate or ((len(rows) - 1) / span_s if span_s > 0.0 else None)
+                    return _NewestRow(int(rows.t_ns[-1]), int(rows.ticks[-1]), rate_hz)
+        return None
+
+    # --- segment file
+
+    def write_queued_rows(self, state: DaemonState, disk_full: str) -> None:
+        """Append the queued rows to the segment. After an error, the rows stay in memory for the next attempt.
+
+        Parameters
+        ----------
+        state : DaemonState
+            State of the estimate that is recorded with the rows.
+        disk_full : str
+            Message if the disk is too full; else "".
+        """
+        if disk_full:
+            self._report_failure(disk_full)
+        if self.trouble and (disk_full or time.monotonic() - self._stopped_s < RETRY_S):
+            return
+        if not self._taken:
+            self._take_queue()
+        if not self._taken:
+            return
+        try:
+            self._append(state)
+        except ConfigError as error:  # pyarrow is not installed
+            self._report_failure(str(error))
+        except OSError as error:
+            self._report_failure(stopped_text(self.folder, error))
+            self.close_segment()
+        else:
+            self._taken = []
+            if self.trouble:
+                self.trouble = ""
+                self.report_continuation()
+
+    def sync(self) -> None:
+        """Flush the open segment to disk."""
+        if self._writer is None or not self._unsynced:
+            return
+        self._unsynced = False
+        try:
+            self._writer.flush_to_disk()
+        except OSError as error:
+            self._report_failure(stopped_text(self.folder, error))
+            self.close_segment()
+
+    def close_segment(self, pack: bool = True) -> None:
+        """Close the open segment, and queue it for packing if ``pack`` is True."""
+        writer, self._writer = self._writer, None
+        if writer is None:
+            return
+        try:
+            writer.close()
+        except OSError as error:
+            self._report_failure(stopped_text(writer.path, error))
+        if pack:
+            self._finished.append(writer.path)
+
+    def suspend(self) -> None:
+        """Close the open segment while another process may create segments in the folder."""
+        self.close_segment(pack=False)
+        self._number = None
+
+    def close_if_file_changed(self) -> str:
+        """Close a file that another program has changed; return a message, or "" if the file is unchanged."""
+        writer = self._writer
+        change = "" if writer is None else writer.describe_external_change()
+        if writer is None or not change:
+            return ""
+        self._writer = None
+        try:
+            writer.close_changed_file()
+        except OSError as error:
+            change = f"{change} ({error.strerror or error})"
+        known = segment.list_segments(self.folder)  # not packed, because some may belong to another program
+        self._number = max(self._number or 0, segment.parse_segment_number(known[-1]) if known else 0)
+        note = f"{writer.path} {change} during recording, with {self._rows} rows in it; a new file is begun"
+        self.queue_event("recording_stopped", note)
+        self.queue_event("recording_back", "recording continues in a new file")
+        return note
+
+    def _append(self, state: DaemonState) -> None:
+        """Append rows to the open segment, or to a new segment if the open segment has its full length."""
+        begin_s = _time_s(self._taken[0])
+        if self._writer is not None and begin_s - self._begin_s >= self._segment_s:
+            self.close_segment()
+        writer = self._writer or self._begin(begin_s)
+        if self.origin.kind == "samples":
+            blocks = [one for one in self._taken if isinstance(one, SampleBlock)]
+            writer.write_samples(blocks, state)
+            self._rows += sum(len(one) for one in blocks)
+        else:
+            writer.write_chunks([one for one in self._taken if isinstance(one, Chunk)])
+            self._rows += len(self._taken)
+        self._unsynced = True
+
+    def _begin(self, begin_s: float) -> SingleSegmentWriter:
+        """Open the next segment."""
+        check_folder_or_absent(self.folder)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if self._number is None:
+            known = segment.list_segments(self.folder)
+            self._number = segment.parse_segment_number(known[-1]) if known else 0
+            self._finished.extend(known)
+            for part in self.folder.glob(f"*{PARTIAL_SUFFIX}"):
+                part.unlink()
+        path = self.folder / segment.format_segment_name(self._number + 1, begin_s)
+        self._writer = self._opening(path, self.origin)
+        self._number += 1
+        self._begin_s, self._rows = begin_s, 0
+        return self._writer
+
+    # --- events
+
+    def queue_event(self, kind: str, text: str) -> None:
+        """Queue an event of the device.
+
+        Parameters
+        ----------
+        kind : str
+            "recording_stopped" or "recording_back".
+        text : str
+            Message of the event.
+        """
+        self._events.append(RecorderEvent(self.origin.device, kind, text))
+
+    def report_continuation(self) -> None:
+        """Queue the event that the recording continues."""
+        self.queue_event("recording_back", f"recording continues; {self.missed} rows are missing in it")
+
+    def _report_failure(self, reason: str) -> None:
+        """Store the reason why the recording has stopped. For the first failure, queue an event."""
+        if not self.trouble:
+            self.queue_event("recording_stopped", reason)
+        self.trouble = reason
+        self._stopped_s = time.monotonic()
+
+
+def stopped_text(path: Path, error: OSError) -> str:
+    """Return the message that an error of the file system has stopped the recording.
+
+    Parameters
+    ----------
+    path : Path
+        File or folder of the error.
+    error : OSError
+        Error of the file system.
+    """
+    return f"{path}: {error.strerror or error}; recording stopped, trying again"
+
+
+def _time_of(newest: _NewestRow, waiting: Sequence[SampleBlock | Chunk]) -> int:
+    """Return the time of a recorded row on the clock of the queued rows, in Unix nanoseconds.
+
+    The times that two processes give the same sample differ by some milliseconds, so the sample is identified by the
+    counter of the device. If no queued row has the same counter value, the recorded time is returned.
+    """
+    for one in waiting if newest.tick != NO_TICK else ():
+        if isinstance(one, SampleBlock):
+            found = np.flatnonzero((one.ticks == newest.tick) & (np.abs(one.t_ns - newest.t_ns) < MAX_SAME_SAMPLE_NS))
+            if found.size:
+                return int(one.t_ns[found[-1]])
+    return newest.t_ns
+
+
+def _rows_after(one: SampleBlock | Chunk, t_ns: int) -> list[SampleBlock | Chunk]:
+    """Return the rows later than a time: the whole block, a part of the block, or no block."""
+    if isinstance(one, Chunk):
+        return [one] if one.t_ns > t_ns else []
+    later = np.flatnonzero(one.t_ns > t_ns + TIME_RESOLUTION_NS)
+    return [one[int(later[0]) :]] if later.size else []
+
+
+def _size(one: SampleBlock | Chunk) -> int:
+    """Return the memory of a queued block or chunk in bytes."""
+    if isinstance(one, SampleBlock):
+        return SAMPLE_BYTES * len(one)
+    return CHUNK_OVERHEAD_BYTES + len(one.data) + len(one.attachment)
+
+
+def _time_s(one: SampleBlock | Chunk) -> float:
+    """Return the time of the first row of a block or chunk, in Unix seconds."""
+    return float(one.t_ns[0] if isinstance(one, SampleBlock) else one.t_ns) / 1e9

@@ -1,0 +1,410 @@
+"""Test whether the slow part of a bias depends on temperature, and whether heating and cooling differ.
+
+A random walk correlates with a temperature ramp by chance, so ordinary regression would name axes that do not depend on
+temperature. The tests are therefore generalised least squares with correlated noise as the null hypothesis. The noise
+is the sum of white noise and a random walk whose increments may be correlated (a smooth drift). The ratio of random
+walk to white noise and the correlation of the increments are unknown. An F test is made for each pair of these two
+parameters on a grid. Pairs are plausible if their log restricted likelihood (Harville, J. Am. Stat. Assoc. 72, 1977) is
+within MAX_LIKELIHOOD_LOSS of the best. The result is the largest p-value of all plausible pairs. The measured false
+positive rates are in
+docs/thermal-measurements.md.
+
+``find_dependence`` tests a cubic polynomial in temperature, alone and with each description of hysteresis.
+``find_hysteresis`` tests the descriptions of hysteresis in addition to a polynomial of order 5. The descriptions are:
+
+- differences between heating and cooling that vanish at the ends of the temperature range;
+- first-order lags, for heat that reaches the sensor with a delay;
+- play operators, whose sum is the Prandtl-Ishlinskii model of rate-independent hysteresis (Visintin, Differential
+  Models of Hysteresis, 1994, chapter III).
+
+If temperature rose and fell, a constant drift with time belongs to the null hypothesis. If temperature moved in one
+direction only, such a drift cannot be distinguished from a dependence on temperature, and ``one_way`` is True.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.common.distributions import incomplete_beta
+from monitor.drift.thermal.interval_means import IntervalMeans
+from monitor.drift.thermal.thermal_model import interpolate_gaps
+from monitor.drift.thermal.thermal_response import first_order_lag
+
+SIGNIFICANCE: Final = 0.01
+"""Largest p-value of a dependence or a hysteresis that is reported, after Bonferroni's correction."""
+MAIN_SHARE: Final = 0.5
+"""Share of the variance of the means above which temperature is said to explain most of the variance."""
+MAX_MEANS: Final = 150
+"""Largest number of means. If there are more, groups of means are averaged, because the cost grows with the cube of the
+number."""
+MIN_FREE: Final = 4
+"""Smallest number of degrees of freedom that a regression must leave."""
+MAX_LIKELIHOOD_LOSS: Final = 2.0
+"""Largest difference of the log restricted likelihood to the best noise model, for a plausible noise model."""
+WALK_RATIOS: Final = (0.0, *np.geomspace(1e-3, 1e3, 9).tolist())
+"""Variance that the random walk gains in an interval, divided by the white variance of a mean."""
+INCREMENT_CORRELATIONS: Final = (0.0, 0.5, 0.8, 0.95)
+"""Correlations of successive increments of the random walk."""
+MIN_REVERSAL_SHARE: Final = 0.05
+"""Share of the temperature range by which temperature must return to have changed its direction."""
+MIN_REVERSAL_SIGMAS: Final = 3.0
+"""Standard errors of a mean of temperature by which temperature must return to have changed its direction."""
+LAG_INTERVALS: Final = (1.0, 2.5, 6.0, 15.0)
+"""Time constants of the lags, in intervals."""
+PLAY_WIDTHS: Final = (0.05, 0.1, 0.2, 0.35)
+"""Half widths of the play operators, as shares of the temperature range."""
+LOOP_POWERS: Final = 4
+"""Number of terms of the difference between heating and cooling."""
+FOLDS: Final = 6
+"""Parts of the means for cross-validation. Successive means belong to different parts."""
+MIN_NEW_SHARE: Final = 1e-4
+"""Smallest part of a regressor that the previous regressors must leave unexplained. Other regressors are dropped."""
+CURVE_ORDER: Final = 3
+"""Order of the polynomial in temperature for the test of dependence."""
+HYSTERESIS_CURVE_ORDER: Final = 5
+"""Order of the polynomial in temperature for the test of hysteresis."""
+
+
+@dataclass(frozen=True, slots=True)
+class TemperatureDependence:
+    """Significant dependence of the slow variation of an axis on temperature."""
+
+    share: float  # explained share of the variance of the interval means, cross-validated
+    p_value: float  # p-value of the hypothesis of no dependence
+    form: str  # "cubic", or "cubic with hysteresis"
+    one_way: bool  # True if temperature only rose or only fell
+    interval_s: float
+
+    @property
+    def explains_most(self) -> bool:
+        """True if temperature explains the greater part of the slow variance."""
+        return self.share >= MAIN_SHARE
+
+
+@dataclass(frozen=True, slots=True)
+class Hysteresis:
+    """Difference of the bias between heating and cooling."""
+
+    size: float  # largest difference of the bias at one temperature, including a drift in between; rad/s or m/s²
+    p_value: float  # p-value of the hypothesis of no difference
+
+    @property
+    def hysteresis_is_significant(self) -> bool:
+        """True if noise alone does not explain the difference."""
+        return self.p_value < SIGNIFICANCE
+
+
+@dataclass(frozen=True, slots=True)
+class _Regression:
+    """F test of one set of regressors."""
+
+    p_value: float  # largest p-value among the plausible noise models
+    likelihood: float  # logarithm, for the most likely noise model; comparable between regressions of the same means
+    smooth: Floats  # [m] known means minus their estimated white noise
+    noise: tuple[float, float]  # ratio and correlation of the most likely noise model
+
+
+def temperature_noise_c(temperature_c: Floats) -> float:
+    """Return the standard deviation of the noise of temperatures [n] in °C, from their second differences."""
+    second = np.diff(temperature_c, 2)
+    return float(np.median(np.abs(second))) / 6.0**0.5 / 0.6745 if second.size else 0.0
+
+
+def heating_direction(temperature_c: Floats) -> Floats:
+    """Return +1 where temperature was last rising and -1 where it was last falling. All values are 0 without any
+    change.
+
+    A reversal counts if it exceeds MIN_REVERSAL_SHARE of the range and MIN_REVERSAL_SIGMAS standard errors of a mean.
+
+    Parameters
+    ----------
+    temperature_c : ndarray, shape (n,)
+        Temperature in °C, without missing values.
+
+    Examples
+    --------
+    >>> heating_direction(np.array([0.0, 1.0, 2.0, 2.0, 1.0, 0.0])).tolist()
+    [1.0, 1.0, 1.0, -1.0, -1.0, -1.0]
+    """
+    noise_c = temperature_noise_c(temperature_c)
+    threshold = max(MIN_REVERSAL_SHARE * float(np.ptp(temperature_c)), MIN_REVERSAL_SIGMAS * noise_c)
+    direction = np.zeros(temperature_c.size)
+    highest = lowest = 0
+    now = 0.0
+    for at, value in enumerate(temperature_c.tolist()):
+        if value > temperature_c[highest]:
+            highest = at
+        if value < temperature_c[lowest]:
+            lowest = at
+        if now >= 0.0 and temperature_c[highest] - value > threshold:
+            now, lowest = -1.0, at
+            direction[highest + 1 : at] = now
+        elif now <= 0.0 and value - temperature_c[lowest] > threshold:
+            now, highest = 1.0, at
+            direction[lowest + 1 : at] = now
+        direction[at] = now
+    moved = np.flatnonzero(direction)
+    if moved.size:
+        direction[: moved[0]] = direction[moved[0]]
+    return direction
+
+
+def find_dependence(means: IntervalMeans) -> TemperatureDependence | None:
+    """Test whether the bias depends on temperature.
+
+    Parameters
+    ----------
+    means : IntervalMeans
+        Interval means of bias (rad/s or m/s²) and temperature (°C). Temperature must vary.
+
+    Returns
+    -------
+    TemperatureDependence or None
+        The dependence with the largest share among the significant ones, or None if noise explains the bias.
+    """
+    pooled = _pooled(means)
+    known, y = pooled.known, pooled.bias
+    x, direction = _scaled(pooled)
+    one_way = not _rose_and_fell(direction)
+    curve = _polynomial(x, CURVE_ORDER)
+    candidates = [("cubic", curve)]
+    nuisance = np.zeros((x.size, 0))
+    if not one_way:
+        loops = _hysteresis_regressors(x, direction).values()
+        candidates += [("cubic with hysteresis", np.hstack([curve, each])) for each in loops]
+        nuisance = _linear_drift(x.size)
+    found: TemperatureDependence | None = None
+    for form, columns in candidates:
+        tested = _regression(y, nuisance, columns, known)
+        if tested is None or (p_value := len(candidates) * tested.p_value) >= SIGNIFICANCE:
+            continue
+        share = _validated_share(y, nuisance, columns, known, tested.noise)
+        if found is None or share > found.share + 0.01:  # a simpler form has precedence
+            found = TemperatureDependence(share, p_value, form, one_way, means.interval_s)
+    return found
+
+
+def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
+    """Test whether the bias differs between heating and cooling at the same temperature.
+
+    Parameters
+    ----------
+    means : IntervalMeans
+        Interval means of bias (rad/s or m/s²) and temperature (°C). Temperature must vary.
+
+    Returns
+    -------
+    Hysteresis or None
+        The difference and its p-value. None if temperature moved in one direction only, or if there are too few means.
+    """
+    pooled = _pooled(means)
+    x, direction = _scaled(pooled)
+    if not _rose_and_fell(direction):
+        return None
+    curve, loops = _polynomial(x, HYSTERESIS_CURVE_ORDER), _hysteresis_regressors(x, direction)
+    # A single lag or play operator is also tested, because it leaves more degrees of freedom than all four together.
+    candidates = [*loops.values(), *loops["lag"].T[:, :, None], *loops["play"].T[:, :, None]]
+
+    def regress(nuisance: Floats) -> list[_Regression]:
+        tested = (_regression(pooled.bias, nuisance, each, pooled.known) for each in candidates)
+        return [one for one in tested if one is not None]
+
+    tests = regress(np.hstack([_linear_drift(x.size), curve]))
+    # Within one temperature cycle, a drift and hysteresis are nearly collinear, so the size comes from a fit without a
+    # drift.
+    fits = regress(curve)
+    if not tests or not fits:
+        return None
+    best = max(fits, key=lambda one: one.likelihood)
+    size = _loop_width(best.smooth, x[pooled.known], direction[pooled.known])
+    return Hysteresis(size, min(len(tests) * min(one.p_value for one in tests), 1.0))
+
+
+def _pooled(means: IntervalMeans) -> IntervalMeans:
+    """Return the means, averaged in groups if there are more than MAX_MEANS."""
+    group = -(-means.bias.size // MAX_MEANS)
+    if group == 1:
+        return means
+    count = means.bias.size // group
+    known = means.known[: count * group].reshape(count, group)
+    rows = (np.where(known, part[: count * group].reshape(count, group), 0.0) for part in (means.bias, means.error))
+    bias, error = (part.sum(axis=1) for part in rows)
+    there = np.maximum(known.sum(axis=1), 1)
+    enough = 2 * known.sum(axis=1) >= group
+    temperature_c = interpolate_gaps(means.temperature_c)[: count * group].reshape(count, group).mean(axis=1)
+    return IntervalMeans(
+        group * means.interval_s,
+        np.where(enough, bias / there, np.nan),
+        error / there**1.5,
+        temperature_c,
+    )
+
+
+def _scaled(means: IntervalMeans) -> tuple[Floats, Floats]:
+    """Return temperature scaled to -1 … 1, and the direction of its change."""
+    temperature_c = interpolate_gaps(means.temperature_c)
+    lowest, swing = float(temperature_c.min()), float(np.ptp(temperature_c))
+    return 2.0 * (temperature_c - lowest) / swing - 1.0, heating_direction(temperature_c)
+
+
+def _rose_and_fell(direction: Floats) -> bool:
+    """Return True if temperature was rising in at least three means and falling in at least three means."""
+    return min(int((direction > 0.0).sum()), int((direction < 0.0).sum())) >= 3
+
+
+def _polynomial(x: Floats, order: int) -> Floats:
+    """Return the powers 1, 2, …, ``order`` of x as columns [n, order]."""
+    return np.stack([x**power for power in range(1, order + 1)], axis=1)
+
+
+def _linear_drift(n: int) -> Floats:
+    """Return a linear drift with time [n, 1] from -1 to 1."""
+    return np.linspace(-1.0, 1.0, n)[:, None]
+
+
+def _hysteresis_regressors(x: Floats, direction: Floats) -> Mapping[str, Floats]:
+    """Return the regressors [n, k] of each description of hysteresis."""
+    return {
+        "direction": np.stack([direction * (1.0 - x**2) * x**power for power in range(LOOP_POWERS)], axis=1),
+        "lag": np.stack([first_order_lag(x, float(np.exp(-1.0 / constant))) - x for constant in LAG_INTERVALS], axis=1),
+        "play": np.stack([_play(x, 2.0 * width) - x for width in PLAY_WIDTHS], axis=1),
+    }
+
+
+def _play(x: Floats, half_width: float) -> Floats:
+    """Return the play operator of x: an output that follows x at a distance of at most half_width.
+
+    >>> _play(np.array([0.0, 1.0, 0.0, -1.0]), 0.25).tolist()
+    [0.0, 0.75, 0.25, -0.75]
+    """
+    out = np.empty(x.size)
+    level = float(x[0])
+    for at, value in enumerate(x.tolist()):
+        level = min(max(level, value - half_width), value + half_width)
+        out[at] = level
+    return out
+
+
+def _regression(y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray) -> _Regression | None:
+    """Return the F test of regressors that are added to the nuisance regressors, or None if there are too few means."""
+    if int(known.sum()) <= MIN_FREE + 1:
+        return None
+    whiteners, log_determinants = _whiteners(known.tobytes())
+    own = nuisance.shape[1]
+    columns = np.hstack([nuisance, tested])[known]
+    columns = columns - columns.mean(axis=0)
+    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    _, r = np.linalg.qr(columns / scale)
+    new = np.flatnonzero(np.abs(np.diag(r)) > MIN_NEW_SHARE)
+    q, _ = np.linalg.qr((columns / scale)[:, new])
+    at = int((new < own).sum())
+    count, terms = whiteners.shape[1], new.size
+    free = count - terms
+    if free < MIN_FREE or terms == at:
+        return None
+    values = y[known] - y[known].mean()
+    triangles = np.asarray(np.linalg.qr(whiteners @ np.column_stack([q, values]), mode="r"))
+    gained = (triangles[:, at:terms, terms] ** 2).sum(axis=1)
+    floor = np.finfo(float).eps ** 2 * float(values @ values)
+    left = np.maximum(triangles[:, terms, terms] ** 2, max(floor, 1e-300))
+    diagonal = np.abs(triangles[:, np.arange(terms), np.arange(terms)])
+    likelihood = -0.5 * (free * np.log(left) + log_determinants) - np.log(np.maximum(diagonal, 1e-300)).sum(axis=1)
+    unexplained = left / (left + gained)
+    # p-value of F = gained / (terms - at) / (left / free)
+    p_values = incomplete_beta(0.5 * free, 0.5 * (terms - at), unexplained)
+    best = int(likelihood.argmax())
+    plausible = likelihood >= likelihood[best] - MAX_LIKELIHOOD_LOSS
+    sizes = np.linalg.solve(triangles[best, :terms, :terms], triangles[best, :terms, terms])
+    white = whiteners[best].T @ (whiteners[best] @ (values - q @ sizes))
+    full = float((-0.5 * (count * np.log(left) + log_determinants)).max())
+    return _Regression(float(p_values[plausible].max()), full, values - white, _noise_models()[best])
+
+
+def _validated_share(
+    y: Floats, nuisance: Floats, tested: Floats, known: np.ndarray, noise: tuple[float, float]
+) -> float:
+    """Return the share of the variance of the means that a fit to the other means predicts."""
+    columns = np.hstack([nuisance, tested])[known]
+    columns = columns - columns.mean(axis=0)
+    columns /= np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+    values = y[known] - y[known].mean()
+    whitener, _ = _whitener(known, *noise)
+    precision = whitener.T @ whitener
+    left = np.empty(values.size)
+    for fold in range(FOLDS):
+        out = np.arange(values.size) % FOLDS == fold
+        beside = precision[np.ix_(~out, out)]
+        marginal = precision[np.ix_(~out, ~out)] - beside @ np.linalg.solve(precision[np.ix_(out, out)], beside.T)
+        others = columns[~out]
+        sizes = np.linalg.lstsq(others.T @ marginal @ others, others.T @ marginal @ values[~out], rcond=1e-12)[0]
+        rest = values - columns[:, nuisance.shape[1] :] @ sizes[nuisance.shape[1] :]
+        left[out] = rest[out] - rest[~out].mean()
+    return 1.0 - float(np.mean(left**2) / np.var(values))
+
+
+def _noise_models() -> list[tuple[float, float]]:
+    """Return ratio and correlation of each noise model; without a random walk there is no correlation."""
+    return [(ratio, one) for ratio in WALK_RATIOS for one in (INCREMENT_CORRELATIONS if ratio else (0.0,))]
+
+
+@lru_cache(maxsize=4)
+def _whiteners(known: bytes) -> tuple[Floats, Floats]:
+    """Return a whitening matrix [g, m - 1, m] of the m known means and its log determinant [g], by noise model."""
+    there = np.frombuffer(known, np.bool_)
+    made = [_whitener(there, *one) for one in _noise_models()]
+    return np.stack([each for each, _ in made]), np.array([each for _, each in made])
+
+
+def _whitener(known: np.ndarray, ratio: float, correlation: float) -> tuple[Floats, float]:
+    """Return the matrix [m - 1, m] that makes differences of the m known means white, and the log determinant.
+
+    The covariance of the differences of successive means is that of white noise, tridiagonal (-1, 2, -1), plus that of
+    the walk. A random walk averaged over intervals has increments of variance 2/3 and covariance 1/6.
+    """
+    n, at = known.size, np.flatnonzero(known)
+    if correlation:
+        row = (1.0 - correlation) / (1.0 + correlation) * correlation ** np.arange(n - 1)
+    else:
+        row = np.zeros(n - 1)
+        row[:2] = (2.0 / 3.0, 1.0 / 6.0)
+    walk = _toeplitz(np.asarray(row))[at[0] : at[-1], at[0] : at[-1]]
+    firsts = at[:-1] - at[0]
+    walk = np.add.reduceat(np.add.reduceat(walk, firsts, axis=0), firsts, axis=1)
+    white = np.zeros(at.size - 1)
+    white[:2] = (2.0, -1.0)
+    covariance = ratio * walk + _toeplitz(white)
+    lower = np.linalg.cholesky(covariance)
+    differences = np.diff(np.eye(at.size), axis=0)
+    return np.linalg.solve(lower, differences), 2.0 * float(np.log(np.diag(lower)).sum())
+
+
+def _toeplitz(row: Floats) -> Floats:
+    """Return the symmetric Toeplitz matrix [n, n] with the given first row [n]."""
+    at = np.arange(row.size)
+    return np.asarray(row[np.abs(at[:, None] - at)])
+
+
+def _loop_width(bias: Floats, x: Floats, direction: Floats) -> float:
+    """Return the largest difference between heating and cooling at one temperature."""
+    grid = np.linspace(-0.95, 0.95, 39)
+    legs: dict[float, list[Floats]] = {1.0: [], -1.0: []}
+    for leg in np.split(np.arange(x.size), np.flatnonzero(np.diff(direction)) + 1):
+        order = leg[np.argsort(x[leg], kind="stable")]
+        if order.size > 1:
+            inside = (grid >= x[order[0]]) & (grid <= x[order[-1]])
+            legs[float(direction[leg[0]])].append(np.where(inside, np.interp(grid, x[order], bias[order]), np.nan))
+    rising, falling = (_mean_of_legs(each, grid.size) for each in (legs[1.0], legs[-1.0]))
+    difference = np.abs(rising - falling)
+    return float(np.nanmax(difference)) if np.isfinite(difference).any() else 0.0
+
+
+def _mean_of_legs(legs: list[Floats], n: int) -> Floats:
+    """Return the mean [n] over all temperature sweeps at each temperature; NaN where no sweep passed."""
+    rows = np.array(legs).reshape(len(legs), n)
+    there = np.isfinite(rows)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(there, rows, 0.0).sum(axis=0) / there.sum(axis=0))

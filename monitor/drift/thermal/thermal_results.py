@@ -1,0 +1,126 @@
+"""Thermal models fitted in one recording, and their predictions for another recording."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.drift.thermal.interval_means import IntervalMeans
+from monitor.drift.thermal.thermal_fit import ThermalFit
+from monitor.drift.thermal.thermal_model import Prediction, ThermalModel, predict
+
+DEFAULT_INTERVALS: Final = 72
+"""Number of intervals in a recording, if no interval is given. The paper uses 72 h in intervals of 1 h."""
+ROUND_INTERVALS_S: Final = (
+    0.1,
+    0.2,
+    0.5,
+    1,
+    2,
+    5,
+    10,
+    15,
+    20,
+    30,
+    60,
+    120,
+    300,
+    600,
+    900,
+    1200,
+    1800,
+    3600,
+    7200,
+    14400,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class ThermalFitReport:
+    """Thermal models fitted in one recording."""
+
+    recording: str
+    interval_s: float
+    means: Mapping[str, IntervalMeans]
+    fits: Mapping[str, ThermalFit]
+    refused: Mapping[str, str]  # axis -> reason why no model was fitted
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ComparisonWithMeans:
+    """Comparison of a thermal model with the interval means of a recording."""
+
+    multi_step: Prediction
+    one_step: Prediction
+    offset: float  # mean of measured minus multi-step; a bias changes from one start to the next
+    rms: float  # rms of measured minus multi-step, rad/s or m/s²
+    rms_without_offset: float  # rms of measured minus multi-step minus offset
+    rms_one_step: float  # rms of measured minus one-step
+    rms_about_mean: float  # rms of measured about its mean
+    coverage: float  # share of means inside the multi-step prediction interval
+
+
+@dataclass(frozen=True, slots=True)
+class ThermalPredictionReport:
+    """Predictions of models for a recording."""
+
+    recording: str
+    interval_s: float
+    means: Mapping[str, IntervalMeans]
+    judged: Mapping[str, ComparisonWithMeans]
+    refused: Mapping[str, str]
+    notes: tuple[str, ...] = ()
+
+
+def compare_with_means(model: ThermalModel, means: IntervalMeans) -> ComparisonWithMeans:
+    """Compare a model with interval means that were not used for the fit.
+
+    Parameters
+    ----------
+    model : ThermalModel
+        Fitted model.
+    means : IntervalMeans
+        Interval means of bias (rad/s or m/s²) and temperature (°C).
+    """
+    multi, known = predict(model, means.temperature_c), means.known
+    residual = means.bias - multi.bias
+    offset = float(residual[known].mean())
+    one = predict(model, means.temperature_c, means.bias - offset)
+    inside = (means.bias >= multi.lo) & (means.bias <= multi.hi)
+    return ComparisonWithMeans(
+        multi,
+        Prediction(one.bias + offset, one.lo + offset, one.hi + offset),
+        offset,
+        _rms(residual[known]),
+        _rms(residual[known] - offset),
+        _rms((means.bias - offset - one.bias)[known]),
+        _rms(means.bias[known] - means.bias[known].mean()),
+        float(inside[known].mean()),
+    )
+
+
+def choose_interval_s(seconds: float, rate_hz: float) -> float:
+    """Return a round interval length in seconds, such that a recording has about DEFAULT_INTERVALS intervals.
+
+    Parameters
+    ----------
+    seconds : float
+        Length of the recording in seconds.
+    rate_hz : float
+        Sample rate in Hz.
+
+    Examples
+    --------
+    >>> choose_interval_s(72 * 3600.0, 100.0), choose_interval_s(8784.0, 4.16), choose_interval_s(60.0, 100.0)
+    (3600, 120, 0.5)
+    """
+    most = max(seconds / DEFAULT_INTERVALS, 1.0 / rate_hz) * 1.01
+    return max((one for one in ROUND_INTERVALS_S if 1.0 / rate_hz <= one <= most), default=1.0 / rate_hz)
+
+
+def _rms(x: Floats) -> float:
+    """Return the rms of x."""
+    return float(np.sqrt(np.mean(x**2)))

@@ -1,0 +1,222 @@
+"""Mean and covariance of squared phase differences, for the bias and the degrees of freedom of a variance.
+
+A variance of the Allan family is a mean of squared differences d_k². Each difference d_k = Σ_p w_p x(k_p) is a sum of a
+few phase points x(k_p) with the weights w_p. A constant rate has no effect on the differences, because Σ w_p = Σ w_p
+k_p = 0.
+
+The covariance of two differences is Cov(d_j, d_k) = Σ_pq w_p w_q G(j_p − k_q). Here G is the generalised autocovariance
+of phase, see ``phase_autocovariance``. This formula also holds for points reflected at the ends of a record. For
+Gaussian noise, the theorem of Isserlis gives Cov(d_j², d_k²) = 2 Cov(d_j, d_k)².
+
+For one cluster size and unit coefficients, ``Moments`` contains the expectation of the variance estimate and the Allan
+variance. ``Moments`` also contains the quadratic form that gives the variance of the estimate. A ramp adds a known
+offset to each second difference. The square of the offset increases the mean, and the product of offset and noise
+increases the variance of the estimate. A ramp without noise adds no variance.
+
+All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²).
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.data_types import Floats, Ints
+from monitor.estimation.allan.uncertainty import deviation_intervals
+from monitor.estimation.fit.coefficient_fit import TO_SI
+
+NUM_COEFFICIENTS: Final = 5
+"""Number of coefficients Q N B K R, in the order of θ."""
+
+_BLOCK_GROWTH: Final = 1.5
+"""Ratio of the lengths of successive blocks, which grow with the distance from a kink."""
+
+
+@dataclass(frozen=True, slots=True)
+class Moments:
+    """Moments of one variance estimate at one cluster size for a record of ``n`` samples without gaps."""
+
+    n: int  # samples in the record
+    factor: int  # cluster size in samples
+    terms: int  # number of differences averaged
+    mean: Floats  # [5] expectation of the variance for each unit coefficient
+    allan: Floats  # [5] Allan variance for each unit coefficient, which the corrected variance estimates
+    covariance: Floats  # [5, 5] C of the quadratic form Var = Σ_ab θ_a θ_b C_ab
+
+
+class PhaseRing(NamedTuple):
+    """Phase of a record of n samples, as a ring of n + 1 or more points."""
+
+    phase: Floats | Ints  # [places, at least k] phase, or wrapping integer phase
+    missing: NDArray[np.int32]  # [places, at least k] running count of missing samples
+    first: int  # row of the oldest point
+    n: int  # number of samples
+
+
+def _integrate_to_phase(values: Floats) -> PhaseRing:
+    """Return the phase of the mean-free rates [n, k], in C order."""
+    phase = np.zeros((len(values) + 1, values.shape[1]))
+    missing = np.zeros(phase.shape, np.int32)
+    rate = phase[1:]
+    rate[:] = values
+    absent = ~np.isfinite(rate)
+    rate[absent] = 0.0
+    # the phase of the mean-free rate stays small, which keeps its precision
+    rate -= rate.sum(axis=0) / np.maximum((~absent).sum(axis=0), 1)
+    rate[absent] = 0.0
+    np.cumsum(rate, axis=0, out=rate)
+    np.cumsum(absent, axis=0, out=missing[1:])
+    return PhaseRing(phase, missing, 0, len(values))
+
+
+def mean_squares(
+    values: Floats, factors: Ints, squared_weights: float, add_squares: Callable[[PhaseRing, int, Floats, Ints], None]
+) -> tuple[Floats, Ints]:
+    """Return the variances [m, k] of rates [n, k] and the number of terms [m, k].
+
+    Parameters
+    ----------
+    values : ndarray of float64, shape (n, k)
+        Rates of k axes; values that are not finite are missing.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    squared_weights : float
+        Factor of the variance definition, see ``variance_of_sums``.
+    add_squares : callable
+        Function that adds the squared differences at one cluster size to the sums [k] and the numbers of terms [k].
+    """
+    ring = _integrate_to_phase(values)
+    sums = np.zeros((factors.size, values.shape[1]))
+    terms = np.zeros(sums.shape, np.int64)
+    for i, m in enumerate(factors):
+        add_squares(ring, int(m), sums[i], terms[i])
+    return variance_of_sums(sums, terms, factors, squared_weights), terms
+
+
+def variance_of_sums(sums: Floats, terms: Ints, factors: Ints, squared_weights: float) -> Floats:
+    """Convert sums of squared differences of phase to variances.
+
+    Parameters
+    ----------
+    sums : ndarray of float64, shape (m, k)
+        Sums of squared differences.
+    terms : ndarray of int64, shape (m, k)
+        Number of terms in each sum.
+    factors : ndarray of int64, shape (m,)
+        Cluster sizes in samples.
+    squared_weights : float
+        Factor of the variance definition: 2 for second differences, 6 for third differences.
+    """
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.where(terms > 0, sums / (squared_weights * factors[:, None] ** 2 * terms), np.nan))
+
+
+def theta_per_sample(theta: Floats, rate_hz: float) -> Floats:
+    """Convert θ of a fit from SI to units of one sample. A negative Q², which represents a band limit, becomes 0.
+
+    Parameters
+    ----------
+    theta : ndarray of float64, shape (5, k)
+        Q² N² B² K² R² in SI.
+    rate_hz : float
+        Sample rate in Hz.
+    """
+    return np.asarray(np.maximum(theta, 0.0) * (rate_hz ** (-2.0 * TO_SI))[:, None])
+
+
+def correct_bias(
+    moments: Sequence[Moments], theta: Floats, variance: Floats, terms: Ints
+) -> tuple[Floats, Floats, Floats, Floats]:
+    """Correct measured variances for bias, and compute their degrees of freedom and intervals.
+
+    A variance with expectation E and variance Var has edf = 2 E²/Var degrees of freedom. Missing terms reduce the
+    degrees of freedom in proportion.
+
+    Parameters
+    ----------
+    moments : sequence of Moments
+        Moments of the m cluster sizes.
+    theta : ndarray of float64, shape (5, k)
+        Q² N² B² K² R² in units of one sample; NaN means unknown.
+    variance : ndarray of float64, shape (m, k)
+        Measured variances.
+    terms : ndarray of int64, shape (m, k)
+        Number of differences averaged.
+
+    Returns
+    -------
+    corrected : ndarray of float64, shape (m, k)
+        Estimate of the Allan variance.
+    edf : ndarray of float64, shape (m, k)
+        Degrees of freedom; NaN if θ is unknown or there is no noise.
+    lo, hi : ndarray of float64, shape (m, k)
+        Ends of the 95 % interval of the deviation.
+    """
+    mean = np.stack([one.mean for one in moments]) @ theta
+    allan = np.stack([one.allan for one in moments]) @ theta
+    square = np.einsum("ak,mab,bk->mk", theta, np.stack([one.covariance for one in moments]), theta)
+    whole = np.array([one.terms for one in moments])[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        edf = np.where(variance > 0.0, 2.0 * mean * mean / square * (terms / whole), np.nan)
+        corrected = variance * (allan / mean)
+    edf[~np.isfinite(edf)] = np.nan
+    lo, hi = deviation_intervals(corrected, edf)
+    return corrected, edf, lo, hi
+
+
+def phase_autocovariance(t: Floats) -> Floats:
+    """Return the generalised autocovariance of phase [4, …] for Q, N, B and K of size one, at lags t in samples.
+
+    The autocovariances of discrete sums of white noise are δ(t), −|t|/2, t² ln|t| / 2π and (|t|³ − |t|)/12.
+    """
+    t = np.abs(t)
+    flicker = t * t * np.log(np.where(t == 0.0, 1.0, t)) / (2.0 * np.pi)
+    return np.stack([np.where(t == 0.0, 1.0, 0.0), -0.5 * t, flicker, (t * t - 1.0) * t / 12.0])
+
+
+def quadrature_nodes(begin: int, end: int, kinks: Iterable[int]) -> tuple[Floats, Floats]:
+    """Return nodes and weights that sum a function over begin ≤ k < end. The function is smooth except at the kinks.
+
+    The range is divided into blocks, whose length grows with the distance to the nearest kink. The sum over the L
+    points of a block is replaced by a three-point Gauss rule, which is exact for polynomials of degree 5. The second
+    and fourth central moments of L equally spaced points are (L² − 1)/12 and (L² − 1)(3L² − 7)/240.
+
+    Parameters
+    ----------
+    begin, end : int
+        Range of the sum.
+    kinks : iterable of int
+        Points at which the function is not smooth.
+
+    Returns
+    -------
+    places, weights : ndarray of float64
+        Nodes and weights of the sum.
+
+    >>> places, weights = quadrature_nodes(0, 1000, [0, 400])
+    >>> places.size < 200, round(float(weights @ places**5) / sum(k**5 for k in range(1000)), 12)
+    (True, 1.0)
+    """
+    steps = [0, 1]
+    while 2 * steps[-1] < end - begin:
+        steps.append(max(steps[-1] + 1, int(_BLOCK_GROWTH * steps[-1])))
+    growing = np.array(steps)
+    corners = np.unique([begin, *(k for k in kinks if begin < k < end), end])
+    edges = np.unique(
+        np.concatenate(
+            [
+                np.concatenate([a + growing[2 * growing <= b - a], b - growing[2 * growing <= b - a]])
+                for a, b in pairwise(corners.tolist())
+            ]
+        )
+    )
+    length, centre = np.diff(edges).astype(np.float64), 0.5 * (edges[1:] + edges[:-1] - 1.0)
+    square = np.where(length > 1.0, (3.0 * length**2 - 7.0) / 20.0, 1.0)
+    outer = (length**2 - 1.0) / 24.0 / square
+    reach = np.sqrt(square)
+    places = np.concatenate([centre, centre - reach, centre + reach])
+    weights = np.concatenate([length * (1.0 - 2.0 * outer), length * outer, length * outer])
+    return places[weights != 0.0], weights[weights != 0.0]

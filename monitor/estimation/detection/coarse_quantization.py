@@ -1,0 +1,76 @@
+"""Detection of quantization steps that are as large as the noise and therefore distort the measured noise.
+
+For each axis, the quantization step and the noise from sample to sample are estimated from at most ``MAX_STRETCHES``
+stretches of ``ROWS`` samples, spread over the recording. The step is the smallest distance between two different
+values. The noise is computed from the mean absolute difference of successive samples. This mean does not depend on the
+step size, and a few outliers or a slow drift hardly affect it.
+
+``reconcile`` also detects steps that are far smaller than the noise (``value_statistics.detect_quantization``). It
+searches for the common divisor of all differences and compares the divisor with the resolution of the number format.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import AXES, Floats
+
+MIN_STEP_TO_NOISE: Final = 0.5
+"""Minimum step relative to the noise. Smaller steps add at most two percent to the variance of the noise."""
+ROWS: Final = 4096
+"""Maximum number of samples in a stretch."""
+MAX_STRETCHES: Final = 16
+GRID_TOLERANCE: Final = 0.1
+"""Deviation from a whole number of steps, as a share of the step, within which a value is on the grid.
+
+Values rounded to float32 are on the grid.
+"""
+SIGMA_PER_MEAN_DISTANCE: Final = 0.8862269254527580
+"""√π/2, the ratio of σ to the mean distance between two samples of Gaussian noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class QuantizationStep:
+    """Quantization step and noise of one axis."""
+
+    axis: int  # index into AXES
+    step: float  # rad/s or m/s²
+    noise: float  # σ from sample to sample, including quantization, rad/s or m/s²
+
+
+def find_coarse_axes(values: Floats) -> list[QuantizationStep]:
+    """Return the axes of samples [n, 6] whose quantization step is at least ``MIN_STEP_TO_NOISE`` times the noise.
+
+    >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
+    >>> noise[:, 4] = noise[:, 4].round()
+    >>> [(one.axis, one.step, round(one.noise, 1)) for one in find_coarse_axes(noise)]
+    [(4, 1.0, 1.0)]
+    """
+    rows = min(ROWS, len(values))
+    count = min(MAX_STRETCHES, -(-len(values) // ROWS))
+    begins = np.linspace(0, len(values) - rows, count).astype(np.int64)
+    found = []
+    for axis in range(len(AXES)) if rows > 1 else ():
+        parts = [values[begin : begin + rows, axis] for begin in begins]
+        away = np.abs(np.concatenate([np.diff(part) for part in parts]))
+        away = away[np.isfinite(away)]
+        noise = SIGMA_PER_MEAN_DISTANCE * float(away.mean()) if away.size else 0.0
+        levels = np.unique(np.concatenate(parts))
+        step = _step(levels[np.isfinite(levels)], MIN_STEP_TO_NOISE * noise)
+        if step is not None and noise > 0.0:
+            found.append(QuantizationStep(axis, step, noise))
+    return found
+
+
+def _step(levels: Floats, least: float) -> float | None:
+    """Return the step of the regular grid that contains all values, or None if the step would be below ``least``."""
+    apart = np.diff(levels)
+    if not apart.size or not apart.min() >= least:
+        return None
+    near = apart[apart < 1.5 * apart.min()]
+    counts = np.cumsum(np.rint(apart / near.mean()))
+    if not np.isfinite(counts).all():
+        return None
+    step = float((levels[-1] - levels[0]) / counts[-1])
+    return step if (np.abs((levels[1:] - levels[0]) / step - counts) < GRID_TOLERANCE).all() else None

@@ -1,0 +1,287 @@
+"""Comparison of the Allan variance of the live window with the Allan variance of the noise model.
+
+For each axis, the comparison gives the difference at each τ in standard deviations and the largest difference, called
+the gap. It also gives the limits that the gap of a true model exceeds only by chance.
+``model_agreement.ModelAgreement`` converts successive comparisons into events.
+
+If the model is true, ν σ²(τ)/σ²_model(τ) is approximately χ² with ν degrees of freedom. The cube root of χ² is
+approximately normal (Wilson & Hilferty, PNAS 17, 1931), which gives
+
+    z(τ) = ((σ²/σ²_model)^(1/3) − 1 + 2/(9ν)) / √(2/(9ν)).
+
+The degrees of freedom ν = 2 σ⁴_model/Var are computed from the model and not from the fit. Var is the variance of the
+measured Allan variance. For the terms Q N B K, Var is computed exactly in ``uncertainty``. Other effects such as a
+resonance, a low-pass or correlated noise have a power spectral density S. For a mean of M terms, Var is then 4/M ∫ (S
+G)² df with the spectral kernel G of the Allan variance. The integral is accurate if the window is long compared with
+the correlation time of the noise. Averaging times with fewer than ``MIN_EDF`` degrees of freedom are not compared,
+because the distribution then differs too much from χ².
+
+The limits account for the number of τ and axes by the inequality of Šidák (J. Am. Stat. Assoc. 62, 1967), P(all |z_i| <
+c) ≥ ∏ P(|z_i| < c). The inequality holds for normal z_i with any correlation. Of 100 independent windows of a true
+model, at most one exceeds ``threshold`` on any axis. Overlapping τ are correlated, so the true share is lower. Of 2500
+simulated windows of six axes and 14 octaves, 0.5 % exceeded ``threshold`` with Q N B K, and 0.9 % with random walk
+alone. The share is higher for telegraph noise and jumps, which are not Gaussian.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import AXES, Floats, Ints
+from monitor.common.distributions import normal_quantile
+from monitor.estimation.allan.curve import AllanCurve
+from monitor.estimation.allan.uncertainty import NOISES, PAIRS, AxisCovarianceTables, CovarianceTable, K
+from monitor.estimation.estimate import Estimate
+from monitor.noise.model import NoiseModel
+from monitor.noise.spectrum import MIN_FREQUENCY_CYCLES, Spectrum, frequency_grid
+from monitor.noise.standard_terms import STANDARD_TERMS
+
+MIN_EDF: Final = 2.0
+"""Minimum degrees of freedom of a compared τ."""
+MIN_SAMPLES: Final = 1000
+"""Minimum number of samples of an axis. With 1000 samples, the error of N is 3 %."""
+FALSE_ALARM: Final = 0.01
+"""Share of independent windows of a true model that exceed the threshold on any axis."""
+FALSE_ALARM_WATCHED: Final = 0.001
+"""Share of independent windows of a true model that exceed ``AxisGap.alarm`` on any axis."""
+
+
+@dataclass(frozen=True, slots=True)
+class AxisGap:
+    """Comparison of one axis of the window with its model."""
+
+    axis: str
+    measured: Floats  # [m] Allan deviation, unit of the axis; NaN if the window is too short
+    model: Floats  # [m] Allan deviation of the model; NaN if unknown
+    z: Floats  # [m] standard deviations above the model; NaN if not compared
+    gap: float  # largest |z|
+    tau_s: tuple[float, float]  # range of τ around the largest |z| that exceeds the threshold on the same side
+    row: int  # row of the largest |z|
+    null95: float  # limit that 95 of 100 windows of a true model do not exceed on this axis
+    threshold: float  # limit that 99 of 100 windows of a true model do not exceed on any axis
+    alarm: float  # limit that 999 of 1000 windows do not exceed on any axis, for repeated comparisons
+    samples: int  # samples of this axis in the window
+
+    @property
+    def ratio(self) -> float:
+        """Ratio of the measured deviation to the deviation of the model at the largest gap."""
+        return float(self.measured[self.row] / self.model[self.row])
+
+
+@dataclass(frozen=True, slots=True)
+class ModelGap:
+    """Comparison of all axes at one moment."""
+
+    t_ns: int  # time of the newest sample
+    rate_hz: float
+    window_s: float
+    samples: int  # received since the start
+    n: int  # samples in the window
+    tau_s: Floats  # [m]
+    axes: Mapping[str, AxisGap]  # axes that can be compared, in the order of AXES
+    agrees: Mapping[str, bool] = field(default_factory=dict)  # current decisions, see ``model_agreement``
+
+
+class PreparedModel:
+    """Noise model prepared for comparison with the Allan curves of a window.
+
+    Parameters
+    ----------
+    model : NoiseModel
+        Noise model of the sensor.
+    length : int
+        Number of samples in the full window.
+    """
+
+    def __init__(self, model: NoiseModel, length: int) -> None:
+        self._model = model
+        self._length = length
+        self._expected: dict[str, _Expected] = {}
+        self._tables = AxisCovarianceTables(np.empty(0, np.int64), length)
+        self._of: tuple[float, tuple[int, ...]] = (0.0, ())  # rate and cluster sizes of the prepared values
+
+    def compare(self, estimate: Estimate) -> ModelGap:
+        """Compare all axes that are part of the model and have at least ``MIN_SAMPLES`` samples in the window."""
+        curve = estimate.curve
+        tables = self._prepare(curve.factors, estimate.rate_hz)
+        found: dict[str, AxisGap] = {}
+        for axis, expected in self._expected.items():
+            i = AXES.index(axis)
+            terms = curve.terms[:, i]
+            n = samples_of_axis(curve, i)
+            if n < MIN_SAMPLES:
+                continue
+            edf = expected.edf(tables.at(i, n, curve.n), terms)
+            one = _axis_gap(axis, curve.tau_s, curve.avar[:, i], expected.avar, edf, n, len(self._expected))
+            if one is not None:
+                found[axis] = one
+        return ModelGap(
+            estimate.t_ns, estimate.rate_hz, estimate.window_s, estimate.samples, curve.n, curve.tau_s, found
+        )
+
+    def _prepare(self, factors: Ints, rate_hz: float) -> AxisCovarianceTables:
+        """Return the covariance tables.
+
+        If the rate or the cluster sizes have changed, the expected curves are recomputed.
+        """
+        of = (rate_hz, tuple(factors.tolist()))
+        if self._of[1] != of[1]:
+            self._tables = AxisCovarianceTables(factors, self._length)
+        if self._of != of:
+            named = (axis for axis in AXES if self._model.effects.get(axis))
+            known = {axis: _Expected.of(self._model, axis, factors, rate_hz) for axis in named}
+            self._expected = {axis: one for axis, one in known.items() if (one.avar > 0.0).any()}
+            self._of = of
+        return self._tables
+
+
+def samples_of_axis(curve: AllanCurve, axis: int) -> int:
+    """Return the number of samples of an axis in the window, which is less than ``curve.n`` for a restarted axis.
+
+    Parameters
+    ----------
+    curve : AllanCurve
+        Curve of the window.
+    axis : int
+        Index into ``AXES``.
+    """
+    terms = curve.terms[:, axis]
+    return int((terms + 2 * curve.factors - 1)[terms > 0].max(initial=0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Expected:
+    """Expected values of the model for one axis at m averaging times."""
+
+    avar: Floats  # [m] Allan variance, squared unit of the axis
+    shape: Floats  # [4] Q² N² B² K² at τ0 = 1
+    more: Floats  # [m] variance of one term beyond the variance from Q N B K, unit⁴
+
+    @classmethod
+    def of(cls, model: NoiseModel, axis: str, factors: Ints, rate_hz: float) -> "_Expected":
+        """Compute the expected values of one axis of a model at the given cluster sizes."""
+        spectrum = model.spectrum(axis, 1.0 / rate_hz)
+        tau_s = factors / rate_hz
+        shape, classic = _standard_terms(model, axis, rate_hz)
+        more = _excess_variance(spectrum, classic, factors, rate_hz)
+        # A ramp has no variance, but the product of ramp and noise has. The effect is at most the effect of a random
+        # walk of the same size.
+        shape[K] += 1.5 * spectrum.slope**2 * float(tau_s.max()) / rate_hz
+        return cls(spectrum.avar(tau_s), shape, more)
+
+    def edf(self, table: CovarianceTable, terms: Ints) -> Floats:
+        """Return the degrees of freedom [m] for these numbers of terms; NaN without terms."""
+        pairs = np.array([self.shape[a] * self.shape[b] * (1.0 if a == b else 2.0) for a, b in PAIRS])
+        exact = np.einsum("iik,k->i", table.covariance, pairs)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            variance = exact * table.terms / terms + self.more / terms
+            return np.where((terms > 0) & (variance > 0.0), 2.0 * self.avar**2 / variance, np.nan)
+
+
+def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Floats, NoiseModel]:
+    """Return Q², N², B² and K² of an axis at τ0 = 1, and a model with only these terms."""
+    letters = ("Q", "N", "B", "K")
+    kinds = tuple(STANDARD_TERMS[letter] for letter in letters)
+    powers = (2.0, 1.0, 0.0, -1.0)
+    effects = tuple(effect for effect in model.effects[axis] if isinstance(effect, kinds))
+    shape = np.zeros(NOISES)
+    for effect in effects:
+        row = kinds.index(type(effect))
+        shape[row] += getattr(effect, letters[row]) ** 2 * rate_hz ** powers[row]
+    return shape, NoiseModel({axis: effects})
+
+
+def _excess_variance(spectrum: Spectrum, classic: NoiseModel, factors: Ints, rate_hz: float) -> Floats:
+    """Return the variance of the Allan variance that the standard terms do not explain, times the number of terms.
+
+    A second difference of noise with the spectral density S has the spectral density S G, where G = 2 sin⁴(πνm)/(m sin
+    πν)². By Parseval's theorem, the result is 4 ∫ (S² − S_standard²) G² dν. A spectral line of mean square P adds 4 P S
+    G² at the frequency of the line. All quantities are at τ0 = 1.
+    """
+    (axis,) = classic.effects
+    f_hz = frequency_grid(MIN_FREQUENCY_CYCLES * rate_hz / float(factors.max()), 1.0 / rate_hz, spectrum.peaks)
+    own, known = (s.density(f_hz) * rate_hz for s in (spectrum, classic.spectrum(axis, 1.0 / rate_hz)))
+    difference = own**2 - known**2
+    if not difference.any() and not spectrum.lines:
+        return np.zeros(factors.size)
+    nu = f_hz / rate_hz
+    more = [4.0 * np.trapezoid(difference * _kernel(nu, m) ** 2, nu) for m in factors.tolist()]
+    for line_hz, mean_square in spectrum.lines:
+        at = np.array([line_hz])
+        here = float(spectrum.density(at)[0]) * rate_hz
+        more = [
+            one + 4.0 * mean_square * here * float(_kernel(at / rate_hz, m)[0]) ** 2
+            for one, m in zip(more, factors.tolist(), strict=True)
+        ]
+    return np.array(more)
+
+
+def _kernel(nu: Floats, m: int) -> Floats:
+    """Return the spectral kernel G of the Allan variance at cluster size m."""
+    return np.asarray(2.0 * np.sin(np.pi * nu * m) ** 4 / (m * np.sin(np.pi * nu)) ** 2)
+
+
+def _axis_gap(
+    axis: str, tau_s: Floats, avar: Floats, expected: Floats, edf: Floats, samples: int, axes: int
+) -> AxisGap | None:
+    """Compare one axis of a model that has ``axes`` axes. Return None if no τ can be compared."""
+    expected = np.where(expected > 0.0, expected, np.nan)
+    z = normal_score(avar / expected, edf)
+    judged = np.isfinite(z)
+    if not judged.any():
+        return None
+    count = int(judged.sum())
+    threshold, alarm = (max_z_limit(share, axes * count) for share in (FALSE_ALARM, FALSE_ALARM_WATCHED))
+    size = np.where(judged, np.abs(z), -1.0)
+    at = int(size.argmax())
+    alike = (size > threshold) & (np.sign(z) == np.sign(z[at]))
+    first = last = at
+    while first > 0 and alike[first - 1]:
+        first -= 1
+    while last + 1 < alike.size and alike[last + 1]:
+        last += 1
+    where = float(tau_s[first]), float(tau_s[last])
+    null95 = max_z_limit(0.05, count)
+    return AxisGap(
+        axis, np.sqrt(avar), np.sqrt(expected), z, float(size[at]), where, at, null95, threshold, alarm, samples
+    )
+
+
+def normal_score(ratio: Floats, edf: Floats) -> Floats:
+    """Return the deviation of χ²/ν from 1 in standard deviations, computed from the cube root of the ratio.
+
+    The result is NaN for fewer than ``MIN_EDF`` degrees of freedom. In the example, 129.561 is the 97.5 % quantile of
+    χ² with 100 degrees of freedom.
+
+    Parameters
+    ----------
+    ratio : ndarray of float64
+        Ratio χ²/ν.
+    edf : ndarray of float64
+        Degrees of freedom ν.
+
+    >>> round(float(normal_score(np.array([1.29561]), np.array([100.0]))[0]), 2)
+    1.96
+    """
+    spread = 2.0 / (9.0 * np.where(edf >= MIN_EDF, edf, np.nan))
+    return np.asarray((np.cbrt(ratio) - 1.0 + spread) / np.sqrt(spread))
+
+
+def max_z_limit(share: float, numbers: int) -> float:
+    """Return the limit that the largest of several |z| exceeds with a given probability.
+
+    The probability is exact for independent z, and an upper bound otherwise.
+
+    Parameters
+    ----------
+    share : float
+        Probability that the limit is exceeded.
+    numbers : int
+        Number of z.
+
+    >>> f"{max_z_limit(0.05, 1):.3f} {max_z_limit(0.01, 6 * 14):.3f}"
+    '1.960 3.847'
+    """
+    return -normal_quantile(float(-0.5 * np.expm1(np.log1p(-share) / numbers)))

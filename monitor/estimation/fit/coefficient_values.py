@@ -1,0 +1,37 @@
+"""Noise coefficients of IEEE Std 952 for six axes, each with a confidence interval and a status."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.data_types import Floats
+
+SYMBOLS: Final = ("Q", "N", "B", "K", "R")
+"""Symbols of the coefficients in the order of their rows.
+
+The symbols denote quantization noise, angle random walk, bias instability, rate random walk and rate ramp.
+"""
+
+
+class Status(IntEnum):
+    """Status of a coefficient, which is always published with the coefficient."""
+
+    UNESTIMATED = 0  # too little data, or withheld: value, lo and hi are NaN
+    UPPER_BOUND = 1  # only bounded by the data: value is NaN, lo is 0, hi is the one-sided 95 % bound
+    ESTIMATED = 2  # value with a two-sided 95 % interval
+
+
+@dataclass(frozen=True, slots=True)
+class Coefficients:
+    """Values and 95 % intervals of the coefficients in SI units (rad, m, s).
+
+    The rows are Q N B K R, the columns gx to az.
+    """
+
+    value: Floats  # [5, 6] NaN unless the status is ESTIMATED
+    lo: Floats  # [5, 6] lower end of the interval
+    hi: Floats  # [5, 6] upper end of the interval
+    status: NDArray[np.int8]  # [5, 6] values of ``Status``

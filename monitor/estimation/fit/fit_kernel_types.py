@@ -1,0 +1,152 @@
+"""Named tuples of arrays that the compiled functions of the fit pass to each other.
+
+All quantities are in units of one sample, so τ0 = 1 and θ = (Q²/τ0², N²/τ0, B², K² τ0, R² τ0²). Results that could not
+be computed are NaN.
+"""
+
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.data_types import Floats, Ints
+from monitor.estimation.allan.uncertainty import NOISES
+
+LIMIT_COUNT: Final = 2 * NOISES
+"""Number of quantities with limits in ``SolutionMaps``, which are θ and the unconstrained solution û of Q N B K."""
+
+
+class SharedInputs(NamedTuple):
+    """Inputs of a fit that are the same for all axes at one window length."""
+
+    columns: Floats  # [m, 5] Allan variance of unit coefficients
+    flat: Floats  # [m, 5] ``columns`` for a curve from which the measured slope has been subtracted
+    covariance: Floats  # [m, m, 10] ``CovarianceTable.covariance``
+    whole: Floats  # [m] number of terms in a window without gaps
+    slope_variance: Floats  # [4] variance of the slope of the rate, for unit θ
+    blind: Floats  # [m] direction of the curve that the fit ignores, larger than any noise; zero means none
+    ask: bool  # True to leave out short τ that contradict the fit
+
+
+class CurvesOfAxes(NamedTuple):
+    """Measured curves and slopes, with one row per axis."""
+
+    avar: Floats  # [axes, m] Allan variance
+    terms: Floats  # [axes, m] number of second differences averaged
+    slope: Floats  # [axes] slope of the rate; NaN means not measured
+    slopes: Floats  # [axes, m] slope that contributes to the Allan variance at each τ
+
+
+class FitOptions(NamedTuple):
+    """Options of a fit."""
+
+    enter: float  # threshold in σ to add a term
+    leave: float  # threshold in σ to drop a term
+    full: bool  # True to weight by the covariances of all τ, False to weight by their variances alone
+    warm: bool  # True to start with the weights of ``FitOutput.theta``
+
+
+class FitOutput(NamedTuple):
+    """Results of a fit, with one row per axis."""
+
+    entered: NDArray[np.bool_]  # [axes, 5] terms in the fit; on input, the terms of the previous fit
+    theta: Floats  # [axes, 5] squared coefficients; on input, the start of a warm fit
+    lo: Floats  # [axes, 5] lower end of the interval
+    hi: Floats  # [axes, 5] upper end of the interval
+    status: NDArray[np.int8]  # [axes, 5] values of ``Status``
+    edf: Floats  # [axes, m] degrees of freedom of the curve
+    fitted: Floats  # [axes, m] fitted model
+    left_out: Ints  # [axes] number of shortest τ left out
+    misfit: Floats  # [axes] ``scatter``, or 1 if chance explains the scatter
+    scatter: Floats  # [axes] variance about the fit, relative to noise of the five terms
+
+
+class TermResults(NamedTuple):
+    """Results of a fit for the five terms of one axis, which are rows of ``FitOutput``."""
+
+    entered: NDArray[np.bool_]  # [5] terms in the fit
+    theta: Floats  # [5] squared coefficients
+    lo: Floats  # [5] lower end of the interval
+    hi: Floats  # [5] upper end of the interval
+    status: NDArray[np.int8]  # [5] values of ``Status``
+
+
+class LeastSquares(NamedTuple):
+    """Weighted least-squares problem of one axis, with the memory for its weights and normal equations."""
+
+    level: Floats  # [m] observations y, which are the Allan variances without the contribution of the slope
+    stretch: Floats  # [m] square root of the ratio of the terms without gaps to the present terms
+    columns: Floats  # [m, 5] columns X
+    covariance: Floats  # [m, m, 10] ``CovarianceTable.covariance``
+    blind: Floats  # [m] direction that the fit ignores; ``blind`` blindᵀ is added to the covariance V
+    variance: Floats  # [m] variances of the observations under the model
+    weighted: Floats  # [m, 5] V⁻¹ X
+    normal: Floats  # [5, 5] Xᵀ V⁻¹ X
+    right: Floats  # [5] Xᵀ V⁻¹ y
+
+
+class TermTests(NamedTuple):
+    """Test statistics of the terms Q N B K of one axis."""
+
+    estimate: Floats  # [5] unconstrained solution û
+    absent_variance: Floats  # [4] variance of û for an absent term
+    enter_limit: Floats  # [4] value of û above which an absent term is added
+
+
+class SolutionMaps(NamedTuple):
+    """Solution of each axis as a linear map from the Allan variances to the coefficients, with limits of validity.
+
+    The right-hand side of the normal equations is r = Xᵀ V⁻¹ y. The constrained solution is θ = ``inverse`` r, and the
+    unconstrained solution is û = ``whole`` r.
+    """
+
+    rows: Floats  # [axes, m, NOISES] V⁻¹ X
+    ramp: Floats  # [axes, NOISES] part of r that is subtracted per slope²
+    twist: Floats  # [axes, NOISES] part of r per slope, because the slope differs between the τ
+    normal: Floats  # [axes, 5, 5] Xᵀ V⁻¹ X
+    inverse: Floats  # [axes, NOISES, NOISES]
+    whole: Floats  # [axes, NOISES, NOISES]
+    low: Floats  # [axes, LIMIT_COUNT + 1] lower limits of θ, of û and of the absolute slope
+    high: Floats  # [axes, LIMIT_COUNT + 1] upper limits
+    used: Ints  # [axes, 2] first τ in use and the one after the last; equal if there is no solution
+    free: NDArray[np.bool_]  # [axes] True if Q² may be negative
+    straight: NDArray[np.bool_]  # [axes] True if slope² τ²/2 is subtracted from the curve
+    either: NDArray[np.bool_]  # [axes] True if the slope is due to K or R, which cannot be distinguished
+
+
+def empty_fit_output(axes: int, m: int, entered: NDArray[np.bool_]) -> FitOutput:
+    """Allocate the results of a fit.
+
+    Parameters
+    ----------
+    axes : int
+        Number of axes.
+    m : int
+        Number of τ.
+    entered : ndarray of bool, shape (axes, 5)
+        Terms of the previous fit. The result contains this array.
+    """
+    theta, lo, hi = np.full((3, axes, 5), np.nan)
+    edf, fitted = np.full((2, axes, m), np.nan)
+    status, left_out = np.zeros((axes, 5), np.int8), np.zeros(axes, np.int64)
+    return FitOutput(entered, theta, lo, hi, status, edf, fitted, left_out, np.ones(axes), np.full(axes, np.inf))
+
+
+def empty_solution_maps(axes: int, m: int) -> SolutionMaps:
+    """Allocate linear maps, which are not valid before a fit.
+
+    Parameters
+    ----------
+    axes : int
+        Number of axes.
+    m : int
+        Number of τ.
+    """
+    ramp, twist = np.zeros((2, axes, NOISES))
+    inverse, whole = np.zeros((2, axes, NOISES, NOISES))
+    limits = np.full((axes, LIMIT_COUNT + 1), np.inf)
+    free, straight, either = np.zeros((3, axes), np.bool_)
+    return SolutionMaps(
+        np.zeros((axes, m, NOISES)), ramp, twist, np.zeros((axes, 5, 5)), inverse, whole, limits, -limits,
+        np.zeros((axes, 2), np.int64), free, straight, either,
+    )  # fmt: skip

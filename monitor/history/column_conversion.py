@@ -1,0 +1,113 @@
+"""Columns of a history row, and the conversion of an estimate into column values.
+
+Each noise coefficient of a measured axis has four columns. For example, ``gz.N`` is the estimated value of N on axis
+gz. ``gz.N.lo`` and ``gz.N.hi`` are the ends of the confidence interval. ``gz.N.bound`` is the upper bound, if the data
+only bound the value. The status of a coefficient follows from the columns that have a value.
+
+Allan deviations have columns such as ``gz.sigma.0.3``, for averaging times of 1 and 3 times powers of ten in seconds.
+The averaging times of an estimate depend on the measured rate, so the deviations are interpolated linearly in log-log
+between two neighbouring points. The error is below 1 % for a deviation with five noise terms, half an octave from a
+point. The module does no I/O.
+"""
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.data_types import AXES, Floats
+from monitor.estimation.estimate import Estimate
+from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
+
+TAU_S: Final = tuple(float(f"{one}e{power}") for power in range(-4, 6) for one in (1, 3))
+"""Averaging times of stored deviations [s], from 0.1 ms to 300 000 s. A window covers a part of this range."""
+HEALTH_COLUMNS: Final = ("rate", "latency", "memory")
+"""Sample rate [Hz], 99th percentile of the latency from receipt to publication [s], memory of the process [bytes]."""
+TEMPERATURE_COLUMNS: Final = ("temperature",)
+"""Mean temperature of a batch [°C]."""
+VALUE_SUFFIXES: Final = ("", ".lo", ".hi", ".bound")
+TAU_MATCH_RATIO: Final = 1.02
+"""A deviation within this factor of a stored averaging time is used without interpolation."""
+MAX_TAU_RATIO: Final = 2.5
+"""Largest ratio of neighbouring averaging times between which deviations are interpolated."""
+
+
+class ColumnConverter:
+    """Converter of estimates into column values, for fixed axes and averaging times.
+
+    Parameters
+    ----------
+    estimate
+        First estimate, which determines the axes and the averaging times.
+    """
+
+    def __init__(self, estimate: Estimate) -> None:
+        self._measured = _measured(estimate)
+        self._axes = np.flatnonzero(self._measured)
+        self._tau_s = estimate.curve.tau_s
+        at, below, above, share = _interpolation_points(self._tau_s)
+        self._below, self._above = np.array(below, np.intp), np.array(above, np.intp)
+        self._share = share[:, None]
+        columns, rows = len(AXES), len(SYMBOLS)
+        self._coefficient_indices = np.array(
+            [row * columns + axis for row in range(rows) for axis in self._axes], np.intp
+        )
+        axes = [AXES[i] for i in self._axes]
+        self.names = (
+            *(f"{axis}.{symbol}{part}" for part in VALUE_SUFFIXES for symbol in SYMBOLS for axis in axes),
+            *(f"{axis}.sigma.{TAU_S[i]:g}" for i in at for axis in axes),
+        )
+        self._coefficient_count = len(self._coefficient_indices)
+
+    def is_compatible(self, estimate: Estimate) -> bool:
+        """Return True if an estimate has the same measured axes and averaging times as the first estimate."""
+        tau_s = estimate.curve.tau_s
+        same = tau_s is self._tau_s or np.array_equal(tau_s, self._tau_s)
+        return same and bool((_measured(estimate) == self._measured).all())
+
+    def convert(self, estimate: Estimate) -> Floats:
+        """Return the column values of an estimate ([k], SI) in the order of ``names``; NaN marks a missing value."""
+        c, m = estimate.coefficients, self._coefficient_count
+        status, hi = c.status.take(self._coefficient_indices), c.hi.take(self._coefficient_indices)
+        estimated = status == Status.ESTIMATED.value
+        numbers = np.full(len(self.names), np.nan)
+        np.copyto(numbers[:m], c.value.take(self._coefficient_indices), where=estimated)
+        np.copyto(numbers[m : 2 * m], c.lo.take(self._coefficient_indices), where=estimated)
+        np.copyto(numbers[2 * m : 3 * m], hi, where=estimated)
+        np.copyto(numbers[3 * m : 4 * m], hi, where=status == Status.UPPER_BOUND.value)
+        numbers[4 * m :] = self._deviations(estimate).ravel()
+        return numbers
+
+    def _deviations(self, estimate: Estimate) -> Floats:
+        """Return the interpolated deviations, shape [τ, axes]."""
+        with np.errstate(divide="ignore"):  # an axis without noise has a deviation of 0
+            log = np.log(estimate.curve.avar[:, self._axes])
+        below, above = log[self._below], log[self._above]
+        with np.errstate(invalid="ignore"):  # interpolation next to a deviation of 0 yields NaN
+            return np.asarray(np.exp(0.5 * (below + self._share * np.where(self._share > 0.0, above - below, 0.0))))
+
+
+def _measured(estimate: Estimate) -> NDArray[np.bool_]:
+    """Return for each of the six axes whether the axis has a deviation at the shortest averaging time."""
+    shortest = estimate.curve.avar[0]
+    return np.asarray(~np.isnan(shortest))
+
+
+def _interpolation_points(tau_s: Floats) -> "tuple[list[int], list[int], list[int], Floats]":
+    """Return the usable indices of TAU_S, the points below and above, and the log-distance from below, 0 to 1."""
+    at, below, above, share = [], [], [], []
+    for i, wanted in enumerate(TAU_S):
+        near = int(np.argmin(np.abs(np.log(tau_s / wanted)))) if tau_s.size else 0
+        if tau_s.size and 1.0 / TAU_MATCH_RATIO < tau_s[near] / wanted < TAU_MATCH_RATIO:
+            low, high, part = near, near, 0.0
+        else:
+            high = int(np.searchsorted(tau_s, wanted))
+            low = high - 1
+            if low < 0 or high >= tau_s.size or tau_s[high] > MAX_TAU_RATIO * tau_s[low]:
+                continue
+            part = float(np.log(wanted / tau_s[low]) / np.log(tau_s[high] / tau_s[low]))
+        at.append(i)
+        below.append(low)
+        above.append(high)
+        share.append(part)
+    return at, below, above, np.array(share)

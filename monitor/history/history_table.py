@@ -1,0 +1,229 @@
+"""Reading of the stored results of a time range as a table with a limited number of buckets.
+
+``read_history`` merges the rows of each bucket while reading, so the memory depends on the number of requested points
+and not on the length of the time range. A bucket is at least as wide as the stored rows in the bucket. Merging (see
+``bucket``) preserves minima and maxima.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import Floats, Ints
+from drivers.errors import NotReady
+from drivers.number_ranges import DAY_S
+from monitor.common.units import format_utc
+from monitor.history.bucket import HistoryRow, Singles, merge_rows, select_columns
+from monitor.history.sqlite_store import HistoryReader
+from monitor.history.stored_events import StoredEvent
+from monitor.history.time_ranges import TimeRange
+
+DEFAULT_POINTS: Final = 1000
+"""Approximate number of buckets in a table. If rows differ in width, there may be up to twice as many."""
+MAX_EVENTS: Final = 1000
+BUCKET_WIDTHS_S: Final = (
+    *(60, 300, 900, 1800, 3600, 10_800, 21_600, 43_200),
+    *(days * DAY_S for days in (1, 2, 4, 7, 30, 90, 365)),
+)
+"""Permitted bucket widths [s]. A width is a multiple of every row width that is not larger."""
+
+
+@dataclass(frozen=True, slots=True)
+class HistoryTable:
+    """History of one device: k columns in p buckets, ordered by time."""
+
+    device: str
+    span: TimeRange  # requested time range, clipped to the stored time range
+    step_s: int  # width of the buckets, unless the stored rows are wider
+    start_s: Ints  # [p] Unix time
+    width_s: Ints  # [p]
+    names: tuple[str, ...]  # [k], see ``columns``
+    n: Ints  # [p, k] number of values
+    low: Singles  # [p, k] SI; NaN if the bucket has no value
+    high: Singles
+    last: Singles
+    counts: Ints  # [p, 4] increments of bucket.COUNTS within each bucket
+    state: Ints  # [p] index of the worst of bucket.STATES
+    events: tuple[StoredEvent, ...]  # the newest events
+    events_in_all: int  # number of events in the time range
+
+    def __len__(self) -> int:
+        return int(self.start_s.size)
+
+    @property
+    def end_s(self) -> Ints:
+        """Unix time at which each bucket ends [s], shape [p]."""
+        return self.start_s + self.width_s
+
+    def column(self, name: str) -> "ColumnStatistics":
+        """Return one column over time; all values are missing if the table has no column of this name."""
+        if name not in self.names:
+            nothing: Floats = np.full(len(self), np.nan)
+            return ColumnStatistics(np.zeros(len(self), np.int64), nothing, nothing, nothing)
+        at = self.names.index(name)
+        parts = [np.asarray(part[:, at], np.float64) for part in (self.low, self.high, self.last)]
+        return ColumnStatistics(self.n[:, at], *parts)
+
+    def axes(self) -> tuple[str, ...]:
+        """Return the axes that have at least one column."""
+        found = dict.fromkeys(name.split(".")[0] for name in self.names if "." in name)
+        return tuple(found)
+
+    def taus(self) -> tuple[str, ...]:
+        """Return the averaging times of the deviations [s] as written in the column names, in ascending order."""
+        found = {name.split(".sigma.")[1] for name in self.names if ".sigma." in name}
+        return tuple(sorted(found, key=float))
+
+
+@dataclass(frozen=True, slots=True)
+class ColumnStatistics:
+    """Statistics of one column over p buckets."""
+
+    n: Ints  # [p] number of values
+    low: Floats  # [p] NaN if the bucket has no value
+    high: Floats
+    last: Floats
+
+
+def read_history(
+    reader: HistoryReader,
+    device: str,
+    span: TimeRange | None,
+    wanted: Callable[[str], bool] = lambda _name: True,
+    step_s: int | None = None,
+    points: int = DEFAULT_POINTS,
+) -> HistoryTable:
+    """Read the history of a device as a table.
+
+    Parameters
+    ----------
+    reader
+        Reader of the history file.
+    device
+        Name of the device.
+    span
+        Time range; None for the last stored day.
+    wanted
+        Returns True for the name of a column that is wanted.
+    step_s
+        Minimum bucket width [s]; None for the width that follows from ``points``.
+    points
+        Approximate number of buckets.
+
+    Raises
+    ------
+    NotReady
+        If the time range contains no rows and no events.
+    RecordingError
+        If a row cannot be read.
+    """
+    held = reader.stored_range(device)
+    if held is None:
+        raise NotReady(f"{device}: no history yet")
+    span = _clip_to_stored(span or TimeRange(held[1] - DAY_S, held[1]), held)
+    step_s = bucket_width_s(
+        replace(span, start_s=max(span.start_s, held[0]), end_s=min(span.end_s, held[1])), step_s, points
+    )
+    parts: dict[tuple[int, int], list[HistoryRow]] = {}
+    names: dict[tuple[str, ...], tuple[str, ...]] = {}
+    for key, rows in groupby(reader.rows(device, span), key=lambda row: _bucket(row, step_s)):
+        one = merge_rows(list(rows), *key)
+        if one.names not in names:
+            names[one.names] = tuple(name for name in one.names if wanted(name))
+        parts.setdefault(key, []).append(select_columns(one, names[one.names]))
+    found = [merge_rows(part, *key) for key, part in sorted(parts.items())]
+    events, in_all = reader.events(device, span, MAX_EVENTS)
+    if not found and not events:
+        raise NotReady(f"{device}: no results in this time range; stored are {_format_range(held)}")
+    return build_table(device, span, step_s, found, events, in_all)
+
+
+def build_table(
+    device: str,
+    span: TimeRange,
+    step_s: int,
+    rows: Sequence[HistoryRow],
+    events: Sequence[StoredEvent],
+    events_in_all: int,
+) -> HistoryTable:
+    """Arrange rows as a table.
+
+    Parameters
+    ----------
+    device
+        Name of the device.
+    span
+        Time range of the table.
+    step_s
+        Bucket width [s].
+    rows
+        Rows, ordered by time.
+    events
+        Events in the time range.
+    events_in_all
+        Number of events in the time range, including those not in ``events``.
+    """
+    names = tuple(dict.fromkeys(name for row in rows for name in row.names))
+    rows = [select_columns(row, names) for row in rows]
+    shape = (len(rows), len(names))
+    return HistoryTable(
+        device,
+        span,
+        step_s,
+        np.array([row.start_s for row in rows], np.int64),
+        np.array([row.width_s for row in rows], np.int64),
+        names,
+        np.array([row.n for row in rows], np.int64).reshape(shape),
+        np.array([row.low for row in rows], np.float32).reshape(shape),
+        np.array([row.high for row in rows], np.float32).reshape(shape),
+        np.array([row.last for row in rows], np.float32).reshape(shape),
+        np.array([row.counts for row in rows], np.int64).reshape(len(rows), 4),
+        np.array([row.state for row in rows], np.int64),
+        tuple(events),
+        events_in_all,
+    )
+
+
+def bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
+    """Return the smallest permitted bucket width [s] for a number of points, at least ``step_s``.
+
+    >>> bucket_width_s(TimeRange(0.0, 86_400.0)), bucket_width_s(TimeRange(0.0, 5 * 31_536_000.0))
+    (300, 172800)
+    >>> bucket_width_s(TimeRange(0.0, 3600.0), 900)
+    900
+
+    Parameters
+    ----------
+    span
+        Time range.
+    step_s
+        Minimum bucket width [s].
+    points
+        Approximate number of buckets.
+    """
+    least_s = max((span.end_s - span.start_s) / points, step_s or 0)
+    return next(
+        (one for one in BUCKET_WIDTHS_S if one >= least_s),
+        math.ceil(least_s / BUCKET_WIDTHS_S[-1]) * BUCKET_WIDTHS_S[-1],
+    )
+
+
+def _clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
+    """Clip a time range to the stored time range plus one day, because events may be outside the stored rows."""
+    start_s, end_s = max(span.start_s, held[0] - DAY_S), min(span.end_s, held[1] + DAY_S)
+    return replace(span, start_s=min(start_s, end_s), end_s=max(start_s, end_s))
+
+
+def _bucket(row: HistoryRow, step_s: int) -> tuple[int, int]:
+    """Return the start and width [s] of the bucket that contains a row."""
+    width_s = max(row.width_s, step_s)
+    return row.start_s // width_s * width_s, width_s
+
+
+def _format_range(held: tuple[float, float]) -> str:
+    """Format the stored time range for a message."""
+    return f"{format_utc(held[0])} to {format_utc(held[1])} UTC"

@@ -1,0 +1,246 @@
+"""Noise coefficients to export, and the comments that are common to all formats.
+
+A ``NoiseCoefficients`` object holds Q, N, B, K and R of each axis in SI. All coefficients of a model file are values.
+In the output of ``analyze --json``, a coefficient with the status ``estimated`` is a value, and a coefficient with the
+status ``upper_bound`` is marked as a bound. Coefficients with another status are absent. Other effects, such as a
+spectral line or a bias, are kept only by name, so that a comment can list what the file omits.
+"""
+
+import math
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import msgspec
+
+from drivers.data_types import AXES
+from drivers.errors import ConfigError, ImuError, NotReady
+from drivers.number_ranges import RATE_HZ
+from monitor.common.units import KINDS, Kind, axes_of
+from monitor.noise.effect import Source, gyro_and_accel_units
+from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRamp, RateRandomWalk
+from monitor.noise.model import NoiseModel
+
+COEFFICIENT_EFFECTS: Final[dict[str, type[Source]]] = {
+    "Q": QuantizationNoise,
+    "N": AngleRandomWalk,
+    "B": BiasInstability,
+    "K": RateRandomWalk,
+    "R": RateRamp,
+}
+"""Noise effect with the same coefficient as parameter."""
+
+
+def ascii_unit(letter: str, kind: Kind) -> str:
+    """Return the SI unit of a coefficient in ASCII.
+
+    >>> ascii_unit("K", "gyro"), ascii_unit("R", "accel")
+    ('rad/s/sqrt(s)', 'm/s^3')
+
+    Parameters
+    ----------
+    letter
+        Coefficient.
+    kind
+        Kind of sensor.
+    """
+    unit = gyro_and_accel_units(COEFFICIENT_EFFECTS[letter])[letter][KINDS.index(kind)]
+    return unit.replace("√s", "sqrt(s)").replace("²", "^2").replace("³", "^3")
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """Coefficient of one axis, SI."""
+
+    value: float
+    bound: bool = False  # True if the value is an upper bound
+
+
+@dataclass(frozen=True, slots=True)
+class NoiseCoefficients:
+    """Noise coefficients by axis and letter. Unknown axes and letters are absent."""
+
+    axes: Mapping[str, Mapping[str, Term]]
+    sample_rate_hz: float | None
+    source: str  # origin of the numbers, for the header of the file
+    left_out: tuple[str, ...] = ()  # other effects, such as "gz.sinusoidal"
+    measured: bool = False  # True if the coefficients come from a recording
+    warnings: tuple[str, ...] = ()  # ASCII sentences for the header of the file
+
+    def coefficients(self, kind: Kind, letter: str) -> dict[str, Term]:
+        """Return one coefficient of the axes that have it.
+
+        Parameters
+        ----------
+        kind
+            Kind of sensor: gyro or accel.
+        letter
+            Coefficient.
+        """
+        return {axis: self.axes[axis][letter] for axis in axes_of(kind) if letter in self.axes.get(axis, {})}
+
+
+def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficients:
+    """Return the coefficients of a noise model. The variances of equal effects on one axis are added.
+
+    >>> model = NoiseModel.from_toml('sample_rate = 100.0\\n["g*".angle_random_walk]\\nN = 1.5e-4')
+    >>> from_model(model).axes["gz"]["N"].value
+    0.00015
+
+    Parameters
+    ----------
+    model
+        Noise model.
+    source
+        Origin of the numbers, for the header of the file.
+    """
+    letters = {effect.name: letter for letter, effect in COEFFICIENT_EFFECTS.items()}
+    axes: dict[str, dict[str, Term]] = {}
+    left_out = []
+    for axis, effects in model.effects.items():
+        sizes: dict[str, float] = {}
+        for one in effects:
+            letter = letters.get(one.name)
+            if letter is None:
+                left_out.append(f"{axis}.{one.name}")
+            else:
+                sizes[letter] = math.hypot(sizes.get(letter, 0.0), getattr(one, letter))
+        axes[axis] = {letter: Term(size) for letter, size in sizes.items() if size > 0.0}
+    known = {axis: axes[axis] for axis in AXES if axes.get(axis)}
+    return NoiseCoefficients(known, model.sample_rate_hz, source, tuple(left_out))
+
+
+class _Coefficient(msgspec.Struct):
+    """One coefficient in the JSON of an analysis."""
+
+    value: float | None
+    hi: float | None
+    status: str
+
+
+class _Temperature(msgspec.Struct):
+    """Key ``temperature`` of an axis in the JSON of an analysis."""
+
+    share: float
+
+
+class _Axis(msgspec.Struct):
+    """One axis in the JSON of an analysis."""
+
+    coefficients: dict[str, _Coefficient]
+    temperature: _Temperature | None = None
+
+
+class _Analysis(msgspec.Struct):
+    """JSON of an analysis with only the keys that an export needs."""
+
+    schema: str
+    axes: dict[str, _Axis]
+    rate: float | None = None
+
+
+def from_analysis(text: bytes | str, source: str = "analysis of a recording") -> NoiseCoefficients:
+    """Return the coefficients in the output of ``imu-monitor analyze --json``.
+
+    Parameters
+    ----------
+    text
+        JSON text.
+    source
+        Origin of the numbers, for the header of the file.
+
+    Raises
+    ------
+    ConfigError
+        If the text is not the JSON of an analysis, or if the rate is outside the supported range.
+    """
+    try:
+        found = msgspec.json.decode(text, type=_Analysis)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(f"not the JSON of an analysis: {error}") from error
+    if not found.schema.startswith("imu-monitor/analyze/"):
+        raise ConfigError(f'schema "{found.schema}"; an export needs "imu-monitor/analyze/1"')
+    try:
+        if found.rate is not None:
+            RATE_HZ.check(found.rate)
+    except ConfigError as error:
+        raise ConfigError(f"rate: {error}") from None
+    axes: dict[str, dict[str, Term]] = {}
+    for axis in (axis for axis in AXES if axis in found.axes):
+        for letter, one in found.axes[axis].coefficients.items():
+            if one.status == "estimated" and one.value is not None:
+                axes.setdefault(axis, {})[letter] = Term(one.value)
+            elif one.status == "upper_bound" and one.hi is not None:
+                axes.setdefault(axis, {})[letter] = Term(one.hi, bound=True)
+    warnings = tuple(
+        f"{axis} follows its temperature, which explains {math.floor(100.0 * mark.share):d} % of its slow variance: "
+        f"B and K of {axis} describe temperature as well as noise"
+        for axis in axes
+        if (mark := found.axes[axis].temperature) is not None
+    )
+    return NoiseCoefficients(axes, found.rate, source, measured=True, warnings=warnings)
+
+
+def missing_coefficient_error(noise: NoiseCoefficients, text: str) -> ImuError:
+    """Return the error for a missing coefficient: NotReady for a recording, ConfigError for a noise model.
+
+    Parameters
+    ----------
+    noise
+        Coefficients of the recording or the model.
+    text
+        Message.
+    """
+    return NotReady(f"{text}: a longer recording is needed") if noise.measured else ConfigError(text)
+
+
+def header_comments(noise: NoiseCoefficients, inflation: float, mark: str) -> list[str]:
+    """Return comments on the origin of the numbers, the inflation factor and the warnings.
+
+    Parameters
+    ----------
+    noise
+        Coefficients.
+    inflation
+        Factor on N, B and K.
+    mark
+        Comment mark of the format.
+    """
+    source = noise.source.encode("ascii", "replace").decode()
+    done = "none" if inflation == 1.0 else f"N, B and K are {inflation:g} times the values of the source"
+    return [
+        f"{mark} source: {source}",
+        f"{mark} inflation: {done}",
+        *(f"{mark} WARNING: {one}" for one in noise.warnings),
+    ]
+
+
+def omitted_comment(noise: NoiseCoefficients, used: Collection[str], mark: str) -> list[str]:
+    """Return a comment that lists the terms of the source that the format cannot represent.
+
+    Parameters
+    ----------
+    noise
+        Coefficients.
+    used
+        Letters that the format represents.
+    mark
+        Comment mark of the format.
+    """
+    letters = {letter for terms in noise.axes.values() for letter, term in terms.items() if not term.bound}
+    unused = [letter for letter in COEFFICIENT_EFFECTS if letter in letters and letter not in used]
+    return [f"{mark} not in this file: {', '.join([*unused, *noise.left_out])}"] if unused or noise.left_out else []
+
+
+def number(value: float) -> str:
+    """Format a number with seven digits so that YAML 1.1, TOML and MATLAB read it as a float.
+
+    >>> number(1.5e-4)
+    '1.500000e-04'
+    """
+    return f"{value:.6e}"
+
+
+def join_lines(lines: Iterable[str]) -> str:
+    """Return the lines as the text of a file."""
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,331 @@
+"""Figures of the reports of ``reconcile``, as SVG elements.
+
+A diagnostic figure shows the measurement, the expectation of the model, and the band that contains 95 of 100 recordings
+simulated from the model. Panels side by side have the same limits, so that the figures of two models can be compared.
+A gap is the difference between measurement and model. A gap chart shows the gap of each diagnostic divided by the
+threshold. An interval chart shows one parameter in several recordings.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from math import isfinite
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.common.units import DEVIATION_UNITS, sensor_kind
+from monitor.publishing.plots import style
+from monitor.publishing.reports.reconcile_sentences import (
+    diagnostic_name,
+    field_unit,
+    format_range,
+    gap_to_threshold_ratio,
+    readable_name,
+)
+from monitor.reconcile.result import DiagnosticGap, Location, ParameterInterval, PlotData
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MARGINS_INCHES: Final = (0.58, 0.15, 0.30, 0.44)  # left, right, top and bottom of a panel, for its labels
+BAND_COLOUR: Final = "#cfd5dd"
+RANGE_TEXT_COLOUR: Final = "#8a5a00"
+ABOVE_THRESHOLD_COLOUR: Final = "#b3261e"
+BELOW_THRESHOLD_COLOUR: Final = "#1b7f4d"
+MAX_MARKERS: Final = 60  # largest number of points that are drawn with markers
+MARGIN_SHARE: Final = 0.06  # margin above and below the curves, as a share of their height
+MAX_BAND_SHARE: Final = 0.35  # a band extends a panel by at most this share of the height of the curves
+LOWEST_SHARE: Final = 0.02  # share of the points that may lie below a logarithmic panel
+MIN_RANGE_SHARE: Final = 0.08  # a range narrower than this share of the width has a detail plot
+DETAIL_WIDTHS: Final = 4.0  # a detail plot extends by this multiple of the range's width to either side
+MIN_DETAIL_SHARE: Final = 0.01  # smallest extension of a detail plot, as a share of the width of the whole plot
+MIN_DETAIL_POINTS: Final = 8
+ROW_INCHES: Final = 0.21  # height of one row of a gap chart or an interval chart
+ROWS_WIDTH_INCHES: Final = 5.6
+MAX_NAME_LENGTH: Final = 32
+MIN_GAP_RATIO: Final = 0.05  # a smaller ratio of gap to threshold is drawn at this value
+
+
+@dataclass(frozen=True, slots=True)
+class DiagnosticPlot:
+    """Data of one panel in the units of the plot."""
+
+    title: str
+    x_label: str
+    y_label: str
+    log: bool
+    x: Floats  # [k]
+    measured: Floats  # [k]
+    expected: Floats  # [k]
+    lo: Floats  # [k]
+    hi: Floats  # [k]
+    mark: tuple[float, float] | None  # range to mark along x
+    mark_label: str
+
+
+def compared_diagnostic_svg(
+    model_panels: Sequence[tuple[str, PlotData]], axis: str, width: float, height: float, where: Location | None = None
+) -> str:
+    """Draw one diagnostic, one panel for each model, and return it as an SVG element.
+
+    Parameters
+    ----------
+    model_panels
+        Title and data of each panel, one for each model.
+    axis
+        Name of the axis.
+    width, height
+        Size of the figure [inches].
+    where
+        Range to mark in the first panel.
+    """
+    plots = [
+        to_field_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(model_panels)
+    ]
+    limits = value_limits(plots)
+    left, right, top, bottom = MARGINS_INCHES
+    share = width / len(plots)
+    with style.figure_style():
+        figure = style.create_figure(width, height, layout=None)
+        for i, plot in enumerate(plots):
+            size = ((share - left - right) / width, (height - top - bottom) / height)
+            panel = figure.add_axes(((i * share + left) / width, bottom / height, *size))
+            _draw_panel(panel, plot if i == 0 else replace(plot, y_label=""), style.axis_colour(axis), limits)
+        return style.svg_element(figure, f"{axis}: {plots[0].y_label} over {plots[0].x_label}")
+
+
+def select_view(views: Sequence[PlotData], lens: str, where: Location) -> PlotData | None:
+    """Return the data of a diagnostic, or the data of the first diagnostic whose x axis contains the range.
+
+    Parameters
+    ----------
+    views
+        Data of all diagnostics.
+    lens
+        Identifier of the diagnostic.
+    where
+        Range that the diagnostic found.
+    """
+    own = [view for view in views if view.lens == lens]
+    return next(iter(own or [view for view in views if range_on_x_axis(view, where) is not None]), None)
+
+
+def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | None:
+    """Return the part of a range that lies along the x axis of a diagnostic, in the unit of the diagnostic.
+
+    Parameters
+    ----------
+    view
+        Data of the diagnostic.
+    where
+        The range.
+    """
+    match view.x_name, view.x_unit:
+        case _, "Hz":
+            return where.frequency
+        case (("averaging time" | "lag"), _):
+            return where.tau
+        case "time", _:
+            return where.time
+        case _, "°C":
+            return where.temperature
+        case _, "rad/s" | "m/s²":
+            return where.value
+    return None
+
+
+def detail_view(view: PlotData, where: Location) -> PlotData | None:
+    """Return the data around a range that is too narrow to be visible. Return None if the range is wide enough.
+
+    Parameters
+    ----------
+    view
+        Data of the diagnostic.
+    where
+        The range.
+    """
+    at = range_on_x_axis(view, where)
+    if at is None or view.x.size < 2:
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x, ends = (np.log10(values) if view.log else values for values in (view.x, np.array(at)))
+    valid = x[np.isfinite(x)]
+    low, width = float(valid.min()), float(np.ptp(valid))
+    share, (a, b) = (x - low) / width, ((ends - low) / width).tolist()
+    if not b - a < MIN_RANGE_SHARE:
+        return None
+    rows = np.abs(share - 0.5 * (a + b)) < max(DETAIL_WIDTHS * (b - a), MIN_DETAIL_SHARE)
+    if rows.sum() < MIN_DETAIL_POINTS:
+        return None
+    lines = {name: getattr(view, name)[rows] for name in ("x", "measured", "expected", "lo", "hi")}
+    return replace(view, y_name="detail", **lines)
+
+
+def to_field_units(title: str, view: PlotData, axis: str, where: Location | None) -> DiagnosticPlot:
+    """Convert the data of a diagnostic to the units of the plot.
+
+    Parameters
+    ----------
+    title
+        Title of the panel.
+    view
+        Data of the diagnostic.
+    axis
+        Name of the axis.
+    where
+        Range to mark. A range of another quantity than the x axis is omitted.
+    """
+    x_unit, y_unit = (
+        field_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)))
+        for unit, line in ((view.x_unit, view.x), (view.y_unit, view.measured))
+    )
+    if view.x_name == "averaging time" and view.y_unit in ("rad/s", "m/s²"):
+        y_unit = DEVIATION_UNITS[sensor_kind(axis)]  # as in all Allan plots
+    x_name, factor = x_unit.name, x_unit.factor
+    if view.x_name == "time" and not view.log:
+        x_name, seconds = style.time_unit(float(np.ptp(view.x)))
+        factor = 1.0 / seconds
+    mark = None if where is None else range_on_x_axis(view, where)
+    measured, expected, lo, hi = (line * y_unit.factor for line in (view.measured, view.expected, view.lo, view.hi))
+    return DiagnosticPlot(
+        title=title,
+        x_label=", ".join(part for part in (readable_name(view.x_name), x_name) if part),
+        y_label=", ".join(part for part in (readable_name(view.y_name), y_unit.name) if part),
+        log=view.log,
+        x=view.x * factor,
+        measured=measured,
+        expected=expected,
+        lo=lo,
+        hi=hi,
+        mark=None if mark is None else (mark[0] * factor, mark[1] * factor),
+        mark_label="" if where is None else format_range(where, axis),
+    )
+
+
+def value_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
+    """Return the common limits of all panels, which contain all curves and the parts of the bands near the curves."""
+    log = plots[0].log
+    curves = _finite([line for plot in plots for line in (plot.measured, plot.expected)], log)
+    if curves.size == 0:
+        return (0.1, 10.0) if log else (-1.0, 1.0)
+    low, high = float(curves.min()), float(curves.max())
+    if log:  # an almost empty bin of a spectrum lies decades below the other bins
+        low = float(min(np.quantile(curves, LOWEST_SHARE), *_finite([plot.expected for plot in plots], log), high))
+    reach = MAX_BAND_SHARE * (high - low)
+    bands = _finite([line for plot in plots for line in (plot.lo, plot.hi)], log).clip(low - reach, high + reach)
+    low, high = float(bands.min(initial=low)), float(bands.max(initial=high))
+    margin = MARGIN_SHARE * (high - low) or max(abs(high) * MARGIN_SHARE, 1e-12)
+    return (10.0 ** (low - margin), 10.0 ** (high + margin)) if log else (low - margin, high + margin)
+
+
+def _finite(lines: Sequence[Floats], log: bool) -> Floats:
+    """Return all values that a panel can show. The values of a logarithmic panel are returned as logarithms."""
+    values = np.concatenate(lines)
+    values = values[np.isfinite(values) & ((values > 0) | (not log))]
+    return np.log10(values) if log else values
+
+
+def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[float, float]) -> None:
+    """Draw the band, the measurement, the expectation and the marked range of one panel."""
+    x = plot.x[np.isfinite(plot.x) & ((plot.x > 0) | (not plot.log))]
+    left, right = (float(x.min()), float(x.max())) if np.ptp(x) > 0 else (0.5, 1.5)
+    scale = "log" if plot.log else "linear"
+    panel.set(xscale=scale, yscale=scale, xlim=(left, right), ylim=limits, xlabel=plot.x_label)
+    panel.autoscale(False)
+    # A lower end of zero has no logarithm. It is drawn below the panel.
+    lo, hi = (np.fmax(line, 0.1 * limits[0]) if plot.log else line for line in (plot.lo, plot.hi))
+    panel.fill_between(plot.x, lo, hi, where=np.isfinite(plot.hi).tolist(), color=BAND_COLOUR, linewidth=0)
+    few = plot.x.size <= MAX_MARKERS
+    panel.plot(plot.x, plot.measured, color=colour, linewidth=1.1, marker="o" if few else "", markersize=4.5)
+    panel.plot(plot.x, plot.expected, "--", color=style.DARK, linewidth=1.0)
+    if plot.mark is not None:
+        ends = np.clip(plot.mark, left, right).tolist()
+        # The edge of the area keeps a very narrow range visible.
+        panel.axvspan(*ends, facecolor=style.ORANGE, edgecolor=style.ORANGE, alpha=0.35, linewidth=3)
+        panel.set_title(plot.mark_label, loc="right", fontsize=9, color=RANGE_TEXT_COLOUR, fontweight="bold")
+    else:
+        panel.set_title(plot.title, loc="right", fontsize=9)
+    for which in "xy" if plot.log else ():
+        style.style_log_axis(panel, which, minor_grid=False)
+    if not plot.log:
+        panel.xaxis.set_major_formatter(lambda value, _: style.format_tick(value))
+        panel.yaxis.set_major_formatter(lambda value, _: style.format_tick(value))
+    panel.tick_params(labelsize=8.5)
+    panel.set_title(plot.y_label, loc="left", fontsize=9, color=style.GREY)
+
+
+def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap] = ()) -> str:
+    """Draw the gap of each diagnostic divided by its threshold, and return the chart as an SVG element.
+
+    Parameters
+    ----------
+    before
+        Gaps with one model.
+    after
+        Gaps with the next model. Empty if there is only one model.
+    """
+    later = {score.lens: score for score in after}
+    with style.figure_style():
+        figure, panel = _create_row_panel([diagnostic_name(score.lens) for score in before], "gap over threshold")
+        panel.set_xscale("log")
+        ratios = [1.0]
+        for y, score in enumerate(before):
+            scores = [score] + ([later[score.lens]] if score.lens in later else [])
+            x = [max(gap_to_threshold_ratio(one), MIN_GAP_RATIO) for one in scores]
+            colours = [ABOVE_THRESHOLD_COLOUR if one.is_significant else BELOW_THRESHOLD_COLOUR for one in scores]
+            panel.plot(x, [y] * len(x), color=style.GREY, linewidth=1.4, zorder=2)
+            if len(x) > 1:
+                panel.plot(x[0], y, "o", mfc="white", mec=colours[0], mew=1.4, markersize=6)
+            panel.plot(x[-1], y, "o", color=colours[-1], markersize=6)
+            ratios += x
+        panel.axvline(1.0, color=style.DARK, linewidth=1.2, zorder=1)
+        panel.set_xlim(0.8 * MIN_GAP_RATIO, max(20.0, 1.3 * max(ratios)))
+        style.style_log_axis(panel, "x", minor_grid=False)
+        if after:
+            panel.set_title("○ before   ● after", loc="right", fontsize=9, color=style.GREY)
+        return style.svg_element(figure, "gap over threshold of each diagnostic")
+
+
+def interval_chart_svg(
+    intervals: Sequence[tuple[str, ParameterInterval]], x_label: str, factor: float, colour: str
+) -> str:
+    """Draw values with 95 % intervals, one row for each recording, and return the chart as an SVG element.
+
+    Parameters
+    ----------
+    intervals
+        Name and interval of each row. The last row is the pooled value.
+    x_label
+        Name and unit of the parameter.
+    factor
+        Factor from the SI unit to the unit of ``x_label``.
+    colour
+        Colour of the recordings.
+    """
+    with style.figure_style():
+        figure, panel = _create_row_panel([name for name, _ in intervals], x_label)
+        for y, (_, one) in enumerate(intervals):
+            if isinstance(one.value, str) or one.lo is None or one.hi is None or not isfinite(one.hi - one.lo):
+                continue
+            pooled = y == len(intervals) - 1
+            value, lo, hi = (factor * part for part in (one.value, one.lo, one.hi))
+            panel.errorbar(
+                value, y, xerr=[[max(value - lo, 0.0)], [max(hi - value, 0.0)]],
+                fmt="D" if pooled else "o", color=style.DARK if pooled else colour, elinewidth=1.8, markersize=6,
+            )  # fmt: skip
+        panel.xaxis.set_major_formatter(lambda value, _: style.format_tick(value))
+        return style.svg_element(figure, f"{x_label}, of each recording")
+
+
+def _create_row_panel(names: Sequence[str], x_label: str) -> "tuple[Figure, Axes]":
+    """Return a figure and a panel with one row for each name. The first name is on top."""
+    figure = style.create_figure(ROWS_WIDTH_INCHES, 0.75 + ROW_INCHES * len(names))
+    panel = figure.subplots()
+    short = [name if len(name) <= MAX_NAME_LENGTH else f"{name[: MAX_NAME_LENGTH - 1]}…" for name in names]
+    panel.set_yticks(range(len(names)), short)
+    panel.set_ylim(len(names) - 0.4, -0.6)
+    panel.set_xlabel(x_label)
+    panel.grid(axis="y", color=style.MINOR_GRID_COLOUR)
+    return figure, panel

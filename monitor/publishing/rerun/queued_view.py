@@ -1,0 +1,276 @@
+"""Live view in Rerun. Results from the main loop of the service are drawn in a separate thread.
+
+``put`` adds a result to a bounded queue and returns at once. The thread opens the viewer, draws new data five times a
+second, and checks once a second that the data have reached the viewer. If the viewer does not answer, the state is
+``stalled``: drawing waits, the queue drops its oldest entries, and ``state`` reports their number. If the viewer is
+missing, cannot start or was closed, ``state`` gives the reason and the attempt is repeated. No exception reaches the
+main loop.
+
+Three properties of Rerun determine this design. A logging call blocks without limit if the viewer does not read. The
+exit handler of Rerun may block in the same way and is therefore removed. Freeing a stream may also block, so streams
+are never freed (see ``sinks``). The import of Rerun takes half a second and is done in the thread.
+"""
+
+import importlib
+import os
+import threading
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, Final
+
+from monitor.history.history_table import HistoryTable
+from monitor.publishing.bounded_queue import BoundedQueue
+from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerClosed, ViewerError, ViewerSettings
+from monitor.publishing.result_kinds import RESULT_KINDS, Drawing, TimedResult, kind_of
+
+if TYPE_CHECKING:
+    from monitor.publishing.rerun.sinks import Output, ViewerProcess
+    from monitor.publishing.rerun.viewer_content import Scene
+
+BACKLOG_BYTES: Final = 16_000_000  # about 25 s of 16 devices at 1 kHz with six axes
+CONFIRM_PERIOD_S: Final = 1.0  # interval between checks that drawn data have reached the viewer
+PATIENCE_S: Final = 1.0  # timeout of this check
+STALL_TIMEOUT_S: Final = 2.0  # a viewer is stalled if one Rerun call takes longer
+RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
+PLOTS_PER_S: Final = 8.0  # rate of Allan plots, shared by all devices; at most one per second and device
+MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes sooner does not work on this host
+MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
+
+HistorySource = Callable[[str], HistoryTable | None]
+"""Function that returns the stored history of a device, or None."""
+
+
+class RerunView:
+    """Viewer of all devices. Only one thread may use it. Every call returns at once.
+
+    Parameters
+    ----------
+    settings
+        Settings of the viewer.
+    devices
+        Devices to show in detail.
+    history_source
+        Function that returns the stored history of a device. The thread of the viewer calls this function.
+    fleet
+        True if further devices are shown only in a ``DeviceTableText``.
+    """
+
+    def __init__(
+        self,
+        settings: ViewerSettings,
+        devices: Sequence[DeviceInfo],
+        history_source: HistorySource = lambda _device: None,
+        fleet: bool = False,
+    ) -> None:
+        self._settings = settings
+        self._history_source = history_source
+        self._fleet = fleet
+        self._devices = tuple(devices)
+        self._backlog: BoundedQueue[tuple[str, float, Any]] = BoundedQueue(BACKLOG_BYTES)
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._phase = "off"
+        self._stalled = False
+        self._inside_since: float | None = None  # monotonic time at which the current Rerun call began [s]
+        self._child: ViewerProcess | None = None
+        self.url = ""  # address of the web page or of the Rerun server
+        self._recording_id = str(uuid.uuid4())
+
+    @property
+    def state(self) -> str:
+        """``ok``, or a short description of the problem; part of the status message."""
+        inside = self._inside_since
+        if self._stalled or (inside is not None and time.monotonic() - inside > STALL_TIMEOUT_S):
+            return f"stalled ({self._backlog.dropped} dropped)"
+        return self._phase
+
+    def start(self) -> None:
+        """Start the thread. Errors are reported in ``state`` and the attempt is repeated."""
+        if self._settings.mode == "none" or self._thread is not None:
+            return
+        self._phase = "starting"
+        self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
+        self._thread.start()
+
+    def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
+        """Set the devices to show in detail. A device must be set before its first result is passed."""
+        self._devices = tuple(devices)
+
+    def put(self, device: str, unix_s: float, result: Any) -> None:
+        """Draw a result.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        unix_s
+            Unix time of the result [s].
+        result
+            Result of one of the kinds in ``monitor.publishing.result_kinds``.
+        """
+        if self._thread is not None:
+            self._backlog.push((device, unix_s, result), kind_of(result).size_bytes(result))
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Draw the remaining data for at most ``timeout_s`` seconds, and close the output."""
+        thread, self._thread = self._thread, None
+        if thread is None:
+            return
+        self._closing.set()
+        self._backlog.wake()
+        thread.join(0.75 * timeout_s)
+        child = self._child
+        if thread.is_alive() and child is not None:
+            child.kill()  # ends the wait of the thread for a viewer that does not respond
+        thread.join(0.25 * timeout_s)
+        self._phase = "closed"
+
+    # ---- methods of the thread ----
+
+    def _run(self) -> None:
+        """Open the viewer and draw until closed. Reopen the viewer after a failure."""
+        settings, attempt = self._settings, 0
+        while not self._closing.is_set():
+            started = time.monotonic()
+            try:
+                _load_rerun()
+                self._show(settings)
+            except ViewerClosed as closed:
+                settings = replace(settings, mode="join")
+                self._phase = str(closed)
+            except ViewerError as trouble:
+                self._phase = str(trouble)
+            except ImportError as missing:
+                self._phase = MISSING if missing.name in ("rerun", "rerun_cli", "rerun_bindings") else str(missing)
+            except Exception as error:  # noqa: BLE001 - reported in state; a drawing error must not end the view
+                self._phase = f"{type(error).__name__}: {error}"
+            settings, attempt = self._wait_and_select_mode(settings, started, attempt)
+
+    def _wait_and_select_mode(
+        self, settings: ViewerSettings, started: float, attempt: int
+    ) -> tuple[ViewerSettings, int]:
+        """Wait before the next attempt. If a window does not work on this host, use the web page instead."""
+        self._stalled, self._inside_since, self.url = False, None, ""
+        lived_s = time.monotonic() - started
+        if self._closing.is_set():
+            return settings, attempt
+        attempt = 0 if lived_s > 60.0 or settings.mode == "join" else attempt + 1
+        if settings.mode == "auto" and lived_s < MIN_WINDOW_LIFETIME_S:
+            return replace(settings, mode="web"), attempt
+        self._closing.wait(RETRY_S[min(attempt, len(RETRY_S) - 1)])
+        return settings, attempt
+
+    def _show(self, settings: ViewerSettings) -> None:
+        """Open a viewer and draw until the viewer ends."""
+        from monitor.publishing.rerun import sinks
+        from monitor.publishing.rerun import viewer_content as rerun_scene
+
+        output = sinks.open_output(settings, self._recording_id, self._closing.is_set)
+        self._child, self.url = output.child, output.url
+        try:
+            scene = rerun_scene.Scene(output.stream, self._fleet)
+            self._draw(output, scene)
+        finally:
+            self._child = None
+            output.close()
+
+    def _send_layout(self, output: "Output", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
+        """Send the layout for the devices and create their entities."""
+        from monitor.publishing.rerun import blueprint
+
+        layout = blueprint.blueprint(devices, self._fleet)
+        output.stream.send_blueprint(layout, make_active=True, make_default=True)
+        scene.set_devices(devices)
+        self._phase = f"ok, but {output.note}" if output.note else "ok"
+
+    def _draw_history(self, scene: "Scene", device: str) -> None:
+        """Draw the stored history of a device before its live data."""
+        self._inside_since = None  # a slow disk must not count as a stalled viewer
+        past = self._history_source(device)
+        self._inside_since = time.monotonic()
+        if past is not None:
+            scene.draw_history(device, past)
+
+    def _draw(self, output: "Output", scene: "Scene") -> None:
+        """Draw new data until closed. Raise ViewerError if the viewer has ended."""
+        waiting = _WaitingResults()
+        shown: tuple[DeviceInfo, ...] | None = None
+        begun: set[str] = set()
+        checked = time.monotonic()
+        while True:
+            closing = self._closing.is_set()
+            waiting.add(
+                self._backlog.take(0.0)
+            )  # before the devices are read, so that the device of each result is known
+            self._inside_since = time.monotonic()
+            if self._devices is not shown:
+                shown = self._devices
+                waiting.period_factor = max(1.0, len(shown) / PLOTS_PER_S)
+                self._send_layout(output, scene, shown)
+                for device in [one.name for one in shown if one.name not in begun]:
+                    begun.add(device)
+                    self._draw_history(scene, device)
+            waiting.draw(scene, everything=closing)
+            now = time.monotonic()
+            if closing or now - checked > CONFIRM_PERIOD_S:
+                self._confirm(output)
+                checked = time.monotonic()
+            self._inside_since = None
+            if closing:
+                return
+            output.check_viewer()
+            self._closing.wait(output.flush_every_s)
+
+    def _confirm(self, output: "Output") -> None:
+        """Wait until all drawn data have reached the viewer. This limits the data held by Rerun to one second."""
+        while not output.confirm_delivery(PATIENCE_S):
+            self._stalled = not self._closing.is_set()
+            output.check_viewer()
+            if self._closing.is_set():
+                return
+        self._stalled = False
+
+
+class _WaitingResults:
+    """Results that wait for their next drawing."""
+
+    def __init__(self) -> None:
+        self.period_factor = 1.0  # factor for the periods of drawings whose rate the devices share
+        self._waiting: dict[Drawing, dict[str, list[TimedResult]]] = {
+            drawing: {} for kind in RESULT_KINDS for drawing in kind.drawings
+        }
+        self._drawn_s: dict[tuple[Drawing, str], float] = {}  # monotonic time of the last drawing of a device [s]
+
+    def add(self, results: Sequence[tuple[str, float, Any]]) -> None:
+        """Add results, given by device, Unix time [s] and result."""
+        for device, unix_s, result in results:
+            for drawing in kind_of(result).drawings:
+                drawing.merge(self._waiting[drawing].setdefault(device, []), (unix_s, result))
+
+    def draw(self, scene: "Scene", everything: bool) -> None:
+        """Draw the results whose period has passed, or all results if ``everything`` is True."""
+        for drawing, devices in self._waiting.items():
+            period_s = drawing.period_s * (self.period_factor if drawing.shares_rate else 1.0)
+            for device in list(devices):
+                now_s = time.monotonic()
+                if everything or now_s - self._drawn_s.get((drawing, device), float("-inf")) >= period_s:
+                    self._drawn_s[drawing, device] = now_s
+                    scene.draw(device, drawing.panel, devices.pop(device))
+
+
+def _load_rerun() -> None:
+    """Import Rerun and remove its exit handler, which waits without limit for a viewer that does not answer.
+
+    Rerun reads RUST_LOG at import. By default its log would report every closed viewer as an error of this process.
+    """
+    given = os.environ.get("RUST_LOG")
+    os.environ["RUST_LOG"] = given or "off"
+    os.environ.setdefault("RERUN_ANALYTICS", "0")
+    try:
+        rerun = importlib.import_module("rerun")
+    finally:
+        if given is None:
+            del os.environ["RUST_LOG"]
+    rerun.unregister_shutdown()

@@ -1,0 +1,107 @@
+"""Parts of a Rerun layout that several panels and reports use. Importing this module imports Rerun."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import rerun as rr
+import rerun.blueprint as rrb
+
+from monitor.publishing.plots import axis_colours as colours
+
+TIMELINE: Final = "sample_time"
+RAW_SAMPLES_S: Final = 30.0
+"""Duration of the raw samples that a view shows [s]."""
+HALF_LABEL_SHARE: Final = 0.08
+"""Width of half a tick label, as a share of the width of the plot."""
+
+
+def time_series_view(
+    origin: str,
+    name: str,
+    contents: Sequence[str] = ("$origin",),
+    last_s: float | None = None,
+    legend: bool = False,
+    styles: Mapping[Any, rr.SeriesLines] | None = None,
+) -> rrb.TimeSeriesView:
+    """Return a view of time series up to the cursor.
+
+    Parameters
+    ----------
+    origin
+        Path of the entity.
+    name
+        Title of the view.
+    contents
+        Entities to show.
+    last_s
+        Time range before the cursor [s]. By default, the view begins with the first sample.
+    legend
+        True to show a legend.
+    styles
+        Styles for this view only, by path of the entity.
+    """
+    return rrb.TimeSeriesView(
+        origin=origin,
+        contents=[f"+ {one}" for one in contents],
+        name=name,
+        plot_legend=rrb.PlotLegend(rrb.Corner2D.LeftTop) if legend else rrb.PlotLegend(visible=False),
+        overrides=styles,
+        axis_x=_until_cursor() if last_s is None else _before_cursor(last_s),
+    )
+
+
+def drawing_view(origin: str, name: str, contents: Any, x_range: Sequence[float], y_range: Sequence[float]) -> rrb.View:
+    """Return a view of a drawing in chart units.
+
+    Parameters
+    ----------
+    origin
+        Path of the entity.
+    name
+        Title of the view.
+    contents
+        Entities to show.
+    x_range, y_range
+        Limits of the view.
+    """
+    return rrb.Spatial2DView(
+        origin=origin,
+        contents=contents,
+        name=name,
+        background=rrb.Background(color=colours.BACKGROUND),
+        visual_bounds=rrb.VisualBounds2D(x_range=list(x_range), y_range=list(y_range)),
+    )
+
+
+def collapsed_blueprint(root: rrb.Container, timeline: str) -> rrb.Blueprint:
+    """Return a layout with collapsed panels around ``root``, which follows a timeline."""
+    return rrb.Blueprint(
+        root,
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline=timeline, play_state="following"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def markdown(text: str) -> rr.TextDocument:
+    """Return a Markdown document."""
+    return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
+
+
+def temperature_view(device: str) -> rrb.TimeSeriesView:
+    """Return the view of the temperature of a device."""
+    return time_series_view(f"/{device}/temperature", "Temperature, °C")
+
+
+def _before_cursor(seconds: float) -> rrb.TimeAxis:
+    """Return a time axis of the last seconds, with space on the right for a tick label at the cursor."""
+    first, last = (rr.TimeRangeBoundary.cursor_relative(seconds=s) for s in (-seconds, HALF_LABEL_SHARE * seconds))
+    return rrb.TimeAxis(view_range=rr.TimeRange(first, last))
+
+
+def _until_cursor() -> rrb.TimeAxis:
+    """Return a time axis from the beginning to the cursor."""
+    now = rr.TimeRangeBoundary.cursor_relative()
+    return rrb.TimeAxis(view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), now))

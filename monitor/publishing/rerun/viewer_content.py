@@ -1,0 +1,138 @@
+"""Content of the Rerun viewer: the panels of all devices, which log their results as entities of one stream.
+
+Results are logged as columns and drawings under the paths listed in the README, on the timeline ``sample_time``. A call
+may block in Rerun while the viewer does not read. Only the thread of the viewer may therefore call this module.
+Importing this module imports Rerun, which takes half a second.
+"""
+
+from collections.abc import Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+import rerun as rr
+
+from drivers.data_types import Floats
+from monitor.common.device_health import Health
+from monitor.history.history_table import HistoryTable
+from monitor.publishing.rerun import result_panels as panels
+from monitor.publishing.rerun.result_panels import Panel
+from monitor.publishing.rerun.shared_views import TIMELINE
+from monitor.publishing.rerun.viewer_settings import DeviceInfo
+from monitor.publishing.result_kinds import RESULT_KINDS, TimedResult
+
+P = TypeVar("P", bound=Panel)
+PANELS: tuple[type[Panel], ...] = tuple(
+    getattr(panels, drawing.panel) for kind in RESULT_KINDS for drawing in kind.drawings
+)
+"""Classes of all panels."""
+
+
+class Scene:
+    """Panels of all devices in one Rerun stream. The class is not thread-safe, and its methods may block.
+
+    Parameters
+    ----------
+    stream
+        Stream of the viewer.
+    fleet
+        True if further devices have only a row in the table of all devices.
+    """
+
+    def __init__(self, stream: rr.RecordingStream, fleet: bool = False) -> None:
+        self.fleet = fleet
+        self.devices: dict[str, DeviceInfo] = {}  # devices that are shown
+        self.healths: dict[str, Health] = {}  # newest health of each shown device
+        self._stream = stream
+        self._panels: dict[tuple[str, type[Panel]], Panel] = {}
+
+    def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
+        """Set the devices to show. Later data of a removed device are still drawn."""
+        self.devices = {one.name: one for one in devices}
+        self.healths = {name: health for name, health in self.healths.items() if name in self.devices}
+        for name in self.devices:
+            for kind in PANELS:
+                self.panel(name, kind).log_styles()
+
+    def panel(self, device: str, kind: type[P]) -> P:
+        """Return a panel of a device. Create the panel if it does not exist.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        kind
+            Class of the panel.
+        """
+        found = self._panels.get((device, kind))
+        if not isinstance(found, kind):
+            found = self._panels[device, kind] = kind(self, device)
+        return found
+
+    def draw(self, device: str, panel: str, results: Sequence[TimedResult]) -> None:
+        """Draw results of a device.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        panel
+            Name of the class of the panel.
+        results
+            At least one result with its Unix time [s], in order of time.
+        """
+        kind: type[Panel] = getattr(panels, panel)
+        self.panel(device, kind).draw(np.array([unix_s for unix_s, _ in results]), [one for _, one in results])
+
+    def draw_history(self, device: str, history: HistoryTable) -> None:
+        """Draw the stored history of a device.
+
+        A line has a gap where buckets are missing. After the last bucket, live data form a separate line.
+
+        Parameters
+        ----------
+        device
+            Name of the device.
+        history
+            The history.
+        """
+        for kind in PANELS:
+            self.panel(device, kind).draw_history(history)
+
+    def set_time(self, unix_s: float) -> None:
+        """Set the Unix time [s] of the following log calls."""
+        self._stream.set_time(TIMELINE, timestamp=_timestamps(np.array([unix_s]))[0])
+
+    def log(self, path: str, *entities: Any, static: bool = False) -> None:
+        """Log an entity.
+
+        Parameters
+        ----------
+        path
+            Path of the entity.
+        *entities
+            Components of the entity.
+        static
+            True if the entity does not change with time.
+        """
+        self._stream.log(path, *entities, static=static)
+
+    def log_scalars(self, path: str, unix_s: Floats, values: Floats) -> None:
+        """Log one or several time series.
+
+        Parameters
+        ----------
+        path
+            Path of the entity.
+        unix_s
+            Unix times [s], shape [n].
+        values
+            Values, shape [n] or [n, series].
+        """
+        if unix_s.size:
+            time = rr.TimeColumn(TIMELINE, timestamp=_timestamps(unix_s))
+            self._stream.send_columns(path, [time], rr.Scalars.columns(scalars=values))
+
+
+def _timestamps(unix_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":
+    """Convert Unix times in seconds to nanosecond timestamps."""
+    return np.round(unix_s * 1e9).astype("datetime64[ns]")

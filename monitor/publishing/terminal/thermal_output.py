@@ -1,0 +1,210 @@
+"""Results of thermal model fits and predictions, as tables for the terminal and as JSON."""
+
+import math
+from typing import Any, Final
+
+import numpy as np
+from rich.console import Console
+from rich.padding import Padding
+
+from monitor.common.units import DEVIATION_UNITS, format_duration, format_rate, sensor_kind
+from monitor.drift.thermal.interval_means import IntervalMeans
+from monitor.drift.thermal.temperature_removal import SLOW_LETTERS, TemperatureRemoval
+from monitor.drift.thermal.thermal_fit import ThermalFit
+from monitor.drift.thermal.thermal_response import ThermalModelForm
+from monitor.drift.thermal.thermal_results import ComparisonWithMeans, ThermalFitReport, ThermalPredictionReport
+from monitor.publishing.coefficient_cells import format_coefficient
+from monitor.publishing.messages.message import encode_json
+from monitor.publishing.terminal.tables import plain_table, print_notes
+
+FIT_SCHEMA: Final = "imu-monitor/thermal-fit/1"
+PREDICT_SCHEMA: Final = "imu-monitor/thermal-predict/1"
+ONE_WAY: Final = "temperature only rose or only fell, so neither a time lag nor hysteresis can be determined"
+DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time would look the same"
+
+
+def print_thermal_fit(study: ThermalFitReport, console: Console) -> None:
+    """Print the results of a thermal model fit.
+
+    Parameters
+    ----------
+    study
+        The fitted models.
+    console
+        Destination.
+    """
+    console.print(_summary_line(study.recording, study.interval_s, study.means), highlight=False)
+    if study.fits:
+        rows = plain_table("axis", "model", wrapped=("per °C", "late by", "loop", "leaves", "explains", "validated"))
+        for axis, one in study.fits.items():
+            rows.add_row(axis, *_fit_row(axis, one))
+        console.print(Padding(rows, (1, 0)))
+        console.print(
+            "loop: largest difference between heating and cooling, if noise does not explain it. leaves: rms of the "
+            "means minus the model. validated: rms on parts of the record that are predicted from the other parts "
+            "(and its ratio to that of a cubic).",
+            style="dim",
+        )
+    one_way = [axis for axis, one in study.fits.items() if not one.temperature_rose_and_fell]
+    notes = (*study.notes, *notes_on_hysteresis(study), *([ONE_WAY] if one_way else []))
+    _print_notes(study.refused, notes, console)
+
+
+def print_thermal_prediction(outlook: ThermalPredictionReport, console: Console) -> None:
+    """Print the predictions of thermal models for a recording, and their errors.
+
+    Parameters
+    ----------
+    outlook
+        The predictions.
+    console
+        Destination.
+    """
+    console.print(_summary_line(outlook.recording, outlook.interval_s, outlook.means), highlight=False)
+    if outlook.judged:
+        rows = plain_table(
+            "axis", wrapped=("rms alone", "multi-step", "offset out", "one-step", "offset", "within 95 %")
+        )
+        for axis, one in outlook.judged.items():
+            each = (one.rms_about_mean, one.rms, one.rms_without_offset, one.rms_one_step, one.offset)
+            rows.add_row(axis, *(_format_deviation(axis, x) for x in each), f"{100.0 * one.coverage:.0f} %")
+        console.print(Padding(rows, (1, 0)))
+    _print_notes(outlook.refused, outlook.notes, console)
+
+
+def temperature_notes(found: TemperatureRemoval) -> list[str]:
+    """Return a sentence for each axis on which temperature explains most of the slow variance, or much of K or R."""
+    notes = []
+    for axis, one in found.dependences.items():
+        fallen = [
+            f"{letter} falls from {before.value} to {after.value} {after.unit} ({100.0 * share:.0f} % of its variance)"
+            for letter in SLOW_LETTERS
+            if found.has_decreased_significantly(letter, axis)
+            and (share := found.variance_share(letter, axis)) is not None
+            for before, after in [
+                (format_coefficient(found.before, letter, axis), format_coefficient(found.coefficients, letter, axis))
+            ]
+        ]
+        without = f"without temperature ({found.models.get(axis, '')}), {' and '.join(fallen)}" if fallen else ""
+        if one.explains_most:
+            share_text = f"{math.floor(100.0 * one.share):d} %"
+            notes.append(
+                f"{axis} follows its temperature: a {one.form} explains {share_text} of the variance of means of "
+                f"{format_duration(one.interval_s)}, so Q N B K R describe temperature as well as noise"
+                f"{'; ' + without if without else ''}; imu-monitor thermal fit models it"
+                f"{'' if not one.one_way else f' ({DRIFT_WITH_TIME})'}"
+            )
+        elif without:
+            notes.append(f"{axis} follows its temperature in part: {without}")
+    return notes
+
+
+def notes_on_hysteresis(study: ThermalFitReport) -> list[str]:
+    """Return a sentence for each axis on which the bias differs significantly between heating and cooling."""
+    return [
+        f"{axis}: at one temperature the bias differs between heating and cooling by up to "
+        f"{format_rate(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
+        for axis, one in study.fits.items()
+        if one.hysteresis and one.hysteresis_p is not None
+    ]
+
+
+def encode_thermal_fit(study: ThermalFitReport) -> bytes:
+    """Encode the results of a thermal model fit as JSON, in SI units."""
+    axes: dict[str, Any] = {}
+    for axis, one in study.fits.items():
+        model = one.model
+        axes[axis] = {
+            "model": model.shape.name,
+            "reference": model.reference_c,
+            "sizes": model.coefficients.tolist(),
+            "time_constants": list(model.shape.constants_s),
+            "equation": model.equation,
+            "slope": model.mean_slope,
+            "hysteresis": one.hysteresis,
+            "hysteresis_p": one.hysteresis_p,
+            "both_directions": one.temperature_rose_and_fell,
+            "explained": one.explained,
+            "phi": model.phi,
+            "candidates": [
+                {"model": each.shape.name, "aicc": each.aicc, "rms": each.rms, "validated": each.validated}
+                for each in one.candidates
+            ],
+            "temperature": study.means[axis].temperature_c,
+            "bias": study.means[axis].bias,
+            "error": study.means[axis].error,
+        }
+    return _json(FIT_SCHEMA, study.recording, study.interval_s, axes, study.refused, study.notes)
+
+
+def encode_thermal_prediction(outlook: ThermalPredictionReport) -> bytes:
+    """Encode predictions and measured means as JSON, in SI units."""
+    axes = {axis: _prediction_of_axis(outlook.means[axis], one) for axis, one in outlook.judged.items()}
+    return _json(PREDICT_SCHEMA, outlook.recording, outlook.interval_s, axes, outlook.refused, outlook.notes)
+
+
+def _prediction_of_axis(means: IntervalMeans, one: ComparisonWithMeans) -> dict[str, Any]:
+    """Return the prediction errors and the predicted and measured bias of one axis."""
+    return {
+        "rms": one.rms,
+        "rms_offset_out": one.rms_without_offset,
+        "rms_one_step": one.rms_one_step,
+        "rms_alone": one.rms_about_mean,
+        "offset": one.offset,
+        "within": one.coverage,
+        "temperature": means.temperature_c,
+        "bias": means.bias,
+        "multi_step": one.multi_step,
+        "one_step": one.one_step,
+    }
+
+
+def _json(
+    schema: str, recording: str, interval_s: float, axes: dict[str, Any], refused: Any, notes: tuple[str, ...]
+) -> bytes:
+    """Encode the common keys and the results of the axes."""
+    whole = {
+        "schema": schema,
+        "recording": recording,
+        "interval": interval_s,
+        "axes": axes,
+        "refused": dict(refused),
+        "notes": list(notes),
+    }
+    return encode_json(whole)
+
+
+def _summary_line(recording: str, interval_s: float, means: Any) -> str:
+    """Return one line with the recording, the number and length of the intervals, and the temperature range."""
+    first: IntervalMeans = next(iter(means.values()))
+    count = first.bias.size
+    warmth = first.temperature_c
+    span = f"{np.nanmin(warmth):.1f} … {np.nanmax(warmth):.1f} °C" if np.isfinite(warmth).any() else "no temperature"
+    return f"{recording}: {count} intervals of {format_duration(interval_s)}, {span}"
+
+
+def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
+    """Return the cells of one fitted axis."""
+    model, best = one.model, one.candidates[0]
+    cubic = next((each.validated for each in one.candidates if each.shape == ThermalModelForm(3, ())), None)
+    return (
+        model.shape.name,
+        _format_deviation(axis, model.mean_slope) if model.shape != ThermalModelForm(0, ()) else "—",
+        ", ".join(format_duration(each) for each in model.shape.constants_s) or "—",
+        "—" if not one.hysteresis else _format_deviation(axis, one.hysteresis),
+        _format_deviation(axis, best.rms),
+        f"{100.0 * one.explained:.0f} %",
+        _format_deviation(axis, best.validated) + (f" ({best.validated / cubic:.2g})" if cubic else ""),
+    )
+
+
+def _format_deviation(axis: str, si: float) -> str:
+    """Format a rate or an acceleration in the unit of the axis."""
+    return DEVIATION_UNITS[sensor_kind(axis)].text(si)
+
+
+def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:
+    """Print the reasons for axes without a model, and the notes."""
+    for axis, reason in refused.items():
+        console.print(f"{axis}: {reason}", highlight=False, soft_wrap=True)
+    print_notes(notes, console)

@@ -1,0 +1,321 @@
+"""Conversion of a search into the result of an axis: effects with parameters, confidence and justification."""
+
+from math import erf, exp, inf, log
+from typing import Final
+
+from monitor.common.distributions import Z95
+from monitor.noise.effect import Effect, Leak
+from monitor.noise.effects import (
+    EFFECTS,
+    BandwidthLimit,
+    BiasStep,
+    ExponentiallyCorrelated,
+    Narrowband,
+    ScaleFactor,
+    Sinusoidal,
+    TemperatureBias,
+    TemperatureLag,
+    TurnOnTransient,
+)
+from monitor.reconcile.diagnostics.null_distribution import AxisNull, measure_gaps
+from monitor.reconcile.likelihood.effect_roles import MOST_DIRECT_DIAGNOSTIC, SIZE_PARAMETERS, size
+from monitor.reconcile.likelihood.hypothesis import Hypothesis, shape_interval, size_interval
+from monitor.reconcile.result import (
+    AddedOrResizedEffect,
+    AxisResult,
+    Decision,
+    DiagnosticGap,
+    DiagnosticSnapshot,
+    Location,
+    ParameterInterval,
+    RunnerUp,
+    StepKind,
+)
+from monitor.reconcile.search.search import AxisDiagnostics, AxisSearchResult, SearchRound
+from monitor.reconcile.search.trials import RETUNE, Trial
+
+SHAPE_PARAMETERS: Final[dict[type[Effect], tuple[str, ...]]] = {
+    ExponentiallyCorrelated: ("correlation_time",),
+    Narrowband: ("frequency", "bandwidth"),
+    Sinusoidal: ("frequency",),
+    TemperatureLag: ("time_constant",),
+    TurnOnTransient: ("time_constant",),
+    BiasStep: ("time",),
+    BandwidthLimit: ("cutoff",),
+    ScaleFactor: ("factor",),
+}
+"""For each effect, the shape parameters that are reported with an interval."""
+MAX_RUNNERS_UP: Final = 3
+MIN_RUNNER_UP_CONFIDENCE: Final = 0.001
+"""Smallest confidence with which an alternative effect is reported."""
+
+
+def describe_axis(search: AxisSearchResult, null: AxisNull, final: AxisNull) -> AxisResult:
+    """Return the result of one axis.
+
+    Parameters
+    ----------
+    search : AxisSearchResult
+        Search on the axis.
+    null : AxisNull
+        Null distributions under the model under test, for the diagnostics before and during the search.
+    final : AxisNull
+        Null distributions under the extended model, which decide whether a remaining difference is significant.
+    """
+    snapshots = [_snapshot(one.before, null) for one in search.rounds]
+    end = _snapshot(search.final, final)
+    snapshots.append(end if search.before_withdrawal is None else _snapshot(search.before_withdrawal, null))
+    steps = tuple(
+        _describe_step(search, search.rounds[at], index, kind, snapshots[at], snapshots[at + 1])
+        for at, index, kind in _remaining_changes(search)
+    )
+    left_over = (*(gap for gap in end.gaps if gap.is_significant), *_noise_floor_gap(search, end))
+    decision = _axis_decision(bool(steps), bool(left_over))
+    return AxisResult(search.hypothesis.axis.name, decision, snapshots[0], steps, left_over, end)
+
+
+def _snapshot(diagnostics: AxisDiagnostics, null: AxisNull) -> DiagnosticSnapshot:
+    """Return the gaps and the plots of an axis."""
+    return DiagnosticSnapshot(measure_gaps(diagnostics.findings, null), diagnostics.plots)
+
+
+def _remaining_changes(search: AxisSearchResult) -> list[tuple[int, int, StepKind]]:
+    """Return the round, the effect and the kind of each change that remains at the end of the search.
+
+    The round and the effect are indices.
+    """
+    hypothesis = search.hypothesis
+    found: list[tuple[int, int, StepKind]] = []
+    left = list(range(hypothesis.given_count, len(hypothesis.effects)))
+    resized: tuple[int, ...] = ()
+    for at, one in enumerate(search.rounds):
+        last = one.hypothesis.effects[-1]
+        index = next((i for i in left if type(hypothesis.effects[i]) is type(last)), None)
+        if index is not None and one.hypothesis.added and one.trials[0].effect is not None:
+            left.remove(index)
+            found.append((at, index, "added"))
+        for noise in one.hypothesis.fit.fitted_noise:
+            if noise < hypothesis.given_count and noise not in resized and noise in hypothesis.fit.fitted_noise:
+                found.append((at, noise, "retuned"))
+        resized = one.hypothesis.fit.fitted_noise
+    return found
+
+
+def _noise_floor_gap(search: AxisSearchResult, end: DiagnosticSnapshot) -> tuple[DiagnosticGap, ...]:
+    """Return the gap of the white noise floor after an added low-pass filter, if the gap is significant.
+
+    No effect describes this noise, so a significant noise floor is reported as an unexplained difference. The gap
+    follows from the gain of the noise floor. It is limited to the largest gap of the spectrum during the search.
+    """
+    hypothesis, axis = search.hypothesis, search.hypothesis.axis
+    limit = next((effect for effect in hypothesis.added if isinstance(effect, BandwidthLimit)), None)
+    if limit is None or not hypothesis.fit.noise_floor_variance > 0.0:
+        return ()
+    without = axis.fit(hypothesis.effects, hypothesis.fit.fixed_noise, noise_floor=False)
+    most = max(one.before.findings["psd"].gain for one in search.rounds)
+    gain = max(min(hypothesis.fit.log_likelihood - without.log_likelihood, most), 0.0)
+    psd = _gap_of("psd", end)
+    place = Location(frequency=(limit.cutoff, 0.5 * axis.rate_hz))
+    gap = DiagnosticGap("psd", place, (2.0 * gain) ** 0.5, psd.null95, psd.threshold)
+    return (gap,) if gap.is_significant else ()
+
+
+def _gap_of(lens: str, snapshot: DiagnosticSnapshot) -> DiagnosticGap:
+    """Return the gap of one diagnostic."""
+    return next(gap for gap in snapshot.gaps if gap.lens == lens)
+
+
+def _axis_decision(changed: bool, left_over: bool) -> Decision:
+    """Return the decision for an axis.
+
+    ``changed`` is True if effects were added or resized. ``left_over`` is True if a significant difference remains.
+    """
+    if left_over:
+        return "partly_explained" if changed else "unexplained"
+    return "explained" if changed else "agrees"
+
+
+def _describe_step(
+    search: AxisSearchResult,
+    done: SearchRound,
+    index: int,
+    kind: StepKind,
+    before: DiagnosticSnapshot,
+    after: DiagnosticSnapshot,
+) -> AddedOrResizedEffect:
+    """Return the description of one effect that was added or resized."""
+    effect, trial = search.hypothesis.effects[index], done.trials[0]
+    gap = _triggering_gap(effect, kind, before)
+    later = _gap_of(gap.lens, after)
+    confidence, others = _confidence_and_runners_up(effect.name if kind == "added" else RETUNE, done.trials)
+    if kind == "retuned" and trial.name != RETUNE:  # an effect was added in the same round
+        confidence, others = _resize_confidence(search.hypothesis, index), ()
+    held_out_before, held_out_after = _held_out_gaps(done, gap, later)
+    return AddedOrResizedEffect(
+        kind=kind,
+        effect=effect.name,
+        parameters=_parameters_with_bounds(search.hypothesis, index, trial, kind),
+        confidence=confidence,
+        runners_up=others,
+        before=gap,
+        after=later,
+        held_out_before=held_out_before,
+        held_out_after=held_out_after,
+        held_out_reason=done.validation.reason,
+        because=_justification(effect, kind, gap, later, others, trial),
+        snapshot_after=after,
+    )
+
+
+def _held_out_gaps(
+    done: SearchRound, gap: DiagnosticGap, later: DiagnosticGap
+) -> tuple[DiagnosticGap | None, DiagnosticGap | None]:
+    """Return the gaps of the cross-validation before and after a round, or None without cross-validation."""
+    validation = done.validation
+    if validation.reason:
+        return None, None
+    return (
+        DiagnosticGap(gap.lens, gap.where, validation.before, gap.null95, gap.threshold),
+        DiagnosticGap(gap.lens, gap.where, validation.after, later.null95, later.threshold),
+    )
+
+
+def _triggering_gap(effect: Effect, kind: StepKind, before: DiagnosticSnapshot) -> DiagnosticGap:
+    """Return the gap that led to an effect.
+
+    If the most direct diagnostic of the effect has a significant gap, this gap is returned. Otherwise, the result is
+    the gap that is largest relative to its threshold.
+    """
+    significant = [gap for gap in before.gaps if gap.is_significant] or list(before.gaps)
+    most_direct = MOST_DIRECT_DIAGNOSTIC.get(effect.name) if kind == "added" else "psd"
+    for gap in significant:
+        if gap.lens == most_direct:
+            return gap
+    return max(significant, key=lambda gap: gap.gap / max(gap.threshold, 1e-9))
+
+
+def _confidence_and_runners_up(name: str, trials: tuple[Trial, ...]) -> tuple[float, tuple[RunnerUp, ...]]:
+    """Return the probability of an effect and of the most probable alternatives.
+
+    The probabilities are proportional to the exponentials of the trial scores. One alternative is the absence of any
+    effect, with the score 0.
+    """
+    best: dict[str, float] = {"": 0.0}
+    for trial in trials:
+        best[trial.name] = max(best.get(trial.name, -inf), trial.score)
+    top = max(best.values())
+    whole = sum(exp(value - top) for value in best.values())
+    chances = {other: exp(value - top) / whole for other, value in best.items()}
+    others = sorted(
+        (chance, other)
+        for other, chance in chances.items()
+        if other in EFFECTS and other != name and chance >= MIN_RUNNER_UP_CONFIDENCE
+    )
+    runners_up = tuple(RunnerUp(other, chance) for chance, other in reversed(others[-MAX_RUNNERS_UP:]))
+    return chances.get(name, chances[max(best, key=lambda one: best[one])]), runners_up
+
+
+def _resize_confidence(hypothesis: Hypothesis, index: int) -> float:
+    """Return the probability that the true size of an effect differs from the size in the model.
+
+    The probability follows from the difference of the logarithms of both sizes, in standard errors.
+    """
+    now, before = size(hypothesis.effects[index]), size(hypothesis.model[index])
+    error = hypothesis.fit.size_error(index)
+    if not (now > 0.0 and before > 0.0 and error > 0.0):
+        return 1.0  # one of the sizes is zero
+    return erf(abs(log(now / before)) * now / error / 2.0**0.5)
+
+
+def _parameters_with_bounds(
+    hypothesis: Hypothesis, index: int, trial: Trial, kind: StepKind
+) -> dict[str, ParameterInterval]:
+    """Return the parameters of an effect with 95 % intervals."""
+    effect = hypothesis.effects[index]
+    if kind == "added" and trial.intervals and trial.name == effect.name:
+        return dict(trial.intervals)
+    found: dict[str, ParameterInterval] = {}
+    if isinstance(effect, Leak):
+        found["source"] = ParameterInterval(effect.source)
+    size_name = SIZE_PARAMETERS.get(type(effect))
+    if size_name is not None:
+        found[size_name] = size_interval(hypothesis.fit, index)
+    if isinstance(effect, TemperatureBias):
+        found["reference"] = ParameterInterval(effect.reference)
+        if effect.quadratic is not None:
+            found["quadratic"] = _quadratic_bounds(hypothesis, index)
+    for shape in SHAPE_PARAMETERS.get(type(effect), ()) if kind == "added" else ():
+        found[shape] = shape_interval(hypothesis.fit, index, shape)
+    if isinstance(effect, BandwidthLimit):
+        found["order"] = ParameterInterval(float(effect.order))
+    if isinstance(effect, Sinusoidal) and effect.phase is not None and effect.amplitude > 0.0:
+        # the frequency is fitted too, which doubles the phase error at the start of a recording (Rife & Boorstyn 1974)
+        error = 2.0 * Z95 * hypothesis.fit.size_error(index) / effect.amplitude
+        found["phase"] = ParameterInterval(effect.phase, effect.phase - error, effect.phase + error)
+    return found
+
+
+def _quadratic_bounds(hypothesis: Hypothesis, index: int) -> ParameterInterval:
+    """Return the quadratic temperature coefficient with the 95 % interval."""
+    fitted = hypothesis.fit.whittle
+    column = next(place for at, place in hypothesis.fit.regressor_slices if at == index).start + 1
+    value = float(fitted.beta[column])
+    error = Z95 * float(fitted.beta_covariance[column, column]) ** 0.5
+    return ParameterInterval(value, value - error, value + error)
+
+
+EVIDENCE_TEXT: Final = {
+    "values": "The measured values are quantized, clipped or repeated",
+    "psd": "The power differs from the spectrum of the model",
+    "lines": "The spectrum contains a steady oscillation",
+    "autocorrelation": "Successive samples are correlated more than the model allows",
+    "level": "The level changes more than the model allows",
+    "temperature": "The level depends on the temperature",
+    "other_axes": "The axis contains a share of another axis",
+    "tails": "The samples have heavier tails than Gaussian noise",
+    "variance": "The variance of the noise changes in time",
+    "spectrogram": "The power in a frequency band changes in time",
+}
+"""For each diagnostic, the text that describes its evidence."""
+
+
+def _justification(
+    effect: Effect,
+    kind: StepKind,
+    gap: DiagnosticGap,
+    after: DiagnosticGap,
+    others: tuple[RunnerUp, ...],
+    trial: Trial,
+) -> str:
+    """Return the sentences that justify an effect."""
+    gaps = f"the gap is {gap.gap:.1f}, and a true model stays below {gap.threshold:.1f}"
+    sentences = [f"{EVIDENCE_TEXT[gap.lens]}{_location_text(gap)}: {gaps}."]
+    if kind == "retuned":
+        sentences.append(f"With another size of {effect.name}, which the model has, the gap is {after.gap:.1f}.")
+        return " ".join(sentences)
+    sentences.append(f"With {effect.name}, the gap is {after.gap:.1f}.")
+    if trial.event_count and trial.name == effect.name:
+        sentences.append(f"The number of detected events is {trial.event_count}.")
+    if others:
+        phrase = _comparison_phrase(others[0].confidence)
+        sentences.append(f"The effect {others[0].effect} explains the difference {phrase}.")
+    return " ".join(sentences)
+
+
+def _comparison_phrase(confidence: float) -> str:
+    """Return a phrase that compares an alternative with the chosen effect."""
+    return "nearly as well" if confidence > 0.2 else "less well" if confidence > 0.01 else "clearly less well"
+
+
+def _location_text(gap: DiagnosticGap) -> str:
+    """Return a phrase for the location of a gap, or an empty string."""
+    place = gap.where
+    if place.frequency is not None:
+        lo, hi = place.frequency
+        middle, wide = 0.5 * (lo + hi), hi - lo
+        return f" at {middle:.5g} Hz" if wide < 0.05 * middle else f" from {lo:.3g} to {hi:.3g} Hz"
+    if place.source is not None:
+        return f" ({place.source})"
+    if place.time is not None and gap.lens in ("level", "variance") and place.time[1] - place.time[0] < 1e3:
+        return f" near {0.5 * (place.time[0] + place.time[1]):.5g} s"
+    return ""

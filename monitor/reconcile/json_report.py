@@ -1,0 +1,115 @@
+"""JSON report of a reconciliation: ``report.json``, schema imu-monitor/reconcile/1.
+
+Equal reconciliations give equal bytes. Numbers are in SI units, and times are in seconds from the start of the
+recording. A number that is not finite becomes null, because JSON cannot represent it. A parameter that names an axis
+has a value and no interval.
+
+``steps`` contains one entry for each effect that was added or resized. In each entry, ``found`` is the difference that
+led to the step, with the threshold of the model before the step. ``gap`` contains the gap of the same diagnostic before
+and after the step, with the threshold of the model after the step. ``scores`` contains all diagnostics. For an axis,
+``scores`` is the comparison with the model under test. For a step, ``scores`` is the comparison after the step.
+"""
+
+from math import isfinite
+from typing import Any, Final
+
+import msgspec
+
+from drivers.data_types import AXES
+from monitor.reconcile.result import (
+    AddedOrResizedEffect,
+    AxisResult,
+    DiagnosticGap,
+    Location,
+    ParameterInterval,
+    Reconciliation,
+)
+
+SCHEMA: Final = "imu-monitor/reconcile/1"
+_JSON_ENCODER: Final = msgspec.json.Encoder()
+
+
+def encode_report(r: Reconciliation) -> bytes:
+    """Encode a reconciliation as JSON, with the axes in the order of ``AXES``."""
+    return _JSON_ENCODER.encode({
+        "schema": SCHEMA,
+        "verdict": r.verdict,
+        "rate": finite_or_none(r.rate_hz),
+        "samples": int(r.samples),
+        "seconds": finite_or_none(r.duration_s),
+        "seed": int(r.seed),
+        "fitted_first": bool(r.fitted_first),
+        "notes": r.notes,
+        "axes": {axis: _axis_entry(r.axes[axis]) for axis in AXES if axis in r.axes},
+    })  # fmt: skip
+
+
+def _axis_entry(result: AxisResult) -> dict[str, Any]:
+    """Return the report entry of one axis."""
+    return {
+        "verdict": result.verdict,
+        "steps": [_step_entry(step) for step in result.steps],
+        "left_over": [_gap_and_location_entry(gap) for gap in result.left_over],
+        "scores": [_gap_and_location_entry(gap) for gap in result.start.gaps],
+    }
+
+
+def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
+    """Return the report entry of one effect that was added or resized."""
+    held_out = _gap_entry(step.held_out_before, step.held_out_after)
+    return {
+        "found": _gap_and_location_entry(step.before),
+        "kind": step.kind,
+        "effect": step.effect,
+        "parameters": {name: parameter_entry(bounds) for name, bounds in step.parameters.items()},
+        "confidence": finite_or_none(step.confidence),
+        "runners_up": [{"effect": one.effect, "confidence": finite_or_none(one.confidence)} for one in step.runners_up],
+        "gap": _gap_entry(step.before, step.after),
+        "held_out_gap": held_out,
+        **({} if held_out else {"held_out_reason": step.held_out_reason}),
+        "because": step.because,
+        "scores": [_gap_and_location_entry(gap) for gap in step.snapshot_after.gaps],
+    }
+
+
+def _gap_entry(before: DiagnosticGap | None, after: DiagnosticGap | None) -> dict[str, float | None] | None:
+    """Return the gaps before and after a step, or None if one of them is unknown."""
+    if before is None or after is None:
+        return None
+    return {
+        "before": finite_or_none(before.gap),
+        "after": finite_or_none(after.gap),
+        "null95": finite_or_none(after.null95),
+        "threshold": finite_or_none(after.threshold),
+    }
+
+
+def _gap_and_location_entry(gap: DiagnosticGap) -> dict[str, Any]:
+    """Return the report entry of one gap of a diagnostic."""
+    return {
+        "lens": gap.lens,
+        "where": _where_entry(gap.where),
+        "gap": finite_or_none(gap.gap),
+        "null95": finite_or_none(gap.null95),
+        "threshold": finite_or_none(gap.threshold),
+    }
+
+
+def _where_entry(where: Location) -> dict[str, Any]:
+    """Return the report entry of a location."""
+    return {
+        name: place if isinstance(place, str) else [finite_or_none(end) for end in place]
+        for name, place in where.resolved_dimensions().items()
+    }
+
+
+def parameter_entry(bounds: ParameterInterval) -> dict[str, Any]:
+    """Return the report entry of a parameter."""
+    if isinstance(bounds.value, str):
+        return {"value": bounds.value}
+    return {"value": finite_or_none(bounds.value), "lo": finite_or_none(bounds.lo), "hi": finite_or_none(bounds.hi)}
+
+
+def finite_or_none(value: float | None) -> float | None:
+    """Return the value as a Python float, which the encoder accepts, or None if the value is not finite."""
+    return None if value is None or not isfinite(value) else float(value)

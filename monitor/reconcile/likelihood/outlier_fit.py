@@ -1,0 +1,314 @@
+"""Detection of outliers among white residuals, and tests against other causes of heavy tails.
+
+Three distributions are fitted to the magnitudes of a white series: a Gaussian, a mixture of two Gaussians (Tukey 1960)
+and Student's t. The mixture is (1−f) N(0, s²) + f N(0, s² + scale²) with the fraction f of outliers. True outliers fit
+the mixture better than the other two distributions, and they are equally likely at all times. Outliers in successive
+samples indicate bursts or jumps. A rate of outliers that varies from hour to hour indicates noise with a changing
+variance. The caller decides whether the gains suffice.
+
+The magnitudes are collected in bins, so that the computing time of the fits does not grow with the recording. Up to six
+standard deviations, a bin is a fortieth of a standard deviation wide. Wider bins follow, each 3 % wider than the bin
+before. The mean square of each bin is stored, so that the bins lose almost no information.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import bdtrc, chdtrc, gammaln, ndtr, ndtri, pdtrc
+
+from drivers.data_types import Floats, Ints
+from monitor.common.compiled import compiled
+from monitor.common.distributions import NORMAL_QUARTILE, Z95
+from monitor.reconcile.preparation.value_statistics import Mask, ValueWithInterval
+
+LINEAR_BINS: Final = 240
+LINEAR_RANGE_SIGMA: Final = 6.0
+"""Magnitude, in standard deviations, up to which the bins have equal width."""
+TOTAL_BINS: Final = 1024
+BINS_PER_LOG_UNIT: Final = 34.0
+"""Number of bins per natural logarithmic unit beyond the linear range. The last bin ends at 6·10¹⁰ standard
+deviations.
+"""
+BIN_EDGES: Final = np.concatenate(
+    [
+        np.arange(LINEAR_BINS) * LINEAR_RANGE_SIGMA / LINEAR_BINS,
+        LINEAR_RANGE_SIGMA * np.exp(np.arange(TOTAL_BINS - LINEAR_BINS + 1) / BINS_PER_LOG_UNIT),
+    ]
+)
+"""Edges of the bins, in standard deviations."""
+START_WIDTHS: Final = np.array([1.3, 1.6, 2.0, 2.6, 3.4, 5.0, 8.0, 15.0, 40.0, 200.0, 3000.0])
+"""Starting values of the EM algorithm: standard deviation of the wide component relative to the narrow one."""
+NEIGHBOUR_SAMPLES: Final = 4
+"""Largest distance in samples of two outliers that count as neighbours."""
+STUDENT_FREEDOMS: Final = np.geomspace(1.0, 300.0, 40)
+MIN_MIXTURE_GAIN_NATS: Final = 0.01
+MAX_Z: Final = 37.0
+"""Value of z for a probability that underflows in 64 bits."""
+
+
+@dataclass(frozen=True, slots=True)
+class OutlierFit:
+    """Fit of a mixture of two Gaussians, with its alternatives."""
+
+    fraction: ValueWithInterval
+    scale: ValueWithInterval  # standard deviation of the error that is added to a sample
+    mask: Mask  # [n] True for samples that are more likely outliers than not
+    count: int  # number of samples in the mask
+    gain: float  # log-likelihood gain over one Gaussian, nats
+    gain_over_student: float  # log-likelihood gain over Student's t, nats; the mixture has one more parameter
+    clustering_z: float  # z of the clustering of outliers, corrected for the number of tests
+    misfit_z: float  # z of the misfit between the magnitudes and the mixture
+
+
+def fit_outliers(w: Floats) -> OutlierFit | None:
+    """Fit a mixture of two Gaussians to white residuals.
+
+    Parameters
+    ----------
+    w : ndarray of float64, shape (n,)
+        White residuals. NaN values are ignored.
+
+    Returns
+    -------
+    OutlierFit or None
+        The best mixture, or None if a single Gaussian fits no worse.
+
+    Examples
+    --------
+    >>> rng = np.random.default_rng(0)
+    >>> w = rng.standard_normal(20_000)
+    >>> w[::400] += 8.0 * rng.standard_normal(50)
+    >>> found = fit_outliers(w)
+    >>> print(f"{found.fraction.value:.4f} {found.scale.value:.1f}", found.gain > 100.0, found.gain_over_student > 5.0)
+    0.0023 7.2 True True
+    """
+    good = np.isfinite(w)
+    n = int(good.sum())
+    some = np.abs(w[good][:: max(1, n // 20_000)])
+    unit = float(np.median(some)) / NORMAL_QUARTILE if n >= 100 else 0.0
+    if not unit > 0.0:
+        return None
+    counts, squares = _bin_magnitudes(w, unit)
+    kept = np.flatnonzero(counts)
+    counts, squares = counts[kept], squares[kept] / counts[kept]
+    narrow, wide, share, best = _fit_mixture(counts, squares, START_WIDTHS)
+    gain = best - _gaussian_log_likelihood(counts, squares)
+    if not (gain > MIN_MIXTURE_GAIN_NATS and wide > narrow):
+        return None
+    far = _outlier_threshold(narrow, wide, share)
+    mask = np.asarray(np.abs(w) > far * unit) & good if np.isfinite(far) else np.zeros(w.size, dtype=np.bool_)
+    fraction, scale = _parameter_intervals(counts, squares, narrow, wide, share)
+    return OutlierFit(
+        fraction=fraction,
+        scale=ValueWithInterval(unit * scale.value, unit * scale.lo, unit * scale.hi),
+        mask=mask,
+        count=int(mask.sum()),
+        gain=float(gain),
+        gain_over_student=float(best - _student_log_likelihood(counts, squares)),
+        clustering_z=_clustering_z(np.flatnonzero(mask), w.size),
+        misfit_z=_misfit_z(counts, kept, narrow, wide, share),
+    )
+
+
+@compiled
+def _bin_magnitudes(w: Floats, unit: float) -> tuple[Floats, Floats]:
+    """Return the number of magnitudes |w|/unit in each bin, and the sum of their squares."""
+    counts, squares = np.zeros(TOTAL_BINS), np.zeros(TOTAL_BINS)
+    for k in range(w.size):
+        x = abs(w[k]) / unit
+        if x <= 1e10:  # false for NaN
+            at = (
+                int(x * (LINEAR_BINS / LINEAR_RANGE_SIGMA))
+                if x < LINEAR_RANGE_SIGMA
+                else LINEAR_BINS + int(BINS_PER_LOG_UNIT * np.log(x / LINEAR_RANGE_SIGMA))
+            )
+            counts[at] += 1.0
+            squares[at] += x * x
+    return counts, squares
+
+
+@compiled
+def _fit_mixture(counts: Floats, squares: Floats, start_widths: Floats) -> tuple[float, float, float, float]:
+    """Return the variances of the two Gaussians, the share of the wide one, and the log-likelihood of the best mixture.
+
+    The EM algorithm runs for 40 steps from every start, and then from the best result until it converges.
+    """
+    total = counts.sum()
+    mean = (counts * squares).sum() / total
+    best = (mean, mean, 0.0, -np.inf)
+    for one in start_widths:
+        narrow, wide, share = min(1.0, mean), one * one, 0.01
+        for step in range(40):
+            share, narrow, wide, like = _em_step(counts, squares, total, narrow, wide, share, step < 15)
+        if like > best[3]:
+            best = (narrow, wide, share, like)
+    narrow, wide, share, like = best
+    for _ in range(600):
+        last = like
+        share, narrow, wide, like = _em_step(counts, squares, total, narrow, wide, share, False)
+        if like - last < 1e-7:
+            break
+    return narrow, wide, share, like
+
+
+@compiled
+def _em_step(
+    counts: Floats, squares: Floats, total: float, narrow: float, wide: float, share: float, held: bool
+) -> tuple[float, float, float, float]:
+    """Perform one EM step and return the log-likelihood before it.
+
+    If ``held`` is True, the wide variance stays fixed.
+    """
+    outside, outside_squares, inside_squares, like = 0.0, 0.0, 0.0, 0.0
+    log_narrow = np.log1p(-share) - 0.5 * np.log(narrow)
+    log_wide = np.log(share) - 0.5 * np.log(wide)
+    for k in range(counts.size):
+        apart = (log_wide - 0.5 * squares[k] / wide) - (log_narrow - 0.5 * squares[k] / narrow)
+        if apart > 0.0:
+            small = np.exp(-apart)
+            part = 1.0 / (1.0 + small)
+            like += counts[k] * (log_wide - 0.5 * squares[k] / wide + np.log1p(small))
+        else:
+            small = np.exp(apart)
+            part = small / (1.0 + small)
+            like += counts[k] * (log_narrow - 0.5 * squares[k] / narrow + np.log1p(small))
+        outside += counts[k] * part
+        outside_squares += counts[k] * part * squares[k]
+        inside_squares += counts[k] * (1.0 - part) * squares[k]
+    share = min(max(outside / total, 1e-12), 1.0 - 1e-12)
+    narrow = inside_squares / max(total - outside, 1e-9)
+    if not held:
+        wide = max(outside_squares / max(outside, 1e-9), narrow)
+    return share, narrow, wide, like - 0.5 * total * np.log(2.0 * np.pi)
+
+
+def _gaussian_log_likelihood(counts: Floats, squares: Floats) -> float:
+    """Return the log-likelihood of the best single Gaussian."""
+    total = counts.sum()
+    return -0.5 * float(total * (np.log(2.0 * np.pi * np.dot(counts, squares) / total) + 1.0))
+
+
+def _mixture_log_density(squares: Floats, narrow: float, wide: float, share: float) -> Floats:
+    """Return the log-density of the mixture at given squared magnitudes."""
+    inside = np.log1p(-share) - 0.5 * (np.log(2.0 * np.pi * narrow) + squares / narrow)
+    outside = np.log(share) - 0.5 * (np.log(2.0 * np.pi * wide) + squares / wide)
+    return np.asarray(np.logaddexp(inside, outside))
+
+
+def _student_log_likelihood(counts: Floats, squares: Floats) -> float:
+    """Return the log-likelihood of the best Student's t.
+
+    The EM algorithm fits the scale s with the weights (ν+1)/(ν + x²/s²) (Lange, Little & Taylor 1989). It runs for all
+    degrees of freedom ν at the same time.
+    """
+    nu = STUDENT_FREEDOMS[:, None]
+    scale = np.ones_like(nu)
+    for _ in range(30):
+        weights = (nu + 1.0) / (nu + squares / scale)
+        scale = ((weights * squares) @ counts / (weights @ counts))[:, None]
+    each = (
+        gammaln(0.5 * (nu + 1.0))
+        - gammaln(0.5 * nu)
+        - 0.5 * np.log(np.pi * nu * scale)
+        - 0.5 * (nu + 1.0) * np.log1p(squares / (nu * scale))
+    )
+    likes = each @ counts
+    best = int(likes.argmax())
+    top = float(likes[best])
+    if 0 < best < STUDENT_FREEDOMS.size - 1:  # maximum of the parabola through the best three values
+        left, right = top - likes[best - 1], top - likes[best + 1]
+        top += 0.125 * float((left - right) ** 2 / (left + right)) if left + right > 0.0 else 0.0
+    return top
+
+
+def _outlier_threshold(narrow: float, wide: float, share: float) -> float:
+    """Return the magnitude above which a sample is more likely an outlier than not."""
+    square = 2.0 * (np.log1p(-share) - np.log(share) + 0.5 * np.log(wide / narrow)) / (1.0 / narrow - 1.0 / wide)
+    return float(square**0.5) if square > 0.0 else 0.0
+
+
+def _parameter_intervals(
+    counts: Floats, squares: Floats, narrow: float, wide: float, share: float
+) -> tuple[ValueWithInterval, ValueWithInterval]:
+    """Return the fraction and the scale of the outliers with 95 % intervals.
+
+    The intervals follow from the curvature of the log-likelihood in ln s, ln scale and logit f.
+    """
+    at = np.array([0.5 * np.log(narrow), 0.5 * np.log(max(wide - narrow, 1e-12)), np.log(share) - np.log1p(-share)])
+
+    def like(x: Floats) -> float:
+        inner, f = np.exp(2.0 * x[0]), 1.0 / (1.0 + np.exp(-x[2]))
+        return float(np.dot(counts, _mixture_log_density(squares, inner, inner + np.exp(2.0 * x[1]), f)))
+
+    step = np.diag([1e-3 / max(1.0, (counts.sum() / 1e4) ** 0.5), 0.02, 0.02])
+    curve = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            a, b = step[i], step[j]
+            curve[i, j] = (like(at + a - b) + like(at - a + b) - like(at + a + b) - like(at - a - b)) / (
+                4.0 * a[i] * b[j]
+            )
+    variance = np.diag(np.linalg.pinv(curve))
+    half = np.where(variance > 0.0, Z95 * np.sqrt(np.maximum(variance, 0.0)), 700.0)
+    with np.errstate(over="ignore"):
+        f = 1.0 / (1.0 + np.exp(-(at[2] + half[2] * np.array([0.0, -1.0, 1.0]))))
+        scale = np.exp(at[1] + half[1] * np.array([0.0, -1.0, 1.0]))
+    return ValueWithInterval(*map(float, f)), ValueWithInterval(*map(float, scale))
+
+
+def _clustering_z(positions: Ints, n: int) -> float:
+    """Return the z value of the strongest of several tests for clustering of events.
+
+    The first test counts the pairs of events that are at most ``NEIGHBOUR_SAMPLES`` samples apart. Without clustering,
+    this number has a Poisson distribution. The other tests divide the recording into 4, 8, … parts with at least two
+    events per part on average. They compare the dispersion of the event counts with χ² (Cochran 1954). The smallest
+    probability is multiplied by the number of tests.
+    """
+    if positions.size < 2:
+        return 0.0
+    pairs = sum(
+        int(np.count_nonzero(positions[k:] - positions[:-k] <= NEIGHBOUR_SAMPLES))
+        for k in range(1, min(NEIGHBOUR_SAMPLES, positions.size - 1) + 1)
+    )
+    expected = NEIGHBOUR_SAMPLES * positions.size * (positions.size - 1.0) / n
+    if expected < 0.2 * positions.size:
+        chances = [float(pdtrc(pairs - 1, expected)) if pairs else 1.0]
+    else:  # outliers are so frequent that only the next sample is informative
+        following = int(np.count_nonzero(np.diff(positions) == 1))
+        chances = [float(bdtrc(following - 1, positions.size, positions.size / n)) if following else 1.0]
+    parts = 4
+    while 2 * parts <= positions.size and parts <= 4096:
+        held = np.bincount(positions * parts // n, minlength=parts)
+        mean = positions.size / parts
+        spread = float(((held - mean) ** 2).sum()) / (mean * (1.0 - positions.size / n))
+        chances.append(float(chdtrc(parts - 1, spread)))
+        parts *= 2
+    return _z_of_probability(min(chances) * len(chances))
+
+
+def _z_of_probability(probability: float) -> float:
+    """Return the value that a standard Gaussian exceeds with a given probability, or 0 if it exceeds 0.5."""
+    if probability > 0.5:
+        return 0.0
+    return -float(ndtri(probability)) if probability > 1e-300 else MAX_Z
+
+
+def _misfit_z(counts: Floats, kept: NDArray[np.intp], narrow: float, wide: float, share: float) -> float:
+    """Return the z value of a χ² test that compares the counts with the mixture.
+
+    The bins are combined into groups with about the same expected count.
+    """
+    below = (1.0 - share) * ndtr(BIN_EDGES / narrow**0.5) + share * ndtr(BIN_EDGES / wide**0.5)
+    total = counts.sum()
+    expected = 2.0 * total * np.diff(below)
+    seen = np.zeros(TOTAL_BINS)
+    seen[kept] = counts
+    groups = np.minimum((2.0 * (below[:-1] - 0.5)) * 40.0, 39.0).astype(np.int64)  # forty groups of equal probability
+    tail = np.minimum(np.floor(-np.log2(np.maximum(2.0 * (1.0 - below[:-1]), 1e-300))), np.log2(total / 20.0))
+    groups = groups + np.maximum(tail.astype(np.int64), 0) * (groups == 39)
+    want, have = np.bincount(groups, expected), np.bincount(groups, seen)
+    some = want > 5.0
+    square = float(((have - want)[some] ** 2 / want[some]).sum())
+    return _z_of_probability(float(chdtrc(max(int(some.sum()) - 4, 1), square)))

@@ -1,0 +1,194 @@
+"""Comparison of Poisson steps, a random process, with a few single steps at fixed times.
+
+The search adds one step at a time. A Kalman smoother computes the gain of a shock of the level at each block, and the
+new step is placed at the block with the largest gain (de Jong & Penzer, "Diagnosing shocks in time series", JASA 93,
+1998). After each new step, the search places every step again while the other steps are kept. Finally, the times are
+refined within the blocks, and the heights are fitted by least squares.
+
+The likelihood of Poisson steps is averaged over all possible times and heights, whereas the times and heights of single
+steps are fitted. Each single step therefore has two penalties, following the minimum description length of Rissanen
+(1978). The penalty for the time is the logarithm of the number of blocks. The penalty for the height h is
+½ ln(1 + h²/Var h). With up to about five steps, the single steps usually have the larger score. With more than about a
+dozen steps, Poisson steps have the larger score, because two parameters describe all steps.
+"""
+
+from math import log
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.common.compiled import compiled
+from monitor.reconcile.likelihood import poisson_steps_vs_random_walk as poisson_steps
+from monitor.reconcile.likelihood.state_space_comparison import (
+    BackgroundNoise,
+    EventProcessComparison,
+    StateSpaceNoise,
+    block_means,
+    innovation_variances,
+    innovations_of_series,
+    kalman_log_likelihood,
+    prior_level_variance,
+    state_space_noise,
+)
+
+TIMES_PER_BLOCK: Final = 8
+
+
+class _SingleStepsFit(NamedTuple):
+    """Fitted single steps."""
+
+    score: float  # log-likelihood less the penalties for times and heights
+    times: Floats  # [k] in blocks since the start
+
+
+def compare_poisson_with_single_steps(
+    y: Floats, tau0_s: float, background: BackgroundNoise, K: float, max_single_steps: int = 5
+) -> EventProcessComparison:
+    """Compare Poisson steps with a few single steps.
+
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series in the unit of the axis, without gaps.
+    tau0_s : float
+        Sample period in seconds.
+    background : BackgroundNoise
+        Other noise of the axis.
+    K : float
+        Starting value of the random walk coefficient, in unit/√s, above zero.
+    max_single_steps : int, optional
+        Largest number of single steps.
+
+    Returns
+    -------
+    EventProcessComparison
+        Gain, ``rate`` and ``height`` of the Poisson steps, the number of jumps, and the number of single steps.
+
+    Raises
+    ------
+    ValueError
+        If the series is too short or the background contains no white noise.
+    """
+    means, block_s = block_means(y, tau0_s, poisson_steps.block_length_s(y.size * tau0_s, background, K))
+    single = _fit_single_steps(means, state_space_noise(background, block_s, means.size * block_s), max_single_steps)
+    return poisson_steps.fit_jumps(means, block_s, background, K).compare_with_effect(single.score, single.times.size)
+
+
+def _fit_single_steps(means: Floats, noise: StateSpaceNoise, max_single_steps: int) -> _SingleStepsFit:
+    """Return the fit with the largest score of 0 to ``max_single_steps`` steps."""
+    blocks: list[int] = []
+    best = _SingleStepsFit(kalman_log_likelihood(means, noise, prior_level_variance(means)), np.empty(0))
+    for _ in range(max_single_steps):
+        blocks.append(int(np.argmax(_shock_gains(means, noise, blocks))))
+        for k in range(len(blocks)):
+            blocks[k] = int(np.argmax(_shock_gains(means, noise, blocks[:k] + blocks[k + 1 :])))
+        found = _refine_steps(means, noise, sorted(blocks))
+        if found.score > best.score:
+            best = found
+    return best
+
+
+def _shock_gains(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> Floats:
+    """Return twice the log-likelihood gain, shape (m,), of a shock at the start of each block.
+
+    The model already contains shocks at the start of the given ``blocks``.
+    """
+    shock_variances = np.zeros(means.size)
+    shock_variances[blocks] = prior_level_variance(means)
+    gains = _shock_statistics(means, noise, prior_level_variance(means), shock_variances)
+    gains[blocks] = 0.0
+    return gains
+
+
+def _refine_steps(means: Floats, noise: StateSpaceNoise, blocks: list[int]) -> _SingleStepsFit:
+    """Refine the times of the steps within the blocks and return the fit."""
+    times = np.array(blocks, np.float64)
+    places = np.arange(-TIMES_PER_BLOCK, TIMES_PER_BLOCK + 1) / TIMES_PER_BLOCK
+    for k in range(times.size):
+        others = np.delete(times, k)
+        apart = [at for at in times[k] + places if 0.0 <= at < means.size and (np.abs(others - at) >= 1.0).all()]
+        tried = [np.insert(others, k, at) for at in apart]
+        times = max(tried, key=lambda t: _fit_heights(means, noise, t)[0])
+    total, heights, deviations = _fit_heights(means, noise, times)
+    cost = times.size * log(means.size) + 0.5 * float(np.log1p((heights / deviations) ** 2).sum())
+    return _SingleStepsFit(total - cost, times)
+
+
+def _fit_heights(means: Floats, noise: StateSpaceNoise, times: Floats) -> tuple[float, Floats, Floats]:
+    """Fit the heights of steps at given times.
+
+    Return the log-likelihood, the heights and the standard deviations of the heights.
+    """
+    # fraction of each block that lies after the step
+    columns = np.clip(np.arange(1.0, means.size + 1.0)[:, None] - times, 0.0, 1.0)
+    columns = np.column_stack([means, columns])
+    logarithms = _whiten(columns, noise, prior_level_variance(means))
+    data, design = columns[:, 0], columns[:, 1:]
+    normal = np.linalg.inv(design.T @ design)
+    heights = normal @ (design.T @ data)
+    left = data - design @ heights
+    return -0.5 * float(logarithms + left @ left), heights, np.sqrt(np.diag(normal))
+
+
+@compiled
+def _whiten(columns: Floats, noise: StateSpaceNoise, level_variance: float) -> float:
+    """Whiten columns, shape (m, c), in place, and return the sum of ln 2πS of the innovation variances S.
+
+    A whitened column contains innovations divided by the standard deviation.
+    """
+    variances, state_covariances = innovation_variances(np.zeros(columns.shape[0]), noise, level_variance)
+    total = 0.0
+    for c in range(columns.shape[1]):
+        innovations = innovations_of_series(columns[:, c].copy(), noise, variances, state_covariances)
+        for k in range(innovations.size):
+            columns[k, c] = innovations[k] / np.sqrt(variances[k])
+    for variance in variances:
+        total += np.log(2.0 * np.pi * variance)
+    return total
+
+
+@compiled
+def _shock_statistics(
+    means: Floats, noise: StateSpaceNoise, level_variance: float, extra_level_variance: Floats
+) -> Floats:
+    """Return twice the log-likelihood ratio, shape (m,), of a shock of the level at the start of each block.
+
+    The ratio is r²/N of the fixed-interval smoother (de Jong & Penzer 1998, section 2). The backward recursions are
+    r ← h e/S + L'r and N ← h h'/S + L'N L, with L = F − k h'/S. For each block, e is the innovation, S is the variance
+    of the innovation, k is the covariance of the innovation with the next state, h is the contribution of the state to
+    the block mean, and F is the state transition.
+    """
+    table = noise.table
+    d, m = table.shape[0], means.size
+    variances, state_covariances = innovation_variances(extra_level_variance, noise, level_variance)
+    innovations = innovations_of_series(means, noise, variances, state_covariances)
+    r, N, scores = np.zeros(d), np.zeros((d, d)), np.empty(m)
+    L = np.empty((d, d))
+    for k in range(m - 1, -1, -1):
+        for i in range(d):
+            for j in range(d):
+                L[i, j] = (table[i, 0] if i == j else 0.0) - state_covariances[k, i] * table[j, 1] / variances[k]
+        _smooth_backward(r, N, L, table, innovations[k], variances[k])
+        scores[k] = r[0] * r[0] / N[0, 0]
+    return scores
+
+
+@compiled
+def _smooth_backward(r: Floats, N: Floats, L: Floats, table: Floats, innovation: float, variance: float) -> None:
+    """Update the smoother variables r, shape (d,), and N, shape (d, d), with one block."""
+    d = r.size
+    NL, new = np.empty((d, d)), np.empty(d)
+    for i in range(d):
+        new[i] = table[i, 1] * innovation / variance
+        for j in range(d):
+            new[i] += L[j, i] * r[j]
+            NL[i, j] = 0.0
+            for n in range(d):
+                NL[i, j] += N[i, n] * L[n, j]
+    for i in range(d):
+        r[i] = new[i]
+        for j in range(d):
+            N[i, j] = table[i, 1] * table[j, 1] / variance
+            for n in range(d):
+                N[i, j] += L[n, i] * NL[n, j]

@@ -1,0 +1,403 @@
+"""Comparison of a process of random events with an effect that has the same spectrum: parts that the pairs share.
+
+A random telegraph has the same second moments as exponentially correlated noise. Poisson steps have the same second
+moments as a random walk. Only the distributions differ. The full likelihood of both effects is therefore computed for
+the same data and the same background noise. The gain of an ``EventProcessComparison`` is the logarithm of the ratio of
+the two maximum likelihoods. The caller subtracts penalties for parameters and prior odds.
+
+The data are block means. The background noise consists of white noise, random walk, flicker noise and exponentially
+correlated noise. It is modelled as a sum of independent first-order processes. The distribution of a block mean, given
+the state at the start of the block, is known exactly. One step of a Kalman filter per block is therefore sufficient.
+The first level has a nearly flat prior, which is the same for both effects.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil, exp, log, pi
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.common.compiled import compiled
+from monitor.common.distributions import Z95
+from monitor.reconcile.result import ParameterInterval
+
+MAX_BLOCKS: Final = 1 << 15
+"""Largest number of blocks. The end of a longer recording is not used."""
+TARGET_BLOCKS: Final = 200.0
+"""Smallest number of blocks in a recording with sufficiently many samples."""
+MIN_BLOCKS: Final = 16
+INITIAL_VARIANCE_RATIO: Final = 100.0
+"""Prior variance of the first level relative to the variance of the data. This prior is effectively flat."""
+FLICKER_TIME_RATIO: Final = 10.0
+"""Ratio of successive correlation times of the processes that approximate flicker noise. With this ratio, the spectrum
+deviates by 5 % from 1/f.
+"""
+FLICKER_CUTOFF_RATIO: Final = 20.0
+"""Highest modelled frequency of flicker noise, relative to the frequency at which flicker and white noise are equal."""
+CURVATURE_STEP: Final = 0.1
+"""Step in the logarithm of a parameter for the numerical curvature at the maximum."""
+ODDS_STEP: Final = 1e-3
+"""Relative change of the odds for the numerical derivative that gives the number of events."""
+MAX_LOG_PARAMETER_RANGE: Final = log(30.0)
+"""Largest distance of the logarithm of a parameter from its starting value."""
+
+
+@dataclass(frozen=True, slots=True)
+class EventProcessComparison:
+    """Comparison of a process of random events with an effect that has the same spectrum, on one axis."""
+
+    gain: float  # log-likelihood of the process less the log-likelihood of the other effect, nats
+    parameters: Mapping[str, ParameterInterval]  # of the process at the maximum, SI, 95 %
+    events: int  # expected number of switches or jumps, given the data and the process
+    single_steps: int = 0  # number of steps, if the process was compared with single steps
+
+
+@dataclass(frozen=True, slots=True)
+class BackgroundNoise:
+    """Noise of an axis besides the compared effects. All spectral densities S(f) are two-sided."""
+
+    white: float  # N²: S(f) = N², unit² s
+    walk: float = 0.0  # K²: S(f) = K²/(2πf)², unit²/s
+    flicker: float = 0.0  # B²: S(f) = B²/(2πf), unit²
+    correlated: tuple[tuple[float, float], ...] = ()  # (σ, unit; T_c, s) of each exponentially correlated noise
+
+
+class StateSpaceNoise(NamedTuple):
+    """Noise of block means as a sum of independent first-order processes and of white noise.
+
+    From the start of one block to the start of the next block, the state x of a process changes to a·x + w. The process
+    contributes c·x + v to the block mean. The random terms w and v are Gaussian. The first process is the level,
+    including the random walk.
+    """
+
+    table: Floats  # [d, 4] a, c, variance of w and covariance of v and w, for each process
+    white: float  # variance of the white noise in a block mean, plus the variances of all v
+
+
+class EventProcessFit(NamedTuple):
+    """Fit of a process of random events at the maximum of the likelihood."""
+
+    log_likelihood: float
+    parameters: dict[str, ParameterInterval]
+    events: float  # expected number of events, given the data
+
+    def compare_with_effect(self, other_log_likelihood: float, single_steps: int = 0) -> EventProcessComparison:
+        """Compare the process with another effect.
+
+        Parameters
+        ----------
+        other_log_likelihood : float
+            Maximum log-likelihood of the other effect for the same data.
+        single_steps : int, optional
+            Number of steps if the other effect consists of single steps.
+        """
+        gain = self.log_likelihood - other_log_likelihood
+        return EventProcessComparison(gain, self.parameters, round(self.events), single_steps)
+
+
+def block_means(y: Floats, tau0_s: float, block_s: float) -> tuple[Floats, float]:
+    """Return the means of consecutive blocks, less the mean of the series, and the length of a block.
+
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series in the unit of the axis.
+    tau0_s : float
+        Sample period in seconds.
+    block_s : float
+        Approximate length of a block in seconds.
+
+    Returns
+    -------
+    means : ndarray of float64, shape (m,)
+        Block means in the unit of ``y``.
+    block_s : float
+        Exact length of a block in seconds.
+
+    Raises
+    ------
+    ValueError
+        If the series has too few blocks.
+
+    Examples
+    --------
+    >>> block_means(np.arange(48.0), 0.5, 1.4)[0][:3].tolist(), block_means(np.arange(48.0), 0.5, 1.4)[1]
+    ([-22.5, -19.5, -16.5], 1.5)
+    """
+    size = max(1, round(block_s / tau0_s))
+    count = min(y.size // size, MAX_BLOCKS)
+    if count < MIN_BLOCKS:
+        raise ValueError(f"the series has {count} blocks of {size * tau0_s:g} s; at least {MIN_BLOCKS} are needed")
+    means = y[: count * size].reshape(count, size).mean(1)
+    return means - means.mean(), size * tau0_s
+
+
+def state_space_noise(background: BackgroundNoise, block_s: float, duration_s: float) -> StateSpaceNoise:
+    """Return the state-space model of noise in block means.
+
+    Parameters
+    ----------
+    background : BackgroundNoise
+        Noise of the axis.
+    block_s : float
+        Length of a block in seconds.
+    duration_s : float
+        Length of the recording in seconds.
+
+    Raises
+    ------
+    ValueError
+        If the background contains no white noise.
+    """
+    if not background.white > 0.0:
+        raise ValueError(f"the white noise is {background.white:g}; it must be above zero")
+    walk = background.walk * block_s
+    rows, white = [(1.0, 1.0, walk, 0.5 * walk)], background.white / block_s + walk / 3.0
+    for sigma, time_s in (*background.correlated, *_flicker_processes(background, block_s, duration_s)):
+        row, own = block_markov_noise(sigma, time_s, block_s)
+        rows.append(row)
+        white += own
+    return StateSpaceNoise(np.array(rows), white)
+
+
+def block_markov_noise(sigma: float, time_s: float, block_s: float) -> tuple[tuple[float, float, float, float], float]:
+    """Return the state-space model of exponentially correlated noise in block means.
+
+    Let σ be the standard deviation of the noise and x the ratio of block length to correlation time. The mean of a
+    block then has the variance σ² 2(x − 1 + e^−x)/x². The covariance of the mean with the noise at either end of the
+    block is σ² (1 − e^−x)/x. The variance and the covariance are integrals of the autocovariance σ² e^−|t|/T_c.
+
+    Parameters
+    ----------
+    sigma : float
+        Standard deviation, in the unit of the axis.
+    time_s : float
+        Correlation time in seconds.
+    block_s : float
+        Length of a block in seconds.
+
+    Returns
+    -------
+    row : tuple of float
+        Row of ``StateSpaceNoise.table``.
+    variance : float
+        Variance of the block mean given the noise at the start of the block.
+    """
+    x = block_s / time_s
+    decay, mean_share = exp(-x), -float(np.expm1(-x)) / x
+    own = x * (2.0 / 3.0 - x * (0.5 - x * 7.0 / 30.0)) if x < 0.01 else 2.0 * (x - 1.0 + decay) / x**2 - mean_share**2
+    return (
+        decay,
+        mean_share,
+        -(sigma**2) * float(np.expm1(-2.0 * x)),
+        sigma**2 * mean_share * (1.0 - decay),
+    ), sigma**2 * own
+
+
+def _flicker_processes(background: BackgroundNoise, block_s: float, duration_s: float) -> list[tuple[float, float]]:
+    """Return the standard deviation and correlation time of each of several processes whose sum is flicker noise.
+
+    Flicker noise has the spectral density B²/(2πf). The sum has this density from the inverse of the recording length
+    up to the frequency above which white noise dominates. The processes have the same variance s, and successive
+    correlation times have the ratio ρ. The sum of the processes has the spectral density (s π/ln ρ)/(2πf) (Keshner,
+    "1/f noise", Proc. IEEE 70, 1982). The variance is therefore s = B² ln ρ/π.
+    """
+    if background.flicker <= 0.0:
+        return []
+    slowest = duration_s / pi
+    fastest = min(max(block_s / pi, background.white / (FLICKER_CUTOFF_RATIO * background.flicker)), 0.1 * slowest)
+    count = ceil(log(slowest / fastest) / log(FLICKER_TIME_RATIO)) + 1
+    spacing = log(slowest / fastest) / (count - 1)
+    sigma = (background.flicker * spacing / pi) ** 0.5
+    return [(sigma, slowest * exp(-k * spacing)) for k in range(count)]
+
+
+def maximise_log_likelihood(log_likelihood: Callable[..., float], start: Sequence[float]) -> tuple[float, Floats]:
+    """Maximise a log-likelihood over the logarithms of positive parameters by the Nelder-Mead method.
+
+    Parameters
+    ----------
+    log_likelihood : callable
+        Function of the parameters.
+    start : sequence of float
+        Starting values of the parameters.
+
+    Returns
+    -------
+    log_likelihood : float
+        Log-likelihood at the maximum.
+    log_parameters : ndarray of float64, shape (k,)
+        Logarithms of the parameters at the maximum.
+    """
+    from scipy.optimize import minimize
+
+    origin = np.log(np.asarray(start, np.float64))
+    found = minimize(
+        lambda at: -log_likelihood(*np.exp(at)),
+        origin,
+        method="Nelder-Mead",
+        bounds=[(x - MAX_LOG_PARAMETER_RANGE, x + MAX_LOG_PARAMETER_RANGE) for x in origin],
+        options={
+            "initial_simplex": np.vstack([origin, origin + 0.3 * np.eye(origin.size)]),
+            "xatol": 0.02,
+            "fatol": 0.02,
+            "maxiter": 80,
+        },
+    )
+    return -float(found.fun), np.asarray(found.x)
+
+
+def fit_event_process(
+    likelihood: Callable[[float, float, float], float], start: Mapping[str, float]
+) -> EventProcessFit:
+    """Maximise the likelihood of a process of random events over its two parameters.
+
+    The expected number of events is the derivative of the log-likelihood with respect to the logarithm of the odds of
+    an event (Fisher's identity).
+
+    Parameters
+    ----------
+    likelihood : callable
+        Function of the two parameters and of a factor on the odds of an event.
+    start : mapping of str to float
+        Names and starting values of the two parameters.
+    """
+    height, at = maximise_log_likelihood(lambda a, b: likelihood(a, b, 1.0), list(start.values()))
+    deviations = _log_deviations(lambda x: likelihood(float(np.exp(x[0])), float(np.exp(x[1])), 1.0), at, height)
+    first, second = np.exp(at).tolist()
+    events = (likelihood(first, second, 1.0 + ODDS_STEP) - height) / ODDS_STEP
+    bounds = [_log_interval(*one) for one in zip((first, second), deviations.tolist(), strict=True)]
+    return EventProcessFit(height, dict(zip(start, bounds, strict=True)), events)
+
+
+def _log_interval(value: float, deviation: float) -> ParameterInterval:
+    """Return a parameter with the 95 % interval, or without an interval that is wider than the search range.
+
+    ``deviation`` is the standard deviation of the logarithm.
+    """
+    wide = Z95 * deviation
+    if not wide < MAX_LOG_PARAMETER_RANGE:
+        return ParameterInterval(value)
+    return ParameterInterval(value, value * exp(-wide), value * exp(wide))
+
+
+def _log_deviations(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
+    """Return the standard deviations of the logarithms of the parameters, or NaN if the curvature shows no maximum."""
+    curvature = _curvature(function, at, height)
+    if (np.linalg.eigvalsh(curvature) < 0.0).all():
+        return np.asarray(np.sqrt(np.diag(np.linalg.inv(-curvature))))
+    return np.full(at.size, np.nan)
+
+
+def _curvature(function: Callable[[Floats], float], at: Floats, height: float) -> Floats:
+    """Return the second derivatives, shape (k, k), from finite differences with the step ``CURVATURE_STEP``."""
+    k = at.size
+    steps = CURVATURE_STEP * np.eye(k)
+    curvature = np.empty((k, k))
+    for i in range(k):
+        curvature[i, i] = function(at + steps[i]) - 2.0 * height + function(at - steps[i])
+        for j in range(i):
+            crossed = [function(at + p * steps[i] + q * steps[j]) * p * q for p in (1.0, -1.0) for q in (1.0, -1.0)]
+            curvature[i, j] = curvature[j, i] = 0.25 * sum(crossed)
+    return curvature / CURVATURE_STEP**2
+
+
+def prior_level_variance(means: Floats) -> float:
+    """Return the prior variance of the first level."""
+    return INITIAL_VARIANCE_RATIO * float(means.var())
+
+
+@compiled
+def initial_covariance(noise: StateSpaceNoise, level_variance: float) -> Floats:
+    """Return the state covariance, shape (d, d), before the first block.
+
+    The prior variance of the level is ``level_variance``. The other processes are stationary.
+    """
+    table = noise.table
+    d = table.shape[0]
+    covariance = np.zeros((d, d))
+    covariance[0, 0] = level_variance
+    for i in range(1, d):
+        covariance[i, i] = table[i, 2] / (1.0 - table[i, 0] ** 2)
+    return covariance
+
+
+@compiled
+def predict_block_mean_variance(noise: StateSpaceNoise, covariance: Floats, state_covariance_out: Floats) -> float:
+    """Return the predicted variance of a block mean from the state covariance, shape (d, d), at the start of the block.
+
+    The covariance of the block mean with the next state is written to ``state_covariance_out``, shape (d,).
+    """
+    table = noise.table
+    d = table.shape[0]
+    variance = 0.0
+    for i in range(d):
+        total = 0.0
+        for j in range(d):
+            total += covariance[i, j] * table[j, 1]
+        variance += table[i, 1] * total
+        state_covariance_out[i] = table[i, 0] * total + table[i, 3]
+    return variance + noise.white
+
+
+@compiled
+def innovation_of_block(block_mean: float, noise: StateSpaceNoise, state: Floats) -> float:
+    """Return the block mean less the prediction from the state, shape (d,), at the start of the block."""
+    innovation = block_mean
+    for i in range(noise.table.shape[0]):
+        innovation -= noise.table[i, 1] * state[i]
+    return innovation
+
+
+@compiled
+def innovation_variances(
+    extra_level_variance: Floats, noise: StateSpaceNoise, level_variance: float
+) -> tuple[Floats, Floats]:
+    """Return the variances of the innovations, shape (m,), and the covariances with the next state, shape (m, d).
+
+    ``extra_level_variance``, shape (m,), is added to the variance of the level at the start of each block.
+    """
+    table = noise.table
+    d, m = table.shape[0], extra_level_variance.size
+    variances, state_covariances = np.empty(m), np.empty((m, d))
+    covariance = initial_covariance(noise, level_variance)
+    for k in range(m):
+        covariance[0, 0] += extra_level_variance[k]
+        variances[k] = predict_block_mean_variance(noise, covariance, state_covariances[k])
+        for i in range(d):
+            for j in range(d):
+                covariance[i, j] *= table[i, 0] * table[j, 0]
+                covariance[i, j] -= state_covariances[k, i] * state_covariances[k, j] / variances[k]
+            covariance[i, i] += table[i, 2]
+    return variances, state_covariances
+
+
+@compiled
+def innovations_of_series(
+    series: Floats, noise: StateSpaceNoise, variances: Floats, state_covariances: Floats
+) -> Floats:
+    """Return the innovations, shape (m,): the block means less the predictions of the Kalman filter."""
+    table = noise.table
+    d = table.shape[0]
+    state, innovations = np.zeros(d), np.empty(series.size)
+    for k in range(series.size):
+        innovations[k] = innovation_of_block(series[k], noise, state)
+        for i in range(d):
+            state[i] = table[i, 0] * state[i] + state_covariances[k, i] * innovations[k] / variances[k]
+    return innovations
+
+
+@compiled
+def kalman_log_likelihood(means: Floats, noise: StateSpaceNoise, level_variance: float) -> float:
+    """Return the log-likelihood of block means under Gaussian noise.
+
+    The Kalman filter follows Anderson & Moore, "Optimal Filtering", 1979, sections 5.5 and 10.4.
+    """
+    variances, state_covariances = innovation_variances(np.zeros(means.size), noise, level_variance)
+    innovations = innovations_of_series(means, noise, variances, state_covariances)
+    total = 0.0
+    for k in range(means.size):
+        total -= 0.5 * (np.log(2.0 * np.pi * variances[k]) + innovations[k] * innovations[k] / variances[k])
+    return total

@@ -1,0 +1,284 @@
+"""Likelihood ratio of a random telegraph and exponentially correlated noise, which have the same second moments.
+
+The two levels are the modes of a switching Kalman filter. The Gaussian state of the filter contains the background
+noise and the position of the levels. Each block has one of three cases. In case 0, the level does not change. In case
+1, the level changes and changes back. In case 2, the level changes once. Each case has a mean and a variance of the
+block mean. After each block, the cases that end in the same level are merged into one Gaussian with the same mean and
+covariance. This is the GPB2 algorithm (Bar-Shalom, Li & Kirubarajan, "Estimation with Applications to Tracking and
+Navigation", 2001, section 11.6.4). If the background is white noise and the levels are known, the filter is the forward
+algorithm of a hidden Markov model.
+"""
+
+from math import log
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.common.compiled import compiled
+from monitor.reconcile.likelihood.state_space_comparison import (
+    TARGET_BLOCKS,
+    BackgroundNoise,
+    EventProcessComparison,
+    EventProcessFit,
+    StateSpaceNoise,
+    block_markov_noise,
+    block_means,
+    fit_event_process,
+    initial_covariance,
+    innovation_of_block,
+    kalman_log_likelihood,
+    maximise_log_likelihood,
+    predict_block_mean_variance,
+    prior_level_variance,
+    state_space_noise,
+)
+
+BLOCKS_PER_CORRELATION_TIME: Final = 8.0
+"""Number of blocks in a correlation time. The level then changes in one of sixteen blocks."""
+MAX_FINE_BLOCKS: Final = 20_000.0
+"""Number of blocks in a recording above which blocks are not shortened to resolve the switches."""
+MIN_SAMPLES_PER_BLOCK: Final = 20
+"""Smallest number of samples in a block if the correlation time allows it. The noise of a sensor is white only over
+several samples.
+"""
+START_AMPLITUDE_FACTORS: Final = np.geomspace(0.5, 2.0, 7)
+"""Starting amplitudes as multiples of 2 σ. The likelihood has several maxima."""
+START_DWELL_FACTORS: Final = (0.35, 1.0)
+"""Starting dwell times as multiples of 2 T_c. A random walk in the background makes T_c appear longer."""
+INITIAL_LEVEL_BLOCKS: Final = 1024
+"""Number of blocks, about 64 dwell times, for which both possible first levels are tracked."""
+MIN_WEIGHT: Final = 1e-300
+"""Smallest weight of a case relative to the likeliest case. This limit avoids a division by zero."""
+
+
+def compare_telegraph_with_correlated_noise(
+    y: Floats, tau0_s: float, background: BackgroundNoise, sigma: float, correlation_time: float
+) -> EventProcessComparison:
+    """Compare a random telegraph with exponentially correlated noise.
+
+    Parameters
+    ----------
+    y : ndarray of float64, shape (n,)
+        Series in the unit of the axis, without gaps.
+    tau0_s : float
+        Sample period in seconds.
+    background : BackgroundNoise
+        Other noise of the axis.
+    sigma : float
+        Starting value of the standard deviation of the process, in the unit of the axis.
+    correlation_time : float
+        Starting value of the correlation time in seconds.
+
+    Returns
+    -------
+    EventProcessComparison
+        Gain, ``amplitude`` and ``dwell_time`` of the telegraph, and the number of switches.
+
+    Raises
+    ------
+    ValueError
+        If the series is too short or the background contains no white noise.
+    """
+    means, block_s = block_means(
+        y, tau0_s, _block_length_s(y.size * tau0_s, tau0_s, correlation_time, background.white / sigma**2)
+    )
+    noise, level_variance = state_space_noise(background, block_s, means.size * block_s), prior_level_variance(means)
+
+    def correlated(sigma: float, time_s: float) -> float:
+        row, own = block_markov_noise(sigma, time_s, block_s)
+        both = StateSpaceNoise(np.vstack([noise.table, row]), noise.white + own)
+        return float(kalman_log_likelihood(means, both, level_variance))
+
+    telegraph = _fit_telegraph(means, block_s, noise, sigma, correlation_time)
+    return telegraph.compare_with_effect(maximise_log_likelihood(correlated, (sigma, correlation_time))[0])
+
+
+def _block_length_s(duration_s: float, tau0_s: float, correlation_time: float, equal_noise_s: float) -> float:
+    """Return the length of a block in seconds.
+
+    In a block of ``equal_noise_s`` seconds, the white noise of the block mean is half of the amplitude. Shorter blocks
+    contain no more information about the switches.
+    """
+    return min(
+        correlation_time / BLOCKS_PER_CORRELATION_TIME,
+        duration_s / TARGET_BLOCKS,
+        max(equal_noise_s, duration_s / MAX_FINE_BLOCKS, MIN_SAMPLES_PER_BLOCK * tau0_s),
+    )
+
+
+def _fit_telegraph(
+    means: Floats, block_s: float, noise: StateSpaceNoise, sigma: float, correlation_time: float
+) -> EventProcessFit:
+    """Maximise the likelihood over amplitude and dwell time, from several starting values."""
+    level_variance = prior_level_variance(means)
+
+    def two_levels(amplitude: float, dwell_s: float, odds: float) -> float:
+        return _log_likelihood(means, noise, level_variance, amplitude, block_s / dwell_s, odds)
+
+    starts = [
+        (2.0 * sigma * a, 2.0 * correlation_time * d)
+        for a in START_AMPLITUDE_FACTORS.tolist()
+        for d in START_DWELL_FACTORS
+    ]
+    amplitude, dwell_s = max(starts, key=lambda start: two_levels(start[0], start[1], 1.0))
+    return fit_event_process(two_levels, {"amplitude": amplitude, "dwell_time": dwell_s})
+
+
+def _log_likelihood(
+    means: Floats, noise: StateSpaceNoise, level_variance: float, amplitude: float, switches: float, odds: float = 1.0
+) -> float:
+    """Return the log-likelihood of a random telegraph with ``switches`` expected switches in a block.
+
+    The probability of each switch is multiplied by ``odds``.
+    """
+    even, odd = 0.5 * (1.0 + np.exp(-2.0 * switches)), -0.5 * np.expm1(-2.0 * switches)
+    none = np.exp(-switches)
+    # Let x be the fraction of the block that the process spends in the other level. Without a change, x is 0. If the
+    # level changes back, x has the density 2(1 − x), the mean 1/3 and the variance 1/18. With one change, x is uniform.
+    cases = np.array([
+        [none, 0.5 * amplitude, 0.0],
+        [odds**2 * (even - none), amplitude / 6.0, amplitude**2 / 18.0],
+        [odds * odd, 0.0, amplitude**2 / 12.0],
+    ])  # fmt: skip
+    # The filter runs once for each first level. A single filter would merge the two first levels before the position of
+    # the levels is known.
+    states = [_initial_state(noise, level_variance, first_level) for first_level in (0, 1)]
+    first_parts = [_switching_log_likelihood(means[:INITIAL_LEVEL_BLOCKS], noise, cases, state) for state in states]
+    second_part = _switching_log_likelihood(
+        means[INITIAL_LEVEL_BLOCKS:], noise, cases, states[int(np.argmax(first_parts))]
+    )
+    return float(np.logaddexp(first_parts[0], first_parts[1]) - log(2.0) + second_part)
+
+
+class _SwitchingFilterState(NamedTuple):
+    """Gaussian state of the filter for each of the two levels."""
+
+    probability: Floats  # [2]
+    mean: Floats  # [2, d]
+    covariance: Floats  # [2, d, d]
+
+
+class _BlockFilterUpdate(NamedTuple):
+    """Update of the filter with one block mean, for each level at the start of the block and each case."""
+
+    weight: Floats  # [2, 3] probability
+    scaled_innovation: Floats  # [2, 3] innovation divided by its variance
+    inverse_variance: Floats  # [2, 3] inverse of the variance of the innovation
+    state_covariance: Floats  # [2, d] covariance of the block mean with the next state
+
+
+@compiled
+def _initial_state(noise: StateSpaceNoise, level_variance: float, first_level: int) -> _SwitchingFilterState:
+    """Return the state before the first block, if the process starts in the given level."""
+    d = noise.table.shape[0]
+    state = _SwitchingFilterState(np.zeros(2), np.zeros((2, d)), np.empty((2, d, d)))
+    state.probability[first_level] = 1.0
+    state.covariance[:] = initial_covariance(noise, level_variance)
+    return state
+
+
+@compiled
+def _switching_log_likelihood(
+    means: Floats, noise: StateSpaceNoise, cases: Floats, state: _SwitchingFilterState
+) -> float:
+    """Return the log-likelihood of two levels and update the filter state in place.
+
+    ``cases``, shape (3, 3), contains the probability of each case, and the mean and variance of the contribution of the
+    telegraph to the block mean. The means are valid for a start in the upper level.
+    """
+    d = noise.table.shape[0]
+    update = _BlockFilterUpdate(np.empty((2, 3)), np.empty((2, 3)), np.empty((2, 3)), np.empty((2, d)))
+    moved, merged = np.empty((2, d)), np.empty((2, d, d))
+    total: float = -0.5 * means.size * np.log(2.0 * np.pi)
+    for block_mean in means:
+        density, log_scale = _weigh_cases(block_mean, noise, cases, state, update)
+        total += np.log(density) - log_scale
+        for level in range(2):
+            _merge_returning_case(update.weight[level], update.scaled_innovation[level], update.inverse_variance[level])
+        for level in range(2):
+            _merge_into_level(level, density, noise.table, state, update, moved[level], merged[level])
+        state.mean[:] = moved
+        state.covariance[:] = merged
+    return total
+
+
+@compiled
+def _weigh_cases(
+    block_mean: float, noise: StateSpaceNoise, cases: Floats, state: _SwitchingFilterState, update: _BlockFilterUpdate
+) -> tuple[float, float]:
+    """Compute the update with a block mean for each level and case.
+
+    All weights are multiplied by a common factor to avoid underflow. Return the sum of the weights and the logarithm of
+    the factor.
+    """
+    weight, pull, known = update.weight, update.scaled_innovation, update.inverse_variance
+    for level in range(2):
+        variance = predict_block_mean_variance(noise, state.covariance[level], update.state_covariance[level])
+        innovation = innovation_of_block(block_mean, noise, state.mean[level])
+        sign = 1.0 - 2.0 * level
+        for k in range(3):
+            apart = innovation - sign * cases[k, 1]
+            known[level, k] = 1.0 / (variance + cases[k, 2])
+            pull[level, k] = apart * known[level, k]
+            weight[level, k] = 0.5 * apart * pull[level, k]
+    least, density = weight.min(), 0.0
+    for level in range(2):
+        for k in range(3):
+            prior = state.probability[level] * cases[k, 0] * np.sqrt(known[level, k])
+            weight[level, k] = prior * np.exp(least - weight[level, k]) + MIN_WEIGHT
+            density += weight[level, k]
+    return density, least
+
+
+@compiled
+def _merge_returning_case(weight: Floats, pull: Floats, known: Floats) -> None:
+    """Merge case 1, in which the level changes and changes back, into case 0, in which the level does not change."""
+    back = weight[1] / (weight[0] + weight[1])
+    apart = pull[1] - pull[0]
+    pull[0] += back * apart
+    known[0] += back * (known[1] - known[0] - (1.0 - back) * apart * apart)
+    weight[0] += weight[1]
+
+
+@compiled
+def _merge_into_level(
+    level: int,
+    density: float,
+    table: Floats,
+    state: _SwitchingFilterState,
+    update: _BlockFilterUpdate,
+    moved: Floats,
+    merged: Floats,
+) -> None:
+    """Merge all cases that end in ``level`` into one Gaussian with the mean ``moved`` and the covariance ``merged``."""
+    d, other = table.shape[0], 1 - level
+    state_covariance, pull, known, at, covariance = (
+        update.state_covariance,
+        update.scaled_innovation,
+        update.inverse_variance,
+        state.mean,
+        state.covariance,
+    )
+    step = np.empty(d)
+    stays, comes = update.weight[level, 0], update.weight[other, 2]
+    state.probability[level] = (stays + comes) / density
+    came = comes / (stays + comes)
+    for i in range(d):
+        stay = table[i, 0] * at[level, i] + state_covariance[level, i] * pull[level, 0]
+        step[i] = table[i, 0] * at[other, i] + state_covariance[other, i] * pull[other, 2] - stay
+        moved[i] = stay + came * step[i]
+    for i in range(d):
+        for j in range(d):
+            decay = table[i, 0] * table[j, 0]
+            stay = (
+                covariance[level, i, j] * decay
+                - state_covariance[level, i] * state_covariance[level, j] * known[level, 0]
+            )
+            come = (
+                covariance[other, i, j] * decay
+                - state_covariance[other, i] * state_covariance[other, j] * known[other, 2]
+            )
+            apart = (1.0 - came) * step[i] * step[j]
+            merged[i, j] = stay + came * (come - stay + apart)
+        merged[i, i] += table[i, 2]

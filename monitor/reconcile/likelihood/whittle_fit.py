@@ -1,0 +1,214 @@
+"""Whittle likelihood of one axis, maximised jointly over the variances of the noise and the sizes of the regressors.
+
+The cosine transform coefficients Y_k of an axis are independent and Gaussian (Whittle 1953). The mean of Y_k is
+Σ_i β_i R_ik with the transforms R_i of the regressors and the sizes β_i. The variance of the n_b coefficients in bin b
+is
+
+    v_b = c_b + Σ_j θ_j B_jb,    θ_j ≥ 0,
+
+with the fixed variance c_b, the variance bases B_j and the squared sizes θ_j of the noise effects. The residual power
+of bin b is P_b = Σ_k (Y_k − Σ_i β_i R_ik)², and the log-likelihood is
+
+    ln L = −½ Σ_b (n_b ln v_b + P_b/v_b).
+
+The likelihood depends only on the sums over bins of the products of Y and R. Fisher scoring finds θ. Coordinate descent
+on the quadratic approximation respects the bound θ ≥ 0. Generalised least squares finds β for the current variances.
+The two steps alternate until ln L no longer increases. A step that does not increase ln L is halved.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import Floats
+from monitor.common.compiled import compiled
+
+MAX_FIT_ITERATIONS: Final = 200
+MAX_STEP_HALVINGS: Final = 12
+CONVERGENCE_NATS: Final = 1e-5
+MIN_VARIANCE_RATIO: Final = 1e-20
+"""Lower limit of a variance, relative to the largest power of a bin."""
+
+
+@dataclass(frozen=True, slots=True)
+class BinSums:
+    """Sums over bins of products of the axis Y and the regressors R."""
+
+    power: Floats  # [m] Σ Y²
+    cross: Floats  # [q, m] Σ R_i Y
+    gram: Floats  # [q, q, m] Σ R_i R_j
+
+
+@dataclass(frozen=True, slots=True)
+class WhittleFit:
+    """Maximum of the Whittle likelihood."""
+
+    theta: Floats  # [p] variances
+    beta: Floats  # [q] sizes of the regressors
+    variance: Floats  # [m] variance of a coefficient in each bin
+    residual: Floats  # [m] sum of squares in each bin after the regressors are removed
+    log_likelihood: float
+    theta_information: Floats  # [p, p] Fisher information of θ
+    beta_covariance: Floats  # [q, q] covariance of β
+
+
+def maximise_whittle(count: Floats, sums: BinSums, bases: Floats, constant: Floats, start: Floats) -> WhittleFit:
+    """Return the θ and β with the largest likelihood.
+
+    Parameters
+    ----------
+    count : ndarray of float64, shape (m,)
+        Number of coefficients in each bin.
+    sums : BinSums
+        Sums over bins of the products of the axis and the regressors.
+    bases : ndarray of float64, shape (p, m)
+        Variance of a coefficient for θ_j = 1.
+    constant : ndarray of float64, shape (m,)
+        Variance that is not fitted.
+    start : ndarray of float64, shape (p,)
+        Starting values of θ.
+    """
+    floor = MIN_VARIANCE_RATIO * float((sums.power / np.maximum(count, 1.0)).max(initial=0.0)) or MIN_VARIANCE_RATIO
+    theta, beta, variance, residual, likelihood, information, normal = _maximise(
+        count, sums.power, sums.cross, sums.gram, bases, constant + floor, np.maximum(start, 0.0)
+    )
+    covariance = np.linalg.pinv(normal) if beta.size else np.zeros((0, 0))
+    return WhittleFit(theta, beta, variance, residual, float(likelihood), information, covariance)
+
+
+@compiled
+def _maximise(
+    count: Floats, power: Floats, cross: Floats, gram: Floats, bases: Floats, constant: Floats, start: Floats
+) -> tuple[Floats, Floats, Floats, Floats, float, Floats, Floats]:
+    """Alternate Fisher scoring for θ and least squares for β until the log-likelihood no longer increases."""
+    theta = start.copy()
+    variance, beta, normal, residual, best = _profile(theta, count, power, cross, gram, bases, constant)
+    information = np.zeros((theta.size, theta.size))
+    for _ in range(MAX_FIT_ITERATIONS):
+        gradient = _score_and_information(count, bases, variance, residual, information)
+        aim = _nonnegative_maximum(information, gradient, theta)
+        before = best
+        share = 1.0
+        for _ in range(MAX_STEP_HALVINGS):
+            trial = theta + share * (aim - theta)
+            v, b, n, r, value = _profile(trial, count, power, cross, gram, bases, constant)
+            if value > best:
+                theta, variance, beta, normal, residual, best = trial, v, b, n, r, value
+                break
+            share *= 0.5
+        if not best > before + CONVERGENCE_NATS:
+            break
+    return theta, beta, variance, residual, best, information, normal
+
+
+@compiled
+def _profile(
+    theta: Floats, count: Floats, power: Floats, cross: Floats, gram: Floats, bases: Floats, constant: Floats
+) -> tuple[Floats, Floats, Floats, Floats, float]:
+    """Return the variances, the best β with its normal matrix, the residuals and the log-likelihood for a given θ.
+
+    The log-likelihood has no constant term.
+    """
+    variance = constant.copy()
+    for j in range(theta.size):
+        if theta[j] > 0.0:
+            for b in range(variance.size):
+                variance[b] += theta[j] * bases[j, b]
+    q = cross.shape[0]
+    beta, normal, residual = np.zeros(q), np.zeros((q, q)), power.copy()
+    if q:
+        beta, normal = _regress(cross, gram, variance)
+        residual = _residual(power, cross, gram, beta)
+    total = 0.0
+    for b in range(count.size):
+        total -= 0.5 * (count[b] * np.log(variance[b]) + residual[b] / variance[b])
+    return variance, beta, normal, residual, total
+
+
+@compiled
+def _score_and_information(
+    count: Floats, bases: Floats, variance: Floats, residual: Floats, information: Floats
+) -> Floats:
+    """Return the gradient of the log-likelihood with respect to θ, and write the Fisher information in place."""
+    p, m = bases.shape
+    gradient = np.zeros(p)
+    for j in range(p):
+        total = 0.0
+        for b in range(m):
+            total += 0.5 * bases[j, b] * (residual[b] / variance[b] - count[b]) / variance[b]
+        gradient[j] = total
+        for i in range(j + 1):
+            total = 0.0
+            for b in range(m):
+                total += 0.5 * count[b] * bases[j, b] * bases[i, b] / variance[b] ** 2
+            information[j, i] = total
+            information[i, j] = total
+    return gradient
+
+
+@compiled
+def _regress(cross: Floats, gram: Floats, variance: Floats) -> tuple[Floats, Floats]:
+    """Return the generalised least-squares estimate of β and its normal matrix.
+
+    A small ridge term allows collinear regressors.
+    """
+    q, m = cross.shape
+    normal = np.zeros((q, q))
+    right = np.zeros(q)
+    for i in range(q):
+        for b in range(m):
+            right[i] += cross[i, b] / variance[b]
+        for j in range(i + 1):
+            total = 0.0
+            for b in range(m):
+                total += gram[i, j, b] / variance[b]
+            normal[i, j] = total
+            normal[j, i] = total
+    scaled = np.zeros((q, q))
+    scale = np.zeros(q)
+    for i in range(q):
+        scale[i] = np.sqrt(normal[i, i]) if normal[i, i] > 0.0 else 1.0
+    for i in range(q):
+        for j in range(q):
+            scaled[i, j] = normal[i, j] / (scale[i] * scale[j])
+        scaled[i, i] += 1e-10
+    return np.linalg.solve(scaled, right / scale) / scale, normal
+
+
+@compiled
+def _residual(power: Floats, cross: Floats, gram: Floats, beta: Floats) -> Floats:
+    """Return the sum of squares in each bin after the regressors are removed."""
+    q, m = cross.shape
+    left = power.copy()
+    for b in range(m):
+        for i in range(q):
+            left[b] -= 2.0 * beta[i] * cross[i, b]
+            for j in range(q):
+                left[b] += beta[i] * beta[j] * gram[i, j, b]
+        if left[b] < 0.0:
+            left[b] = 0.0  # negative only by rounding
+    return left
+
+
+@compiled
+def _nonnegative_maximum(information: Floats, gradient: Floats, theta: Floats) -> Floats:
+    """Return the maximum of the quadratic approximation over θ ≥ 0, by coordinate descent."""
+    p = theta.size
+    found = theta.copy()
+    slope = gradient.copy()
+    for _ in range(500):
+        largest_gain = 0.0
+        for j in range(p):
+            if information[j, j] <= 0.0:
+                continue
+            new = max(found[j] + slope[j] / information[j, j], 0.0)
+            change = new - found[j]
+            if change != 0.0:
+                for i in range(p):
+                    slope[i] -= information[i, j] * change
+                found[j] = new
+                largest_gain = max(largest_gain, change * change * information[j, j])
+        if largest_gain < 1e-12:
+            break
+    return found

@@ -1,0 +1,90 @@
+"""Input of ``reconcile``: the recording, the selection of usable axes and the smoothing of the temperature."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from drivers.data_types import Floats
+from drivers.errors import NotReady
+from monitor.noise.model import NoiseModel
+
+MIN_SAMPLES: Final = 4096
+"""Smallest number of samples. A spectrum and a spectrogram need at least this number."""
+MIN_VALID_FRACTION: Final = 0.5
+TEMPERATURE_SMOOTHING_FRACTION: Final = 0.001
+"""Length of the moving average of the temperature, as a fraction of the recording. The temperature of a sensor changes
+slowly, and thermometers are noisy.
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """Measured samples of one recording, with the sample rate and the temperature."""
+
+    values: Mapping[str, Floats]  # axis -> [n] SI; NaN = missing
+    rate_hz: float
+    temperature_c: Floats | None = None  # [n] °C; NaN = missing
+
+    @property
+    def samples(self) -> int:
+        """Number of samples of each axis."""
+        return next(iter(self.values.values())).size
+
+
+def select_usable_axes(recording: Recording, model: NoiseModel | None) -> tuple[Recording, tuple[str, ...]]:
+    """Select the axes that can be compared.
+
+    Parameters
+    ----------
+    recording : Recording
+        Recording to check.
+    model : NoiseModel or None
+        Model under test. If None, every axis with enough samples and varying values is kept.
+
+    Returns
+    -------
+    recording : Recording
+        Recording with the selected axes and the smoothed temperature.
+    notes : tuple of str
+        One sentence for each axis that is not used.
+
+    Raises
+    ------
+    NotReady
+        If the recording has too few samples or no usable axis.
+    """
+    if recording.samples < MIN_SAMPLES:
+        raise NotReady(
+            f"the recording has {recording.samples} samples; at least {MIN_SAMPLES} are needed "
+            f"({MIN_SAMPLES / recording.rate_hz:.0f} s at {recording.rate_hz:g} Hz)"
+        )
+    notes, kept = [], {}
+    for name, y in recording.values.items():
+        valid = y[np.isfinite(y)]
+        if valid.size < MIN_SAMPLES or valid.size < MIN_VALID_FRACTION * y.size:
+            notes.append(f"{name}: only {valid.size} of {y.size} samples are valid; left out")
+        elif np.ptp(valid) == 0.0:
+            notes.append(f"{name}: all samples have the same value; left out")
+        elif model is not None and not model.effects.get(name):
+            notes.append(f"{name}: the model does not contain this axis; left out")
+        else:
+            kept[name] = y
+    if not kept:
+        raise NotReady("no axis to compare: " + "; ".join(notes))
+    temperature_c = recording.temperature_c
+    if temperature_c is not None:
+        temperature_c = _smooth_temperature(temperature_c) if np.isfinite(temperature_c).any() else None
+    return Recording(kept, recording.rate_hz, temperature_c), tuple(notes)
+
+
+def _smooth_temperature(temperature_c: Floats) -> Floats:
+    """Interpolate missing samples of the temperature and smooth the noise of the thermometer by a moving average."""
+    known = np.flatnonzero(np.isfinite(temperature_c))
+    whole = np.interp(np.arange(temperature_c.size), known, temperature_c[known])
+    half = int(0.5 * TEMPERATURE_SMOOTHING_FRACTION * whole.size)
+    if half < 1:
+        return whole
+    sums = np.concatenate([[0.0], np.cumsum(np.pad(whole - whole[0], half, mode="edge"))])
+    return np.asarray((sums[2 * half + 1 :] - sums[: -2 * half - 1]) / (2 * half + 1) + whole[0])

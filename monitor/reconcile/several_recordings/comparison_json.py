@@ -1,0 +1,85 @@
+"""JSON report of a comparison of several recordings: schema imu-monitor/reconcile-runs/1.
+
+Equal comparisons give equal bytes. Numbers are in SI units, and a number that is not finite becomes null. The
+``parameters`` of an effect are pooled over the recordings that show the effect. The entry ``p`` of a parameter is the
+probability of an equal or larger scatter if the true value is the same in all recordings. The entries ``consistent``
+and ``p`` of an effect refer to the size. ``each`` contains the values of each recording. The file ``report.json`` in
+``folder`` contains the complete result of a recording.
+"""
+
+from typing import Any, Final
+
+import msgspec
+
+from monitor.reconcile.json_report import finite_or_none, parameter_entry
+from monitor.reconcile.result import AddedOrResizedEffect
+from monitor.reconcile.several_recordings.comparison import AxisComparison, Comparison, MatchedEffect, NamedResult
+
+SCHEMA: Final = "imu-monitor/reconcile-runs/1"
+
+
+def encode_comparison(c: Comparison) -> bytes:
+    """Encode a comparison as JSON."""
+    return msgspec.json.encode({
+        "schema": SCHEMA,
+        "verdict": c.verdict,
+        "seed": int(c.seed),
+        "fitted_to": c.fitted_to,
+        "recordings": [
+            *(_run_entry(run) for run in c.runs),
+            *({"name": name, "folder": name, "verdict": None, "why": why} for name, why in c.without_result.items()),
+        ],
+        "axes": {axis: _axis_entry(one) for axis, one in c.axes.items()},
+    })  # fmt: skip
+
+
+def _run_entry(run: NamedResult) -> dict[str, Any]:
+    """Return the report entry of one recording."""
+    return {
+        "name": run.name,
+        "folder": run.name,
+        "verdict": run.result.verdict,
+        "rate": finite_or_none(run.result.rate_hz),
+        "samples": int(run.result.samples),
+        "seconds": finite_or_none(run.result.duration_s),
+    }
+
+
+def _axis_entry(one: AxisComparison) -> dict[str, Any]:
+    """Return the report entry of one axis."""
+    return {
+        "verdicts": {run: result.verdict for run, result in one.results.items()},
+        "common": [_effect_entry(matched) for matched in one.common],
+        "single": [
+            {
+                **_effect_entry(matched),
+                "absent": [{"run": a.run, "meaning": a.meaning, "because": a.because} for a in matched.absent],
+            }
+            for matched in one.single
+        ],
+    }
+
+
+def _effect_entry(matched: MatchedEffect) -> dict[str, Any]:
+    """Return the report entry of one effect."""
+    return {
+        "effect": matched.effect,
+        "kind": matched.kind,
+        "recordings": list(matched.steps),
+        "parameters": {
+            name: {**parameter_entry(one.bounds), **({} if one.p is None else {"p": finite_or_none(one.p)})}
+            for name, one in matched.parameters.items()
+        },
+        "consistent": matched.consistent,
+        "p": finite_or_none(matched.p),
+        "each": {run: _step_entry(step) for run, step in matched.steps.items()},
+    }
+
+
+def _step_entry(step: AddedOrResizedEffect) -> dict[str, Any]:
+    """Return the report entry of one effect in one recording."""
+    return {
+        "parameters": {name: parameter_entry(one) for name, one in step.parameters.items()},
+        "confidence": finite_or_none(step.confidence),
+        "gap": {"before": finite_or_none(step.before.gap), "after": finite_or_none(step.after.gap)},
+    }

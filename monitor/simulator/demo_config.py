@@ -1,0 +1,71 @@
+"""Configuration of the ``demo`` command.
+
+The configuration is the shipped one. Options select another sensor and add effects.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Final, ParamSpec, TypeVar
+
+from drivers.errors import ConfigError
+from monitor.common import shipped_config_paths as shipped_file_paths
+from monitor.common.shipped_config_paths import CONFIG_FOLDER
+from monitor.noise.model_loading import read_model
+from monitor.settings import loading
+from monitor.settings.loading import Config, VirtualTable
+from monitor.simulator import DEFAULT_RATE_HZ, parse_effects
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+DEMO_CONFIG: Final = CONFIG_FOLDER / "demo.toml"
+"""Shipped configuration of the demo."""
+
+
+def demo_config(sensor: str | None = None, effects: Sequence[str] = (), effect_at_s: float | None = None) -> Config:
+    """Return the configuration of ``demo``.
+
+    Parameters
+    ----------
+    sensor : str, optional
+        Model of the catalogue, or path of a model file. The default is the model of the shipped configuration.
+    effects : sequence of str, optional
+        Effects in the syntax of ``parse_effects``.
+    effect_at_s : float, optional
+        Time at which the effects begin, in seconds since the start.
+
+    Raises
+    ------
+    ConfigError
+        If an option has an invalid value. The message begins with the name of the option.
+    """
+    config = loading.load(DEMO_CONFIG)
+    (device,) = config.devices
+    table = device.link
+    assert isinstance(table, VirtualTable)
+    given = {
+        "model": None
+        if sensor is None
+        else str(_for_option("--sensor", shipped_file_paths.model_path, sensor, Path.cwd())),
+        "effect": tuple(effects) or None,
+        "effect_at": effect_at_s,
+    }
+    table = table.model_copy(update={key: value for key, value in given.items() if value is not None})
+    rate_hz = _for_option("--sensor", read_model, Path(table.model)).sample_rate_hz or DEFAULT_RATE_HZ
+    for text in effects:
+        _for_option("--effect", parse_effects, text)
+    window_s = min(device.window_s, loading.WINDOW_SAMPLES[1] / rate_hz)
+    # the viewer then shows when the sensor no longer agrees with the noise model
+    driver = replace(device.driver, link=table)
+    update = {"driver": driver, "rate_hz": rate_hz, "window_s": window_s, "model": Path(table.model)}
+    device = device.model_copy(update=update)
+    return replace(config, devices=(device,), path=None)
+
+
+def _for_option(option: str, function: Callable[P, T], *arguments: P.args, **named: P.kwargs) -> T:
+    """Call a function, and prefix a ConfigError with the name of the option."""
+    try:
+        return function(*arguments, **named)
+    except ConfigError as error:
+        raise ConfigError(f"{option}: {error}") from error
