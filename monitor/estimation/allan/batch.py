@@ -86,19 +86,7 @@ def overlapping_avar(values: Floats, factors: Ints, each: EachAxis = map) -> tup
 def overlapping_avar_axis(rate: Floats, factors: Ints) -> Column:
     """Return the overlapping Allan variance of one axis and the number of terms, as ``overlapping_avar`` does.
 
-    Parameters
-    ----------
-    rate : ndarray of float, shape (n,)
-        Rates of the axis. Values that are not finite are missing.
-    factors : ndarray of int64, shape (m,)
-        Cluster sizes in samples.
-
-    Returns
-    -------
-    avar : ndarray of float64, shape (m,)
-        Allan variance in squared units of the axis.
-    terms : ndarray of int64, shape (m,)
-        Number of terms.
+    The rates have the shape (n,), and the results have the shape (m,).
     """
     phase = np.empty(len(rate) + 1)
     phase[0] = 0.0

@@ -57,19 +57,7 @@ class HadamardCurve:
 def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
     """Return the overlapping Hadamard variance of rates and the number of terms.
 
-    Parameters
-    ----------
-    values : ndarray of float64, shape (n, k)
-        Rates of k axes; values that are not finite are missing.
-    factors : ndarray of int64, shape (m,)
-        Cluster sizes in samples, up to n/3.
-
-    Returns
-    -------
-    hvar : ndarray of float64, shape (m, k)
-        Hadamard variance in squared units of the axis.
-    terms : ndarray of int64, shape (m, k)
-        Number of terms.
+    The parameters and results are those of ``total.total_variance``, with cluster sizes of up to n/3.
 
     >>> ramp = np.arange(90.0)[:, None]
     >>> hadamard_variance(ramp + np.tile([[0.0], [0.5]], (45, 1)), np.array([1, 2]))[0].ravel().round(12).tolist()
@@ -81,16 +69,7 @@ def hadamard_variance(values: Floats, factors: Ints) -> tuple[Floats, Ints]:
 def hadamard_curve(values: Floats, rate_hz: float, theta: Floats, factors: Ints | None = None) -> HadamardCurve:
     """Return the Hadamard variance of a record with confidence intervals.
 
-    Parameters
-    ----------
-    values : ndarray of float64, shape (n, k)
-        Rates of k axes; values that are not finite are missing.
-    rate_hz : float
-        Sample rate in Hz.
-    theta : ndarray of float64, shape (5, k)
-        Fitted Q² N² B² K² R² in SI, see ``coefficient_fit.Fit.theta``; NaN means unknown.
-    factors : ndarray of int64, shape (m,), or None
-        Cluster sizes in samples, up to n/3. None means octaves.
+    The parameters are those of ``total.total_curve``, with cluster sizes of up to n/3.
     """
     n = len(values)
     factors = octaves(n // 3) if factors is None else factors
@@ -103,18 +82,7 @@ def make_hadamard_curve(
 ) -> HadamardCurve:
     """Compute degrees of freedom and confidence intervals of Hadamard variances.
 
-    Parameters
-    ----------
-    moments : sequence of Moments
-        Moments of the m cluster sizes.
-    rate_hz : float
-        Sample rate in Hz.
-    theta : ndarray of float64, shape (5, k)
-        Fitted Q² N² B² K² R² in SI; NaN means unknown.
-    raw : ndarray of float64, shape (m, k)
-        Hadamard variances.
-    terms : ndarray of int64, shape (m, k)
-        Number of terms.
+    The parameters are those of ``total.make_total_curve``.
     """
     _, edf, lo, hi = correct_bias(moments, theta_per_sample(theta, rate_hz), raw, terms)
     factors = np.array([one.factor for one in moments])

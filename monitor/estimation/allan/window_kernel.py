@@ -442,25 +442,8 @@ def mean_second_difference(phase: Ints, missing: NDArray[np.int32], newest: int,
     a long block are used, because phase is smooth enough for them to represent the block. A missing sample is replaced
     by the mean of the newest samples.
 
-    Parameters
-    ----------
-    phase : ndarray of int64, shape (places · LANES,)
-        Integer phase.
-    missing : ndarray of int32, shape (places · LANES,)
-        Running count of missing samples.
-    newest : int
-        Row of the newest phase point.
-    n : int
-        Number of newest samples in use.
-    m : int
-        Cluster size in samples.
-    axis : int
-        Index of the axis.
-
-    Returns
-    -------
-    float
-        Slope of the rate in integer units per sample; NaN if too many samples are missing.
+    The result is the slope of the rate in integer units per sample, or NaN if too many samples are missing. The
+    parameters are those of ``slope_of_thirds``, with the cluster size m in samples.
     """
     places = phase.size // LANES
     last, first = newest * LANES + axis, place(newest - n, places) * LANES + axis
