@@ -3,7 +3,8 @@
 A row of ``RESULT_KINDS`` lists the messages that are published and the viewer panels that draw the result. It also
 states how often the panels draw, and how results are merged while they wait for a slow viewer. A new kind of result
 needs a row here, a message in ``monitor.publishing.messages.results``, a panel in
-``monitor.publishing.rerun.result_panels`` and the code that produces the result. The module does no I/O and does not import Rerun.
+``monitor.publishing.rerun.result_panels`` and the code that produces the result. The module does no I/O and does not
+import Rerun.
 """
 
 from collections.abc import Callable

@@ -5,10 +5,11 @@ is extracted from the frames of many samples at once. The tests compare the extr
 cantools decodes.
 
 One sample may be spread over several messages. ``drivers.decoders.dbc.sample_assembly`` joins the frames in order of
-arrival. A sample is bad, and counts as missing, if one of its frames is missing, too short or not ``valid``. With ``partial = true``, the axes of a missing frame are only marked as not measured. A sample also
-counts as missing if one of its frames arrived later than the time ``window`` allows. Such samples are counted in
-``dropped_late_samples`` instead of ``bad``. A message that contains only the temperature may be sent less often than
-the other messages. Each sample then gets the newest temperature.
+arrival. A sample is bad, and counts as missing, if one of its frames is missing, too short or not ``valid``. With
+``partial = true``, the axes of a missing frame are only marked as not measured. A sample also counts as missing if one
+of its frames arrived later than the time ``window`` allows. Such samples are counted in ``dropped_late_samples``
+instead of ``bad``. A message that contains only the temperature may be sent less often than the other messages. Each
+sample then gets the newest temperature.
 
 J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by their parameter group, without priority
 and sender. The decoder accepts the first sender that it receives, unless ``source`` names the sender. A raw value in
