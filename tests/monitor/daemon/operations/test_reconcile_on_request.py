@@ -97,7 +97,7 @@ def test_the_program_is_given_the_window_as_a_recording(tmp_path: Path) -> None:
     text = f"""
         import shutil
         shutil.copy(sys.argv[1], {str(kept)!r})
-        while os.nice(0) < {min(os.nice(0) + NICENESS_INCREASE, LARGEST_NICENESS)}:  # the parent sets it after the start
+        while os.nice(0) < {min(os.nice(0) + NICENESS_INCREASE, LARGEST_NICENESS)}:  # set after the start
             time.sleep(0.01)
         seen = {{"given": given, "nice": os.nice(0)}}
         print(json.dumps({{"verdict": "agrees", **seen}}))
