@@ -378,7 +378,7 @@ def alarms(seeds: int) -> None:
                 by_hand.adopt_and_start_models(one)
             told += [event.text for event in one.take_events()]
         hours = sum(len(values) for values in records) / rate_hz / 3600.0
-        made.add_row(name, f"{hours:.1f}", str(len(told)), str(sum("stepped" in text for text in told)))
+        made.add_row(name, f"{hours:.1f}", str(len(told)), str(sum("step of the bias" in text for text in told)))
     console.print(made)
 
 
