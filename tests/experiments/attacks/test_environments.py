@@ -240,7 +240,7 @@ def test_the_current_folder_is_gone(script: Path, recording: Path, tmp_path: Pat
         )  # fmt: skip
         assert done.returncode == status, done.stderr
         if status:
-            assert "the current folder is gone" in one_line(done, status)
+            assert "the current folder has been removed" in one_line(done, status)
 
 
 @ON_DEMAND
