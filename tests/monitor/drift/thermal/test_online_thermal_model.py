@@ -42,7 +42,7 @@ def shares(looks, biases):
 def test_it_learns_how_bias_follows_temperature():
     means = hourly(1, 2, 0.05)
     run = Run().give(means.bias, means.temperature_c)
-    assert "12 are the least" in run.looks[5].text
+    assert "at least 12 are needed" in run.looks[5].text
     assert run.looks[5].one_step is None
     assert all(one.one_step is not None and not one.text for one in run.looks[12:])
     assert run.looks[-1].model.startswith("difference")
