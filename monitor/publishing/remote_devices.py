@@ -21,7 +21,7 @@ from monitor.publishing.messages.message import Message, decode_message
 from monitor.publishing.messages.results import (
     CoefficientsMessage,
     EventMessage,
-    GapMessage,
+    ModelGapMessage,
     StatusMessage,
     measured_axes,
 )
@@ -45,7 +45,7 @@ DECODERS: Final[dict[topics.Topic, Callable[[bytes], Message]]] = {
     topics.STATUS: StatusMessage.decode,
     topics.EVENT: EventMessage.decode,
     topics.COEFFICIENTS: partial(decode_message, CoefficientsMessage),
-    topics.GAP: partial(decode_message, GapMessage),
+    topics.GAP: partial(decode_message, ModelGapMessage),
 }
 """Decoder of each topic that tables of devices show."""
 
@@ -101,8 +101,8 @@ class RemoteDevice:
             return "silent"
         return "present" if self.status is None else self.status.state
 
-    def rank(self, now_s: float) -> int:
-        """Return the rank in tables: 0 no data, 1 a problem or not ready, 2 running, 3 ended."""
+    def display_rank(self, now_s: float) -> int:
+        """Return the display_rank in tables: 0 no data, 1 a problem or not ready, 2 running, 3 ended."""
         state, status = self.state(now_s), self.status
         if state in ("lost", "gone", "silent"):
             return 0
@@ -114,7 +114,7 @@ class RemoteDevice:
         troubled = status.text or status.overflowed or status.crossed or self.disagreements
         return 2 if outputs_work and not troubled else 1
 
-    def problems(self) -> str:
+    def describe_problems(self) -> str:
         """Return a description of all problems, or "" if there are none."""
         if self.status is None:
             return ""
@@ -130,7 +130,7 @@ class RemoteDevice:
             found.append(f"limits exceeded: {', '.join(crossed[:MAX_NAMED_LIMITS])}{more}")
         return "; ".join([*found, *self.disagreements])
 
-    def update(self, message: Message) -> None:
+    def update_from_message(self, message: Message) -> None:
         """Update the state from a message.
 
         Raises
@@ -143,7 +143,7 @@ class RemoteDevice:
                 self.status = message
             case CoefficientsMessage():
                 self.coefficients = DeviceCoefficients.from_message(message)
-            case GapMessage():
+            case ModelGapMessage():
                 self.disagreements = tuple(_describe_disagreements(message))
 
 
@@ -175,14 +175,14 @@ class DeviceStates:
         payload
             Encoded message.
         """
-        device, topic = split_key(key) or ("", topics.ALIVE)
+        device, topic = split_device_and_topic(key) or ("", topics.ALIVE)
         with self._lock:
             try:
                 if topic not in DECODERS:
                     return None
                 message = DECODERS[topic](payload)
                 known = self._devices.get(device) or RemoteDevice(device, 0.0)
-                known.update(message)
+                known.update_from_message(message)
             except ValueError:
                 self.malformed += 1
                 return None
@@ -193,7 +193,7 @@ class DeviceStates:
                     self._events.append((device, message))
         return message
 
-    def set_token(self, key: str, exists: bool) -> None:
+    def set_liveliness_token(self, key: str, exists: bool) -> None:
         """Process the change of a liveliness token.
 
         Parameters
@@ -203,7 +203,7 @@ class DeviceStates:
         exists
             True if the token exists.
         """
-        device, topic = split_key(key) or ("", None)
+        device, topic = split_device_and_topic(key) or ("", None)
         if topic is not topics.ALIVE:
             return
         with self._lock:
@@ -211,21 +211,21 @@ class DeviceStates:
             if self._add(known):
                 known.token_exists = exists
 
-    def remove(self, key: str) -> None:
+    def remove_device(self, key: str) -> None:
         """Remove the state and the events of the device to which a key belongs."""
-        device, _ = split_key(key) or ("", None)
+        device, _ = split_device_and_topic(key) or ("", None)
         with self._lock:
             self._devices.pop(device, None)
             for one in [one for one in self._events if one[0] == device]:
                 self._events.remove(one)
 
-    def devices(self, now_s: float) -> list[RemoteDevice]:
+    def sorted_devices(self, now_s: float) -> list[RemoteDevice]:
         """Return copies of the states of all devices. Devices with problems at time ``now_s`` [s] come first."""
         with self._lock:
             found = [copy.copy(one) for one in self._devices.values()]
-        return sorted(found, key=lambda one: (one.rank(now_s), one.key))
+        return sorted(found, key=lambda one: (one.display_rank(now_s), one.key))
 
-    def coefficients(self, device: str) -> DeviceCoefficients | None:
+    def device_coefficients(self, device: str) -> DeviceCoefficients | None:
         """Return the newest coefficients of a device, or None if there are none."""
         with self._lock:
             known = self._devices.get(device)
@@ -251,12 +251,12 @@ class DeviceStates:
         return True
 
 
-def split_key(key: str) -> tuple[str, topics.Topic] | None:
+def split_device_and_topic(key: str) -> tuple[str, topics.Topic] | None:
     """Split a key into the key of the device and the topic. Return None if the topic is unknown.
 
-    >>> split_key("imu/bench-1/status")
+    >>> split_device_and_topic("imu/bench-1/status")
     ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz', kept=1))
-    >>> split_key("imu/bench-1/mood")
+    >>> split_device_and_topic("imu/bench-1/mood")
     """
     for topic in topics.TOPICS:
         device = key.removesuffix(f"/{topic.name}")
@@ -265,7 +265,7 @@ def split_key(key: str) -> tuple[str, topics.Topic] | None:
     return None
 
 
-def _describe_disagreements(message: GapMessage) -> list[str]:
+def _describe_disagreements(message: ModelGapMessage) -> list[str]:
     """Return a text for each axis that disagrees with its model."""
     found = [(axis, message.axes[axis]) for axis in AXES if axis in message.axes]
     return [

@@ -22,11 +22,11 @@ from monitor.publishing.messages.results import (
     AllanMessage,
     CoefficientsMessage,
     EventMessage,
-    GapMessage,
-    SlowStatistics,
+    ModelGapMessage,
     StatusMessage,
     ThermalMessage,
-    TotalMessage,
+    TotalAndHadamardCurves,
+    TotalAndHadamardMessage,
 )
 
 POINT_INTERVAL_S: Final = 1.0
@@ -82,7 +82,7 @@ def keep_newest(waiting: list[TimedResult], new: TimedResult) -> None:
     waiting[:] = [new]
 
 
-def keep_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
+def keep_newest_and_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
     """Add the new result, and drop the previous result if it follows the result before it too closely.
 
     The coefficients for each sample of a dropped estimate are kept. The parameters are those of ``keep_all``.
@@ -97,7 +97,7 @@ def keep_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawing:
+class DrawingRule:
     """Rule for drawing one kind of result in one panel of the viewer."""
 
     panel: str
@@ -116,7 +116,7 @@ class ResultKind:
     result: type
     """Class of the results."""
     messages: tuple[type[Message], ...] = ()
-    drawings: tuple[Drawing, ...] = ()
+    drawings: tuple[DrawingRule, ...] = ()
     size_bytes: Callable[[Any], int] = lambda _result: SMALL_RESULT_BYTES
     """Approximate size of a result, for the limit of the viewer's queue."""
 
@@ -124,34 +124,34 @@ class ResultKind:
 RESULT_KINDS: Final = (
     ResultKind(
         SampleRows,
-        drawings=(Drawing("SamplesPanel"),),
+        drawings=(DrawingRule("SamplesPanel"),),
         size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes + one.temperature_c.nbytes,
     ),
-    ResultKind(Event, (EventMessage,), (Drawing("EventsPanel"),)),
-    ResultKind(Health, (StatusMessage,), (Drawing("HealthPanel", keep_newest),)),
+    ResultKind(Event, (EventMessage,), (DrawingRule("EventsPanel"),)),
+    ResultKind(Health, (StatusMessage,), (DrawingRule("HealthPanel", keep_newest),)),
     ResultKind(
-        DeviceTableText, drawings=(Drawing("DeviceTablePanel", keep_newest),), size_bytes=lambda one: len(one.text)
+        DeviceTableText, drawings=(DrawingRule("DeviceTablePanel", keep_newest),), size_bytes=lambda one: len(one.text)
     ),
     ResultKind(
         CompensatedRows,
-        drawings=(Drawing("CompensatedPanel"),),
+        drawings=(DrawingRule("CompensatedPanel"),),
         size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes,
     ),
-    ResultKind(ThermalIntervalResult, (ThermalMessage,), (Drawing("ThermalPanel"),)),
-    ResultKind(DriftUpdate, drawings=(Drawing("DriftPanel"),)),
-    ResultKind(SlowStatistics, (TotalMessage,)),
+    ResultKind(ThermalIntervalResult, (ThermalMessage,), (DrawingRule("ThermalPanel"),)),
+    ResultKind(DriftUpdate, drawings=(DrawingRule("DriftPanel"),)),
+    ResultKind(TotalAndHadamardCurves, (TotalAndHadamardMessage,)),
     ResultKind(
         ModelGap,  # before the estimate, because the Allan plot also shows the deviations of the model
-        (GapMessage,),
-        (Drawing("GapPanel", keep_spaced, period_s=1.0),),
+        (ModelGapMessage,),
+        (DrawingRule("GapPanel", keep_newest_and_spaced, period_s=1.0),),
         size_bytes=lambda one: 6 * 4 * int(one.tau_s.nbytes),
     ),
     ResultKind(
         Estimate,
         (AllanMessage, CoefficientsMessage),
         (
-            Drawing("AllanPanel", keep_newest, period_s=1.0, shares_rate=True),
-            Drawing("CoefficientsPanel", keep_spaced, period_s=5.0),
+            DrawingRule("AllanPanel", keep_newest, period_s=1.0, shares_rate=True),
+            DrawingRule("CoefficientsPanel", keep_newest_and_spaced, period_s=5.0),
         ),
         size_bytes=lambda one: 8 * int(one.curve.avar.nbytes),
     ),

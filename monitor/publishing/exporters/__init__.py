@@ -17,19 +17,23 @@ from typing import Any, Final
 from drivers.errors import ConfigError
 from drivers.number_ranges import COEFFICIENT, INFLATION
 from monitor.publishing.exporters.exported_coefficients import (
+    ExportedCoefficient,
     NoiseCoefficients,
-    Term,
-    from_analysis,
+    from_analysis_json,
     from_model,
     missing_coefficient_error,
 )
-from monitor.publishing.exporters.gyroparams import gyroparams
-from monitor.publishing.exporters.kalibr import kalibr
-from monitor.publishing.exporters.kalman import kalman
+from monitor.publishing.exporters.gyroparams import export_gyroparams
+from monitor.publishing.exporters.kalibr import export_kalibr
+from monitor.publishing.exporters.kalman import export_kalman
 
-__all__ = ["FORMATS", "NoiseCoefficients", "Term", "export", "from_analysis", "from_model"]
+__all__ = ["FORMATS", "ExportedCoefficient", "NoiseCoefficients", "export", "from_analysis_json", "from_model"]
 
-FORMATS: Final[dict[str, Callable[..., str]]] = {"kalibr": kalibr, "gyroparams": gyroparams, "kalman": kalman}
+FORMATS: Final[dict[str, Callable[..., str]]] = {
+    "kalibr": export_kalibr,
+    "gyroparams": export_gyroparams,
+    "kalman": export_kalman,
+}
 """Export function of each format."""
 
 
@@ -39,7 +43,7 @@ def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, *
     Parameters
     ----------
     noise
-        Coefficients from ``from_model`` or ``from_analysis``.
+        Coefficients from ``from_model`` or ``from_analysis_json``.
     format_name
         Name of the format, a key of FORMATS.
     inflation

@@ -49,7 +49,7 @@ def ascii_unit(letter: str, kind: Kind) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
+class ExportedCoefficient:
     """Coefficient of one axis, SI."""
 
     value: float
@@ -60,14 +60,14 @@ class Term:
 class NoiseCoefficients:
     """Noise coefficients by axis and letter. Unknown axes and letters are absent."""
 
-    axes: Mapping[str, Mapping[str, Term]]
+    axes: Mapping[str, Mapping[str, ExportedCoefficient]]
     sample_rate_hz: float | None
     source: str  # origin of the numbers, for the header of the file
     left_out: tuple[str, ...] = ()  # other effects, such as "gz.sinusoidal"
     measured: bool = False  # True if the coefficients come from a recording
     warnings: tuple[str, ...] = ()  # ASCII sentences for the header of the file
 
-    def coefficients(self, kind: Kind, letter: str) -> dict[str, Term]:
+    def coefficient_by_axis(self, kind: Kind, letter: str) -> dict[str, ExportedCoefficient]:
         """Return one coefficient of the axes that have it.
 
         Parameters
@@ -95,7 +95,7 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
         Origin of the numbers, for the header of the file.
     """
     letters = {effect.name: letter for letter, effect in COEFFICIENT_EFFECTS.items()}
-    axes: dict[str, dict[str, Term]] = {}
+    axes: dict[str, dict[str, ExportedCoefficient]] = {}
     left_out = []
     for axis, effects in model.effects.items():
         sizes: dict[str, float] = {}
@@ -105,7 +105,7 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
                 left_out.append(f"{axis}.{one.name}")
             else:
                 sizes[letter] = math.hypot(sizes.get(letter, 0.0), getattr(one, letter))
-        axes[axis] = {letter: Term(size) for letter, size in sizes.items() if size > 0.0}
+        axes[axis] = {letter: ExportedCoefficient(size) for letter, size in sizes.items() if size > 0.0}
     known = {axis: axes[axis] for axis in AXES if axes.get(axis)}
     return NoiseCoefficients(known, model.sample_rate_hz, source, tuple(left_out))
 
@@ -139,12 +139,12 @@ class _Analysis(msgspec.Struct):
     rate: float | None = None
 
 
-def from_analysis(text: bytes | str, source: str = "analysis of a recording") -> NoiseCoefficients:
+def from_analysis_json(json_text: bytes | str, source: str = "analysis of a recording") -> NoiseCoefficients:
     """Return the coefficients in the output of ``imu-monitor analyze --json``.
 
     Parameters
     ----------
-    text
+    json_text
         JSON text.
     source
         Origin of the numbers, for the header of the file.
@@ -155,7 +155,7 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
         If the text is not the JSON of an analysis, or if the rate is outside the supported range.
     """
     try:
-        found = msgspec.json.decode(text, type=_Analysis)
+        found = msgspec.json.decode(json_text, type=_Analysis)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"not the JSON of an analysis: {error}") from error
     if not found.schema.startswith("imu-monitor/analyze/"):
@@ -165,13 +165,13 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
             RATE_HZ.check(found.rate)
     except ConfigError as error:
         raise ConfigError(f"rate: {error}") from None
-    axes: dict[str, dict[str, Term]] = {}
+    axes: dict[str, dict[str, ExportedCoefficient]] = {}
     for axis in (axis for axis in AXES if axis in found.axes):
         for letter, one in found.axes[axis].coefficients.items():
             if one.status == "estimated" and one.value is not None:
-                axes.setdefault(axis, {})[letter] = Term(one.value)
+                axes.setdefault(axis, {})[letter] = ExportedCoefficient(one.value)
             elif one.status == "upper_bound" and one.hi is not None:
-                axes.setdefault(axis, {})[letter] = Term(one.hi, bound=True)
+                axes.setdefault(axis, {})[letter] = ExportedCoefficient(one.hi, bound=True)
     warnings = tuple(
         f"{axis} follows its temperature, which explains {math.floor(100.0 * mark.share):d} % of its slow variance: "
         f"B and K of {axis} describe temperature as well as noise"
@@ -181,20 +181,20 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
     return NoiseCoefficients(axes, found.rate, source, measured=True, warnings=warnings)
 
 
-def missing_coefficient_error(noise: NoiseCoefficients, text: str) -> ImuError:
+def missing_coefficient_error(noise: NoiseCoefficients, message: str) -> ImuError:
     """Return the error for a missing coefficient: NotReady for a recording, ConfigError for a noise model.
 
     Parameters
     ----------
     noise
         Coefficients of the recording or the model.
-    text
+    message
         Message.
     """
-    return NotReady(f"{text}: a longer recording is needed") if noise.measured else ConfigError(text)
+    return NotReady(f"{message}: a longer recording is needed") if noise.measured else ConfigError(message)
 
 
-def header_comments(noise: NoiseCoefficients, inflation: float, mark: str) -> list[str]:
+def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: str) -> list[str]:
     """Return comments on the origin of the numbers, the inflation factor and the warnings.
 
     Parameters
@@ -203,39 +203,45 @@ def header_comments(noise: NoiseCoefficients, inflation: float, mark: str) -> li
         Coefficients.
     inflation
         Factor on N, B and K.
-    mark
+    comment_sign
         Comment mark of the format.
     """
     source = noise.source.encode("ascii", "replace").decode()
     done = "none" if inflation == 1.0 else f"N, B and K are {inflation:g} times the values of the source"
     return [
-        f"{mark} source: {source}",
-        f"{mark} inflation: {done}",
-        *(f"{mark} WARNING: {one}" for one in noise.warnings),
+        f"{comment_sign} source: {source}",
+        f"{comment_sign} inflation: {done}",
+        *(f"{comment_sign} WARNING: {one}" for one in noise.warnings),
     ]
 
 
-def omitted_comment(noise: NoiseCoefficients, used: Collection[str], mark: str) -> list[str]:
+def comment_on_omitted_terms(
+    noise: NoiseCoefficients, represented_letters: Collection[str], comment_sign: str
+) -> list[str]:
     """Return a comment that lists the terms of the source that the format cannot represent.
 
     Parameters
     ----------
     noise
         Coefficients.
-    used
+    represented_letters
         Letters that the format represents.
-    mark
+    comment_sign
         Comment mark of the format.
     """
     letters = {letter for terms in noise.axes.values() for letter, term in terms.items() if not term.bound}
-    unused = [letter for letter in COEFFICIENT_EFFECTS if letter in letters and letter not in used]
-    return [f"{mark} not in this file: {', '.join([*unused, *noise.left_out])}"] if unused or noise.left_out else []
+    unused = [letter for letter in COEFFICIENT_EFFECTS if letter in letters and letter not in represented_letters]
+    return (
+        [f"{comment_sign} not in this file: {', '.join([*unused, *noise.left_out])}"]
+        if unused or noise.left_out
+        else []
+    )
 
 
-def number(value: float) -> str:
+def format_float(value: float) -> str:
     """Format a number with seven digits so that YAML 1.1, TOML and MATLAB read it as a float.
 
-    >>> number(1.5e-4)
+    >>> format_float(1.5e-4)
     '1.500000e-04'
     """
     return f"{value:.6e}"

@@ -16,17 +16,17 @@ from monitor.common.units import Kind, axes_of
 from monitor.publishing.exporters.exported_coefficients import (
     NoiseCoefficients,
     ascii_unit,
+    comment_on_omitted_terms,
+    format_float,
     header_comments,
     join_lines,
-    number,
-    omitted_comment,
 )
 
 N_POLES: Final = 500
 """Number of poles of the 1/f filter, as in the Allan variance example of MathWorks."""
 
 
-def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
+def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
     """Return the text of the MATLAB script.
 
     Parameters
@@ -63,15 +63,15 @@ def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
         ]
     rate = "" if noise.sample_rate_hz is None else f", 'SampleRate', {noise.sample_rate_hz!r}"
     lines += ["", f"imu = imuSensor('accel-gyro'{rate}{''.join(made)});"]
-    return join_lines([*lines, *omitted_comment(noise, "NBK", "%")])
+    return join_lines([*lines, *comment_on_omitted_terms(noise, "NBK", "%")])
 
 
 def _property(noise: NoiseCoefficients, kind: Kind, letter: str, name: str, unit: str, inflation: float) -> str:
     """Return one property of three axes. An unknown value is 0, and a comment names the axis."""
-    known, values, said = noise.coefficients(kind, letter), [], ""
+    known, values, said = noise.coefficient_by_axis(kind, letter), [], ""
     for axis in axes_of(kind):
         term = known.get(axis)
-        values.append("0" if term is None or term.bound else number(term.value * inflation))
+        values.append("0" if term is None or term.bound else format_float(term.value * inflation))
         if term is None:
             said += f"; {axis} unknown"
         elif term.bound:

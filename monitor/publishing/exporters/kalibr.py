@@ -13,14 +13,14 @@ from drivers.errors import ConfigError
 from monitor.common.units import Kind
 from monitor.publishing.exporters.exported_coefficients import (
     COEFFICIENT_EFFECTS,
+    ExportedCoefficient,
     NoiseCoefficients,
-    Term,
     ascii_unit,
+    comment_on_omitted_terms,
+    format_float,
     header_comments,
     join_lines,
     missing_coefficient_error,
-    number,
-    omitted_comment,
 )
 
 INFLATION_COMMENT: Final = (
@@ -29,7 +29,7 @@ INFLATION_COMMENT: Final = (
 )
 
 
-def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
+def export_kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
     """Return the text of the file.
 
     Parameters
@@ -62,13 +62,13 @@ def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/i
         for letter, key, unit_of in (("N", "noise_density", "B"), ("K", "random_walk", "R")):
             largest, comment = _largest_term(noise, kind, letter)
             unit = f"{ascii_unit(unit_of, kind)}/sqrt(Hz)"  # a density has the unit of B (for N) or R (for K) per √Hz
-            lines += [f"# {letter}: {comment}", f"{name}_{key}: {number(largest.value * inflation)}  # {unit}"]
-    return join_lines([*lines, *omitted_comment(noise, "NK", "#")])
+            lines += [f"# {letter}: {comment}", f"{name}_{key}: {format_float(largest.value * inflation)}  # {unit}"]
+    return join_lines([*lines, *comment_on_omitted_terms(noise, "NK", "#")])
 
 
-def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[Term, str]:
+def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[ExportedCoefficient, str]:
     """Return the largest estimate, or the largest bound if there is no estimate, and a comment on the choice."""
-    known = noise.coefficients(kind, letter)
+    known = noise.coefficient_by_axis(kind, letter)
     if not known:
         raise missing_coefficient_error(
             noise, f"kalibr needs {letter} ({COEFFICIENT_EFFECTS[letter].name}) above 0 on the {kind} axes"

@@ -29,13 +29,13 @@ from drivers.number_ranges import DURATION_S
 from monitor.common.units import sensor_kind
 from monitor.noise.effects import BiasInstability
 from monitor.publishing.exporters.exported_coefficients import (
+    ExportedCoefficient,
     NoiseCoefficients,
-    Term,
     ascii_unit,
+    comment_on_omitted_terms,
+    format_float,
     header_comments,
     join_lines,
-    number,
-    omitted_comment,
 )
 
 FLICKER_TAU_S: Final = np.array([1000.0])  # any τ much longer than the sample interval gives the same deviation
@@ -55,7 +55,7 @@ HEADER_COMMENT: Final = (
 )
 
 
-def kalman(
+def export_kalman(
     noise: NoiseCoefficients, inflation: float = 1.0, dt_s: float | None = None, correlation_time_s: float | None = None
 ) -> str:
     """Return the text of the file.
@@ -95,7 +95,7 @@ def kalman(
     ]
     for axis, terms in noise.axes.items():
         lines += ["", f"[{axis}]", *_axis(axis, terms, inflation, step_s, correlation_time_s)]
-    return join_lines([*lines, *omitted_comment(noise, "NBK", "#")])
+    return join_lines([*lines, *comment_on_omitted_terms(noise, "NBK", "#")])
 
 
 def _markov_sigma(B: float) -> float:
@@ -116,21 +116,21 @@ def _markov_time_s(N: float, K: float) -> float:
     return math.sqrt(3.0) * N / K / MARKOV_PEAK_AT
 
 
-def bias_state_transition_matrix(dt_s: float, time_s: float) -> Floats:
+def state_transition_matrix(dt_s: float, correlation_time_s: float) -> Floats:
     """Return the transition matrix F [3, 3] of angle, random-walk bias and Gauss-Markov bias.
 
     Parameters
     ----------
     dt_s
         Time step [s].
-    time_s
+    correlation_time_s
         Correlation time T [s].
     """
-    lost = -math.expm1(-dt_s / time_s)
-    return np.array([[1.0, dt_s, time_s * lost], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0 - lost]])
+    lost = -math.expm1(-dt_s / correlation_time_s)
+    return np.array([[1.0, dt_s, correlation_time_s * lost], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0 - lost]])
 
 
-def process_noise_matrix(dt_s: float, N: float, K: float, sigma: float, time_s: float) -> Floats:
+def process_noise_matrix(dt_s: float, N: float, K: float, markov_sigma: float, correlation_time_s: float) -> Floats:
     """Return the covariance Q [3, 3] of the process noise of angle, random-walk bias and Gauss-Markov bias.
 
     Q is the integral of F(s) G F(s)ᵀ over 0 ≤ s ≤ dt, where F is the transition matrix and G = diag(N², K², 2σ²/T).
@@ -143,17 +143,17 @@ def process_noise_matrix(dt_s: float, N: float, K: float, sigma: float, time_s: 
         White noise, in rad/√s or m/s/√s.
     K
         Rate random walk, in rad/s/√s or m/s²/√s.
-    sigma
+    markov_sigma
         σ of the Gauss-Markov process, in rad/s or m/s².
-    time_s
+    correlation_time_s
         Correlation time T [s].
     """
-    x = dt_s / time_s
+    x = dt_s / correlation_time_s
     q = np.zeros((3, 3))
     q[:2, :2] = K**2 * np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-    q[0, 0] += N**2 * dt_s + 2.0 * (sigma * time_s) ** 2 * _integrated_markov_variance(x)
-    q[0, 2] = q[2, 0] = sigma**2 * time_s * math.expm1(-x) ** 2
-    q[2, 2] = -(sigma**2) * math.expm1(-2.0 * x)
+    q[0, 0] += N**2 * dt_s + 2.0 * (markov_sigma * correlation_time_s) ** 2 * _integrated_markov_variance(x)
+    q[0, 2] = q[2, 0] = markov_sigma**2 * correlation_time_s * math.expm1(-x) ** 2
+    q[2, 2] = -(markov_sigma**2) * math.expm1(-2.0 * x)
     return q
 
 
@@ -165,7 +165,7 @@ def _integrated_markov_variance(x: float) -> float:
 
 
 def _axis(
-    axis: str, terms: Mapping[str, Term], inflation: float, dt_s: float, correlation_time_s: float | None
+    axis: str, terms: Mapping[str, ExportedCoefficient], inflation: float, dt_s: float, correlation_time_s: float | None
 ) -> list[str]:
     """Return the TOML table of one axis: comments, densities, F and Q."""
     kind = sensor_kind(axis)
@@ -175,8 +175,8 @@ def _axis(
     lines = _remarks(terms)
     states = ["angle" if kind == "gyro" else "velocity", "bias_walk"]
     densities = [
-        f"psd_white = {number(N**2)}  # ({rate})^2/Hz, N^2",
-        f"psd_walk = {number(K**2)}  # ({drift})^2/Hz, K^2",
+        f"psd_white = {format_float(N**2)}  # ({rate})^2/Hz, N^2",
+        f"psd_walk = {format_float(K**2)}  # ({drift})^2/Hz, K^2",
     ]
     sigma = _markov_sigma(B)
     if B and time_s is None:
@@ -184,9 +184,9 @@ def _axis(
     elif B and time_s is not None:
         states.append("bias_markov")
         densities += [
-            f"psd_markov = {number(2.0 * sigma**2 / time_s)}  # ({drift})^2/Hz, 2 sigma^2/T",
-            f"sigma_markov = {number(sigma)}  # {rate}",
-            f"correlation_time = {number(time_s)}  # s, T",
+            f"psd_markov = {format_float(2.0 * sigma**2 / time_s)}  # ({drift})^2/Hz, 2 sigma^2/T",
+            f"sigma_markov = {format_float(sigma)}  # {rate}",
+            f"correlation_time = {format_float(time_s)}  # s, T",
         ]
     size = len(states)
     sigma, time_s = (sigma, time_s or 1.0) if size == 3 else (0.0, 1.0)  # without the third state, T has no effect
@@ -195,12 +195,12 @@ def _axis(
         *lines,
         f"states = [{listed}]",
         *densities,
-        f"F = {_matrix(bias_state_transition_matrix(dt_s, time_s)[:size, :size])}",
+        f"F = {_matrix(state_transition_matrix(dt_s, time_s)[:size, :size])}",
         f"Q = {_matrix(process_noise_matrix(dt_s, N, K, sigma, time_s)[:size, :size])}",
     ]
 
 
-def _remarks(terms: Mapping[str, Term]) -> list[str]:
+def _remarks(terms: Mapping[str, ExportedCoefficient]) -> list[str]:
     """Return comments on the unknown coefficients and upper bounds of one axis."""
     unknown = [letter for letter in "NBK" if letter not in terms]
     bounds = [letter for letter in "NBK" if letter in terms and terms[letter].bound]

@@ -22,7 +22,12 @@ from monitor.history.history_table import MAX_EVENTS, ColumnStatistics, HistoryT
 from monitor.history.query_parameters import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, HistoryQuery
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
-from monitor.publishing.messages.message import Message, decode_message, remove_control_characters, shared_fields
+from monitor.publishing.messages.message import (
+    Message,
+    attributes_with_field_names,
+    decode_message,
+    remove_control_characters,
+)
 
 MAX_BUCKETS: Final = 1_000_000
 """Largest number of buckets accepted in a message."""
@@ -75,20 +80,20 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
             status=[_STATUS_NAMES[one] for one in status.tolist()],
         )
 
-    def coefficient_columns(self, value_column: str, buckets: int) -> dict[str, ColumnStatistics]:
+    def coefficient_columns(self, value_column: str, bucket_count: int) -> dict[str, ColumnStatistics]:
         """Return the stored columns of the coefficient.
 
         Parameters
         ----------
         value_column
             Name of the column of the value, such as gz.N.
-        buckets
+        bucket_count
             Number of buckets.
         """
-        value, n = self.to_column(buckets), _checked(self.n, (buckets,))
-        lo, hi = (_checked(one, (buckets,)) for one in (self.lo, self.hi))
+        value, n = self.to_column(bucket_count), _checked(self.n, (bucket_count,))
+        lo, hi = (_checked(one, (bucket_count,)) for one in (self.lo, self.hi))
         only_bounded = np.array([one == _STATUS_NAMES[Status.UPPER_BOUND] for one in self.status], np.bool_)
-        if only_bounded.shape != (buckets,):
+        if only_bounded.shape != (bucket_count,):
             raise ValueError("lists of different lengths")
         return {
             value_column: ColumnStatistics(n, value.low, value.high, value.last),
@@ -117,11 +122,11 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
                 found[axis] = NumberHistory.from_column(ColumnStatistics(n, low, high, last))
         return cls(tau=[float(tau) for tau in taus], axes=found)
 
-    def deviation_columns(self, buckets: int) -> dict[str, ColumnStatistics]:
+    def deviation_columns(self, bucket_count: int) -> dict[str, ColumnStatistics]:
         """Return the stored columns of all axes."""
         columns = {}
         for axis in (axis for axis in self.axes if axis in AXES):
-            one = self.axes[axis].to_column(buckets, len(self.tau))
+            one = self.axes[axis].to_column(bucket_count, len(self.tau))
             for i, tau in enumerate(self.tau):
                 columns[f"{axis}.sigma.{tau:g}"] = ColumnStatistics(
                     one.n[:, i], one.low[:, i], one.high[:, i], one.last[:, i]
@@ -151,10 +156,10 @@ class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         }
         return cls(state=[STATES[one] for one in past.state.tolist()], **counts, **numbers)
 
-    def status_columns(self, buckets: int) -> dict[str, ColumnStatistics]:
+    def status_columns(self, bucket_count: int) -> dict[str, ColumnStatistics]:
         """Return the stored columns of the numbers."""
         numbers = {name: getattr(self, name) for name in STATUS_COLUMNS}
-        return {name: one.to_column(buckets) for name, one in numbers.items() if isinstance(one, NumberHistory)}
+        return {name: one.to_column(bucket_count) for name, one in numbers.items() if isinstance(one, NumberHistory)}
 
 
 class PastEvent(
@@ -180,7 +185,10 @@ class PastEvent(
     @classmethod
     def from_stored_event(cls, event: StoredEvent) -> Self:
         """Return a stored event."""
-        return cls(**shared_fields(cls, event) | {"what": {name: dict(sides) for name, sides in event.what.items()}})
+        return cls(
+            **attributes_with_field_names(cls, event)
+            | {"what": {name: dict(sides) for name, sides in event.what.items()}}
+        )
 
     def to_event(self) -> StoredEvent:
         """Return the stored event, without control characters in its texts."""
@@ -213,7 +221,7 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
     events_in_all: int | UnsetType = UNSET
 
     @classmethod
-    def reply(cls, past: HistoryTable, query: HistoryQuery, t: float, samples: int) -> Self:
+    def build_reply(cls, past: HistoryTable, query: HistoryQuery, t: float, samples: int) -> Self:
         """Build the reply to a query.
 
         Parameters

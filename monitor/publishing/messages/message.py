@@ -35,7 +35,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="sc
     """Number of samples of the device since the start."""
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: Any) -> Self:
+    def from_result(cls, device: str, t: float | None, samples: int, result: Any) -> Self:
         """Build the message from a result.
 
         Parameters
@@ -50,7 +50,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="sc
             Result of the daemon.
         """
         head = {"device": device, "t": t, "samples": samples}
-        return cls(**head | shared_fields(cls, result) | cls._convert(t, result))
+        return cls(**head | attributes_with_field_names(cls, result) | cls._convert(t, result))
 
     @classmethod
     def _convert(cls, _t: float | None, _result: Any) -> dict[str, Any]:
@@ -65,12 +65,12 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="sc
 M = TypeVar("M", bound=Message)
 
 
-def decode_message(kind: type[M], payload: bytes, max_bytes: int = MAX_PAYLOAD_BYTES) -> M:
+def decode_message(message_type: type[M], payload: bytes, max_bytes: int = MAX_PAYLOAD_BYTES) -> M:
     """Decode a message.
 
     Parameters
     ----------
-    kind
+    message_type
         Class of the message.
     payload
         JSON text.
@@ -85,11 +85,11 @@ def decode_message(kind: type[M], payload: bytes, max_bytes: int = MAX_PAYLOAD_B
     if len(payload) > max_bytes:
         raise ValueError(f"the payload has {len(payload)} bytes; at most {max_bytes} are read")
     try:
-        found = _decoder(kind).decode(payload)  # its errors are ValueErrors
+        found = _decoder(message_type).decode(payload)  # its errors are ValueErrors
     except RecursionError as error:
         raise ValueError(str(error)) from error
-    if not isinstance(found, kind):
-        raise ValueError(f'schema "{Message.__name__}" instead of {kind.topic.schema()}')
+    if not isinstance(found, message_type):
+        raise ValueError(f'schema "{Message.__name__}" instead of {message_type.topic.schema()}')
     return found
 
 
@@ -98,17 +98,17 @@ def encode_json(value: Any) -> bytes:
     return _ENCODER.encode(value)
 
 
-def shared_fields(kind: type[msgspec.Struct], source: object) -> dict[str, Any]:
+def attributes_with_field_names(struct_type: type[msgspec.Struct], source: object) -> dict[str, Any]:
     """Return the attributes of an object for which a struct has a field of the same name.
 
     Parameters
     ----------
-    kind
+    struct_type
         Class of the struct.
     source
         The object.
     """
-    return {name: getattr(source, name) for name in kind.__struct_fields__ if hasattr(source, name)}
+    return {name: getattr(source, name) for name in struct_type.__struct_fields__ if hasattr(source, name)}
 
 
 def remove_control_characters(text: str) -> str:

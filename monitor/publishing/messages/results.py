@@ -21,7 +21,13 @@ from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from monitor.noise.standard_terms import unit_allan_variances
-from monitor.publishing.messages.message import Count, Message, decode_message, remove_control_characters, shared_fields
+from monitor.publishing.messages.message import (
+    Count,
+    Message,
+    attributes_with_field_names,
+    decode_message,
+    remove_control_characters,
+)
 
 MAX_AVERAGING_TIMES: Final = 1000
 """Largest accepted number of averaging times."""
@@ -31,7 +37,7 @@ MAX_OUTPUTS: Final = 16
 STATUSES: Final = {status.name.lower(): status for status in Status}
 
 
-class SlowStatistics(NamedTuple):
+class TotalAndHadamardCurves(NamedTuple):
     """Total and Hadamard deviations of the window, which are computed in small steps."""
 
     total: TotalCurve
@@ -131,7 +137,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
             window_s=window_s,
             samples=self.samples,
             curve=AllanCurve(tau_s, factors, deviation**2, terms, edf, lo, hi, round(filled_s * rate_hz)),
-            fitted=fitted_variance(tau_s, rate_hz, coefficients),
+            fitted=fitted_allan_variance(tau_s, rate_hz, coefficients),
             coefficients=coefficients,
             k_or_r=np.array([axis in k_or_r for axis in AXES]),
         )
@@ -178,7 +184,7 @@ class TauRange(msgspec.Struct, frozen=True):
     tau: tuple[float, float]
 
 
-class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
+class AxisModelGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Comparison of one axis with its model."""
 
     agrees: bool | None = None
@@ -193,18 +199,20 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     z: Floats | None = None
 
 
-class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
+class ModelGapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
     """Message ``imu/<device>/gap``: comparison of the measured Allan deviations with the noise model of the device."""
 
     topic = topics.GAP
     tau_s: Floats | None = None
-    axes: dict[str, AxisGapValues]
+    axes: dict[str, AxisModelGapValues]
 
     @classmethod
     def _convert(cls, _t: float | None, result: ModelGap) -> dict[str, Any]:
         axes = {
-            axis: AxisGapValues(
-                agrees=result.agrees.get(axis), where=TauRange(one.tau_s), **shared_fields(AxisGapValues, one)
+            axis: AxisModelGapValues(
+                agrees=result.agrees.get(axis),
+                where=TauRange(one.tau_s),
+                **attributes_with_field_names(AxisModelGapValues, one),
             )
             for axis, one in result.axes.items()
         }
@@ -242,7 +250,9 @@ class ThermalMessage(
     @classmethod
     def _convert(cls, _t: float | None, result: ThermalIntervalResult) -> dict[str, Any]:
         axes = {
-            axis: AxisThermalValues(**shared_fields(AxisThermalValues, one) | {"model": one.model or None})
+            axis: AxisThermalValues(
+                **attributes_with_field_names(AxisThermalValues, one) | {"model": one.model or None}
+            )
             for axis, one in result.axes.items()
         }
         return {"axes": axes}
@@ -255,13 +265,13 @@ class DeviationTable(msgspec.Struct, frozen=True, eq=False):
     axes: dict[str, DeviationCurve]
 
     @classmethod
-    def of(cls, curve: TotalCurve | HadamardCurve) -> Self:
+    def from_curve(cls, curve: TotalCurve | HadamardCurve) -> Self:
         """Return the deviations of all axes that have at least one deviation."""
         curves = {axis: DeviationCurve(*deviations_with_interval_ends(curve, i)) for i, axis in enumerate(AXES)}
         return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
 
 
-class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()):
+class TotalAndHadamardMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()):
     """Message ``imu/<device>/total``: total and Hadamard deviations, each with its own averaging times."""
 
     topic = topics.TOTAL
@@ -269,8 +279,11 @@ class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()
     hadamard: DeviationTable
 
     @classmethod
-    def _convert(cls, _t: float | None, result: SlowStatistics) -> dict[str, Any]:
-        return {"total": DeviationTable.of(result.total), "hadamard": DeviationTable.of(result.hadamard)}
+    def _convert(cls, _t: float | None, result: TotalAndHadamardCurves) -> dict[str, Any]:
+        return {
+            "total": DeviationTable.from_curve(result.total),
+            "hadamard": DeviationTable.from_curve(result.hadamard),
+        }
 
 
 class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()):
@@ -319,7 +332,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
         return Event(self.kind, round((self.t or 0.0) * 1e9), self.text, axis, values)
 
 
-class Latency(msgspec.Struct, frozen=True):
+class LatencyPercentiles(msgspec.Struct, frozen=True):
     """Percentiles of the latency from receipt to publication [s]."""
 
     p50: float | None = None
@@ -342,7 +355,7 @@ class StatusMessage(
     lost: Count
     bad: Count
     overflowed: Count = 0
-    latency: Latency = Latency()
+    latency: LatencyPercentiles = LatencyPercentiles()
     memory_bytes: Count = 0
     outputs: dict[str, str] = msgspec.field(default_factory=dict)
     uptime_s: float = 0.0
@@ -357,7 +370,7 @@ class StatusMessage(
     def _convert(cls, _t: float | None, result: Health) -> dict[str, Any]:
         return {
             "samples": result.received,
-            "latency": Latency(result.latency_p50_s, result.latency_p99_s),
+            "latency": LatencyPercentiles(result.latency_p50_s, result.latency_p99_s),
             "outputs": {name: mask_secrets(state) for name, state in result.outputs.items()},
             "text": mask_secrets(result.text),
         }
@@ -400,21 +413,21 @@ class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.sc
 
     topic = topics.RECONCILE
 
-    def encode_report(self, report: Mapping[str, Any], status: int, folder: str | None) -> bytes:
+    def encode_report(self, report: Mapping[str, Any], exit_status: int, folder: str | None) -> bytes:
         """Encode the reply.
 
         Parameters
         ----------
         report
             Report of the command.
-        status
+        exit_status
             Exit status of the command.
         folder
             Folder that contains the complete report. None if the report was not saved.
         """
         head = msgspec.to_builtins(self)
         keys = {key: value for key, value in report.items() if key not in head}
-        return msgspec.json.encode({**head, **keys, "exit": status, "folder": folder})
+        return msgspec.json.encode({**head, **keys, "exit": exit_status, "folder": folder})
 
 
 def coefficient_values(
@@ -457,7 +470,7 @@ def event_start_s(unix_s: float, event: Event) -> float | None:
     return None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
 
 
-def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -> Floats:
+def fitted_allan_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -> Floats:
     """Return the Allan variance of the estimated terms, shape [m, 6]. It is NaN on axes without estimated terms.
 
     Parameters

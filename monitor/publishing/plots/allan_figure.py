@@ -49,7 +49,7 @@ MIN_LETTER_DISTANCE: Final = 0.045  # rings closer than this share of the height
 
 
 @dataclass(frozen=True, slots=True)
-class OtherDeviation:
+class AdditionalDeviation:
     """Total or Hadamard deviation that is drawn in addition to the Allan deviation."""
 
     name: str  # "total" or "Hadamard"
@@ -59,21 +59,23 @@ class OtherDeviation:
     hi: Floats
     only_beyond: bool = False  # True to draw only τ longer than the longest τ of the Allan deviation
 
-    def drawn_points(self, axis: int, longest_s: float) -> NDArray[np.bool_]:
+    def drawn_points_mask(self, axis: int, longest_allan_tau_s: float) -> NDArray[np.bool_]:
         """Return a mask of the points of an axis that are drawn, shape [k].
 
         Parameters
         ----------
         axis
             Column of the axis.
-        longest_s
+        longest_allan_tau_s
             Longest averaging time of the Allan deviation of this axis [s].
         """
         positive = np.isfinite(self.deviation[:, axis]) & (self.deviation[:, axis] > 0)
-        return np.asarray(positive & (self.tau_s > longest_s) if self.only_beyond else positive)
+        return np.asarray(positive & (self.tau_s > longest_allan_tau_s) if self.only_beyond else positive)
 
 
-def other_deviations(total: TotalCurve | None = None, hadamard: HadamardCurve | None = None) -> list[OtherDeviation]:
+def additional_deviations(
+    total: TotalCurve | None = None, hadamard: HadamardCurve | None = None
+) -> list[AdditionalDeviation]:
     """Return the total deviation, to be drawn beyond the longest τ of the Allan deviation, and the Hadamard deviation.
 
     Parameters
@@ -85,9 +87,11 @@ def other_deviations(total: TotalCurve | None = None, hadamard: HadamardCurve | 
     """
     found = []
     if total is not None:
-        found.append(OtherDeviation("total", total.tau_s, np.sqrt(total.tvar), total.lo, total.hi, only_beyond=True))
+        found.append(
+            AdditionalDeviation("total", total.tau_s, np.sqrt(total.tvar), total.lo, total.hi, only_beyond=True)
+        )
     if hadamard is not None:
-        found.append(OtherDeviation("Hadamard", hadamard.tau_s, np.sqrt(hadamard.hvar), hadamard.lo, hadamard.hi))
+        found.append(AdditionalDeviation("Hadamard", hadamard.tau_s, np.sqrt(hadamard.hvar), hadamard.lo, hadamard.hi))
     return found
 
 
@@ -102,7 +106,7 @@ class _Ring:
     line: Floats  # deviation of the term at both ends of LINE_TAU_S
 
 
-def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequence[OtherDeviation] = ()) -> None:
+def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequence[AdditionalDeviation] = ()) -> None:
     """Draw the Allan plot of one kind of sensor.
 
     Parameters
@@ -128,7 +132,7 @@ def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequ
             continue
         fitted, measured = (np.sqrt(a[:, i]) * factor for a in (estimate.fitted, estimate.curve.avar))
         lo, hi = (a[valid, i] * factor for a in (estimate.curve.lo, estimate.curve.hi))
-        measured, longest_s = measured[valid], float(tau_s[valid][-1])
+        measured, longest_allan_tau_s = measured[valid], float(tau_s[valid][-1])
         draw_band(panel, tau_s[valid], lo, hi, COLOURS[number])
         panel.plot(tau_s, fitted, linestyle=FIT_DASHES[number], color=COLOURS[number], zorder=3)
         style = {"color": COLOURS[number], "markersize": MARKER_SIZES[number], "mew": 1.1}
@@ -137,9 +141,9 @@ def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequ
         near_lo, near_hi = np.maximum(lo, measured / MAX_BAND_RATIO), np.minimum(hi, measured * MAX_BAND_RATIO)
         shown += [measured, fitted, near_lo, near_hi]
         for style_name, other in zip(OTHER_LINE_STYLES, others, strict=False):
-            points = other.drawn_points(i, longest_s)
+            points = other.drawn_points_mask(i, longest_allan_tau_s)
             if points.any():
-                shown.append(_draw_other(panel, other, points, number, i, factor, longest_s, style_name))
+                shown.append(_draw_other(panel, other, points, number, i, factor, longest_allan_tau_s, style_name))
                 drawn.add(other.name)
         rings += _rings(estimate, i, factor, minimum_tau_s, float(measured.min()))
     _set_limits(panel, shown, rings)
@@ -148,12 +152,12 @@ def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequ
 
 
 def _draw_other(
-    panel: "Axes", other: OtherDeviation, points: NDArray[np.bool_], number: int, i: int, factor: float,
-    longest_s: float, line_style: str,
+    panel: "Axes", other: AdditionalDeviation, points: NDArray[np.bool_], number: int, i: int, factor: float,
+    longest_allan_tau_s: float, line_style: str,
 ) -> Floats:  # fmt: skip
     """Draw another deviation of one axis as a thin line; return the values that the plot must contain."""
     # The line begins at the last point of the Allan deviation, so that its origin is visible.
-    line = points | (other.tau_s == longest_s) if other.only_beyond else points
+    line = points | (other.tau_s == longest_allan_tau_s) if other.only_beyond else points
     y, colour = other.deviation[:, i] * factor, COLOURS[number]
     panel.plot(other.tau_s[line], y[line], line_style, color=colour, linewidth=0.9, alpha=0.8, zorder=2)
     if other.only_beyond:  # at shorter τ, the markers would hide the Allan deviation
@@ -234,7 +238,7 @@ def _group_rings(panel: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
     return groups
 
 
-def _draw_labels(panel: "Axes", kind: Kind, others: Sequence[OtherDeviation], drawn: Collection[str]) -> None:
+def _draw_labels(panel: "Axes", kind: Kind, others: Sequence[AdditionalDeviation], drawn: Collection[str]) -> None:
     """Draw axis labels, grid and legend."""
     panel.plot([], [], "--", color=GREY, label="fit")
     panel.fill_between([], [], [], color=GREY, alpha=0.25, label="95 %")

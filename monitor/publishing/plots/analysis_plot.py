@@ -24,8 +24,8 @@ from monitor.publishing.coefficient_cells import (
     mark_temperature_axis,
 )
 from monitor.publishing.messages.results import measured_axes
-from monitor.publishing.plots.allan_figure import LEGEND_TEXT, OtherDeviation, draw_allan_panel
-from monitor.publishing.plots.dynamic_figure import ChangeMark, draw_dynamic_panels, height_inches
+from monitor.publishing.plots.allan_figure import LEGEND_TEXT, AdditionalDeviation, draw_allan_panel
+from monitor.publishing.plots.dynamic_figure import ChangeMark, draw_dynamic_panels, dynamic_figure_height_inches
 from monitor.publishing.plots.style import COLOURS, GREY, create_figure, figure_style, save_figure
 
 if TYPE_CHECKING:
@@ -43,17 +43,17 @@ class AnalysisPlotData:
     """Content of the plot and of the HTML report of one recording."""
 
     analysis: Analysis
-    others: Sequence[OtherDeviation] = ()  # such as total and Hadamard deviation
+    others: Sequence[AdditionalDeviation] = ()  # such as total and Hadamard deviation
     dynamic: DynamicAllan | None = None
     marks: Sequence[ChangeMark] = ()  # changes to mark in the dynamic Allan deviation
 
 
-def save_analysis_plot(drawn: AnalysisPlotData, path: Path, title: str = "") -> None:
+def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "") -> None:
     """Write the plot.
 
     Parameters
     ----------
-    drawn
+    plot_data
         Analysis of the recording.
     path
         File to write. Its suffix selects the format.
@@ -65,21 +65,21 @@ def save_analysis_plot(drawn: AnalysisPlotData, path: Path, title: str = "") -> 
     ConfigError
         If matplotlib is missing or the file cannot be written.
     """
-    estimate, dynamic = drawn.analysis.estimate, drawn.dynamic
+    estimate, dynamic = plot_data.analysis.estimate, plot_data.dynamic
     with figure_style():
         kinds = measured_kinds(estimate)
         heights = [INCHES[1]]
         if dynamic is not None:
-            heights.append(max(height_inches(dynamic, kind) for kind in kinds))
+            heights.append(max(dynamic_figure_height_inches(dynamic, kind) for kind in kinds))
         figure = create_figure(INCHES[0] * len(kinds), sum(heights))
         parts = figure.subfigures(len(heights), len(kinds), squeeze=False, height_ratios=heights)
         for column, kind in enumerate(kinds):
             curves, table = parts[0, column].subplots(2, 1, height_ratios=[3.6, 1.75])
-            draw_allan_panel(curves, estimate, kind, drawn.others)
-            _draw_table(table, drawn.analysis, kind)
+            draw_allan_panel(curves, estimate, kind, plot_data.others)
+            _draw_table(table, plot_data.analysis, kind)
             if dynamic is not None:
-                draw_dynamic_panels(parts[1, column], dynamic, kind, drawn.marks)
-        figure.suptitle("\n".join([*([title] if title else []), recording_line(estimate)]))
+                draw_dynamic_panels(parts[1, column], dynamic, kind, plot_data.marks)
+        figure.suptitle("\n".join([*([title] if title else []), describe_recording(estimate)]))
         save_figure(figure, path)
 
 
@@ -89,7 +89,7 @@ def measured_kinds(estimate: Estimate) -> list[Kind]:
     return [kind for kind in KINDS if set(axes_of(kind)) & present] or list(KINDS)
 
 
-def recording_line(estimate: Estimate) -> str:
+def describe_recording(estimate: Estimate) -> str:
     """Return one line with the number of samples, rate, duration and number of missing samples."""
     missing = estimate.curve.n - estimate.samples
     gaps = f", {missing:,} missing" if missing > 0 else ""
@@ -97,7 +97,7 @@ def recording_line(estimate: Estimate) -> str:
     return f"{estimate.samples:,} samples at {estimate.rate_hz:.6g} Hz, {duration}{gaps}"
 
 
-def is_k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
+def is_k_r_ambiguous(estimate: Estimate, letter: str, axis: str) -> bool:
     """Return True if a coefficient is K or R with an upper bound, and the data do not show which of the two is present.
 
     Parameters
@@ -129,7 +129,7 @@ def _draw_table(panel: "Axes", analysis: Analysis, kind: Kind) -> None:
         for axis, x, _ in columns:
             cell = format_coefficient(estimate.coefficients, letter, axis)
             panel.text(x, y + 0.02, cell.value, va="center")
-            small = "K or R" if is_k_or_r(estimate, letter, axis) else cell.interval
+            small = "K or R" if is_k_r_ambiguous(estimate, letter, axis) else cell.interval
             panel.text(x, y - 0.05, small, va="center", fontsize=6.5, color=GREY)
     temperature = f";  {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if analysis.axes_of_temperature else ""
     for y, text in ((0.03, TABLE_LEGEND + temperature), (-0.04, LEGEND_TEXT)):

@@ -25,17 +25,17 @@ TEXT: Final[Colour] = (236, 239, 242)  # legible on the label boxes of the dark 
 TEMPERATURE: Final[Colour] = (236, 180, 72)
 
 
-def blend(colour: Colour, share: float, ground: Colour = BACKGROUND) -> Colour:
+def blend_colours(colour: Colour, colour_share: float, background: Colour = BACKGROUND) -> Colour:
     """Return the mixture of a colour and a background, as a translucent area would appear.
 
     Parameters
     ----------
     colour
         Colour as red, green and blue, 0 to 255.
-    share
+    colour_share
         Share of the colour, 0 to 1.
-    ground
+    background
         Background colour.
     """
-    r, g, b = (round(share * c + (1 - share) * d) for c, d in zip(colour, ground, strict=True))
+    r, g, b = (round(colour_share * c + (1 - colour_share) * d) for c, d in zip(colour, background, strict=True))
     return r, g, b

@@ -57,7 +57,7 @@ def _shown_axes(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
     return tuple(a for a in axes_of(kind) if bool(np.isfinite(dynamic.deviation[:, :, AXES.index(a)]).any()))
 
 
-def height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
+def dynamic_figure_height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
     """Return the height of the figure [inches].
 
     Parameters
@@ -71,12 +71,12 @@ def height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
     return SPARE_INCHES + HEAT_MAP_INCHES * heat_maps + COEFFICIENT_INCHES * coefficients
 
 
-def divide_by_median(dynamic: DynamicAllan) -> Floats:
+def divide_by_time_median(dynamic: DynamicAllan) -> Floats:
     """Return the deviation divided by the median over time, shape [T, m, 6]. NaN if it is missing or the median is 0.
 
     >>> from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan as of
     >>> steady = of(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0)
-    >>> bool(np.allclose(np.median(divide_by_median(steady), axis=0), 1.0))
+    >>> bool(np.allclose(np.median(divide_by_time_median(steady), axis=0), 1.0))
     True
     """
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -102,9 +102,9 @@ def draw_dynamic_panels(
     axes, letters = _shown_axes(dynamic, kind), _shown_coefficients(dynamic, kind)
     ratios = [HEAT_MAP_INCHES] * len(axes) + [COEFFICIENT_INCHES] * len(letters)
     panels = list(figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0])
-    unit, unit_s = style.time_unit(float(dynamic.t_s[-1]))
+    unit, unit_s = style.select_time_unit(float(dynamic.t_s[-1]))
     edges = _time_edges(dynamic.t_s) / unit_s
-    ratio, mesh = _colour_scale_end(divide_by_median(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
+    ratio, mesh = _colour_scale_end(divide_by_time_median(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
     for panel, axis in zip(panels, axes, strict=False):
         mesh = _draw_heat_map(panel, dynamic, axis, edges, ratio)
     for panel, letter in zip(panels[len(axes) :], letters, strict=True):
@@ -156,7 +156,7 @@ def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Float
     """Draw the heat map of one axis, time by τ."""
     i = AXES.index(axis)
     with np.errstate(invalid="ignore", divide="ignore"):
-        colour = np.log(divide_by_median(dynamic)[:, :, i].T)
+        colour = np.log(divide_by_time_median(dynamic)[:, :, i].T)
     median = _median(dynamic)[:, :, i]
     usual = (dynamic.lo[:, :, i] <= median) & (median <= dynamic.hi[:, :, i])
     alpha: Any = np.where(usual.T, PALE_ALPHA, 1.0)  # matplotlib accepts an array, but its type hints do not
@@ -203,7 +203,7 @@ def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: 
         values.append(value)
         ends.append((lo, hi))
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    style.set_value_scale(panel, low, high, 0.25)
+    style.set_y_scale(panel, low, high, 0.25)
     if not (low > 0 and high > style.LOG_SCALE_RATIO * low):
         lowest, highest = np.nanquantile(ends, [1.0 - BAND_ENDS_INSIDE, BAND_ENDS_INSIDE]).tolist()
         bottom, top = panel.get_ylim()

@@ -117,7 +117,7 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
         lows.append(np.nanmin(low))
         highs.append(np.nanmax(high))
     if lows:
-        style.set_value_scale(panel, float(min(lows)), float(max(highs)), 0.15)
+        style.set_y_scale(panel, float(min(lows)), float(max(highs)), 0.15)
         panel.legend(loc="upper left", ncols=3, fontsize=style.SMALL_TEXT, frameon=True, edgecolor="none")
     else:
         _draw_absence(panel, "never estimated")

@@ -18,7 +18,7 @@ from monitor.common.units import DEVIATION_UNITS, sensor_kind
 from monitor.publishing.plots import style
 from monitor.publishing.reports.reconcile_sentences import (
     diagnostic_name,
-    field_unit,
+    displayed_unit,
     format_range,
     gap_to_threshold_ratio,
     readable_name,
@@ -65,7 +65,7 @@ class DiagnosticPlot:
     mark_label: str
 
 
-def compared_diagnostic_svg(
+def diagnostic_comparison_svg(
     model_panels: Sequence[tuple[str, PlotData]], axis: str, width: float, height: float, where: Location | None = None
 ) -> str:
     """Draw one diagnostic, one panel for each model, and return it as an SVG element.
@@ -82,9 +82,9 @@ def compared_diagnostic_svg(
         Range to mark in the first panel.
     """
     plots = [
-        to_field_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(model_panels)
+        to_displayed_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(model_panels)
     ]
-    limits = value_limits(plots)
+    limits = common_y_limits(plots)
     left, right, top, bottom = MARGINS_INCHES
     share = width / len(plots)
     with style.figure_style():
@@ -93,22 +93,22 @@ def compared_diagnostic_svg(
             size = ((share - left - right) / width, (height - top - bottom) / height)
             panel = figure.add_axes(((i * share + left) / width, bottom / height, *size))
             _draw_panel(panel, plot if i == 0 else replace(plot, y_label=""), style.axis_colour(axis), limits)
-        return style.svg_element(figure, f"{axis}: {plots[0].y_label} over {plots[0].x_label}")
+        return style.to_svg_element(figure, f"{axis}: {plots[0].y_label} over {plots[0].x_label}")
 
 
-def select_view(views: Sequence[PlotData], lens: str, where: Location) -> PlotData | None:
+def select_diagnostic_view(views: Sequence[PlotData], diagnostic_id: str, where: Location) -> PlotData | None:
     """Return the data of a diagnostic, or the data of the first diagnostic whose x axis contains the range.
 
     Parameters
     ----------
     views
         Data of all diagnostics.
-    lens
+    diagnostic_id
         Identifier of the diagnostic.
     where
         Range that the diagnostic found.
     """
-    own = [view for view in views if view.lens == lens]
+    own = [view for view in views if view.lens == diagnostic_id]
     return next(iter(own or [view for view in views if range_on_x_axis(view, where) is not None]), None)
 
 
@@ -136,7 +136,7 @@ def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | No
     return None
 
 
-def detail_view(view: PlotData, where: Location) -> PlotData | None:
+def zoomed_view(view: PlotData, where: Location) -> PlotData | None:
     """Return the data around a range that is too narrow to be visible. Return None if the range is wide enough.
 
     Parameters
@@ -163,7 +163,7 @@ def detail_view(view: PlotData, where: Location) -> PlotData | None:
     return replace(view, y_name="detail", **lines)
 
 
-def to_field_units(title: str, view: PlotData, axis: str, where: Location | None) -> DiagnosticPlot:
+def to_displayed_units(title: str, view: PlotData, axis: str, where: Location | None) -> DiagnosticPlot:
     """Convert the data of a diagnostic to the units of the plot.
 
     Parameters
@@ -178,14 +178,14 @@ def to_field_units(title: str, view: PlotData, axis: str, where: Location | None
         Range to mark. A range of another quantity than the x axis is omitted.
     """
     x_unit, y_unit = (
-        field_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)))
+        displayed_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)))
         for unit, line in ((view.x_unit, view.x), (view.y_unit, view.measured))
     )
     if view.x_name == "averaging time" and view.y_unit in ("rad/s", "m/s²"):
         y_unit = DEVIATION_UNITS[sensor_kind(axis)]  # as in all Allan plots
     x_name, factor = x_unit.name, x_unit.factor
     if view.x_name == "time" and not view.log:
-        x_name, seconds = style.time_unit(float(np.ptp(view.x)))
+        x_name, seconds = style.select_time_unit(float(np.ptp(view.x)))
         factor = 1.0 / seconds
     mark = None if where is None else range_on_x_axis(view, where)
     measured, expected, lo, hi = (line * y_unit.factor for line in (view.measured, view.expected, view.lo, view.hi))
@@ -204,7 +204,7 @@ def to_field_units(title: str, view: PlotData, axis: str, where: Location | None
     )
 
 
-def value_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
+def common_y_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
     """Return the common limits of all panels, which contain all curves and the parts of the bands near the curves."""
     log = plots[0].log
     curves = _finite([line for plot in plots for line in (plot.measured, plot.expected)], log)
@@ -285,7 +285,7 @@ def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap
         style.style_log_axis(panel, "x", minor_grid=False)
         if after:
             panel.set_title("○ before   ● after", loc="right", fontsize=9, color=style.GREY)
-        return style.svg_element(figure, "gap over threshold of each diagnostic")
+        return style.to_svg_element(figure, "gap over threshold of each diagnostic")
 
 
 def interval_chart_svg(
@@ -316,7 +316,7 @@ def interval_chart_svg(
                 fmt="D" if pooled else "o", color=style.DARK if pooled else colour, elinewidth=1.8, markersize=6,
             )  # fmt: skip
         panel.xaxis.set_major_formatter(lambda value, _: style.format_tick(value))
-        return style.svg_element(figure, f"{x_label}, of each recording")
+        return style.to_svg_element(figure, f"{x_label}, of each recording")
 
 
 def _create_row_panel(names: Sequence[str], x_label: str) -> "tuple[Figure, Axes]":

@@ -141,7 +141,7 @@ def save_figure(figure: "Figure", path: Path) -> None:
         raise ConfigError(f"cannot write the plot {path}: {error}") from error
 
 
-def svg_element(figure: "Figure", description: str) -> str:
+def to_svg_element(figure: "Figure", description: str) -> str:
     """Return a figure as an SVG element without width and height, so that it fills its column in a page.
 
     Parameters
@@ -239,25 +239,25 @@ def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
     panel.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=columns, **options)
 
 
-def set_value_scale(panel: "Axes", low: float, high: float, margin: float) -> None:
+def set_y_scale(panel: "Axes", smallest: float, largest: float, margin: float) -> None:
     """Set scale and limits of the y axis of a positive quantity. The scale is logarithmic if the values differ much.
 
     Parameters
     ----------
     panel
         Axes of matplotlib.
-    low, high
+    smallest, largest
         Smallest and largest value that is drawn.
     margin
         Margin of a linear scale above and below, as a share of the range.
     """
-    if low > 0 and high > LOG_SCALE_RATIO * low:
+    if smallest > 0 and largest > LOG_SCALE_RATIO * smallest:
         panel.set_yscale("log")
-        panel.set_ylim(low / 1.3, high * 1.3)
+        panel.set_ylim(smallest / 1.3, largest * 1.3)
         style_log_axis(panel, "y")
     else:
-        space = margin * (high - low) + 0.02 * high
-        panel.set_ylim(max(low - space, 0.0), high + space)
+        space = margin * (largest - smallest) + 0.02 * largest
+        panel.set_ylim(max(smallest - space, 0.0), largest + space)
 
 
 def omit_wide_intervals(value: Floats, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
@@ -272,10 +272,10 @@ def omit_wide_intervals(value: Floats, lo: Floats, hi: Floats) -> tuple[Floats, 
     return np.where(near, lo, np.nan), np.where(near, hi, np.nan)
 
 
-def time_unit(duration_s: float) -> tuple[str, float]:
+def select_time_unit(duration_s: float) -> tuple[str, float]:
     """Return the name and the length [s] of the unit that suits a time axis of this duration [s].
 
-    >>> time_unit(7200.0), time_unit(5e5)
+    >>> select_time_unit(7200.0), select_time_unit(5e5)
     (('min', 60.0), ('d', 86400.0))
     """
     return next((name, seconds) for name, seconds, below in TIME_UNITS if duration_s < below)

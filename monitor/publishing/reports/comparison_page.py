@@ -11,7 +11,7 @@ from monitor.publishing.plots.reconcile_figures import interval_chart_svg
 from monitor.publishing.plots.style import axis_colour
 from monitor.publishing.reports import comparison_sentences, reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
-from monitor.publishing.reports.reconcile_sentences import Parameter, parameter_unit, readable_name
+from monitor.publishing.reports.reconcile_sentences import FormattedParameter, parameter_unit, readable_name
 from monitor.reconcile.result import AddedOrResizedEffect
 from monitor.reconcile.several_recordings.comparison import Comparison, MatchedEffect
 
@@ -44,7 +44,7 @@ def _rows(seen: MatchedEffect) -> list[tuple[str, AddedOrResizedEffect]]:
     return [*seen.steps.items(), ("all together", seen.pooled_step())]
 
 
-def _parameters_by_name(c: Comparison, step: AddedOrResizedEffect, axis: str) -> dict[str, Parameter]:
+def _parameters_by_name(c: Comparison, step: AddedOrResizedEffect, axis: str) -> dict[str, FormattedParameter]:
     """Return the text of each parameter of a step."""
     return {one.name: one for one in reconcile_sentences.format_parameters(step, axis, c.baseline)}
 

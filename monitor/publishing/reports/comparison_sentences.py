@@ -31,11 +31,11 @@ def summarize(c: Comparison) -> str:
     return " ".join([compared, *lists])
 
 
-def describe_agreement(seen: MatchedEffect) -> str:
+def describe_size_agreement(effect: MatchedEffect) -> str:
     """Return a text on whether the sizes of an effect agree between the recordings, with the p-value."""
-    if seen.p is None:
+    if effect.p is None:
         return "nothing to compare"
-    return f"sizes {'agree' if seen.consistent else 'differ'} ({_format_p_value(seen.p)})"
+    return f"sizes {'agree' if effect.consistent else 'differ'} ({_format_p_value(effect.p)})"
 
 
 def _format_p_value(p: float) -> str:
@@ -47,7 +47,7 @@ def _format_p_value(p: float) -> str:
     return "p < 0.001" if p < 0.001 else f"p = {format_number(p, 2)}"
 
 
-def count_findings(result: AxisResult | None) -> str:
+def describe_finding_counts(result: AxisResult | None) -> str:
     """Return the numbers of effects and of unexplained differences of one axis in one recording."""
     if result is None:
         return "not recorded"

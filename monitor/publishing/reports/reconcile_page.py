@@ -15,7 +15,7 @@ from monitor.common.units import format_duration
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots import reconcile_figures as diagnostic_figure
 from monitor.publishing.plots import style
-from monitor.publishing.plots.reconcile_figures import compared_diagnostic_svg, detail_view, select_view
+from monitor.publishing.plots.reconcile_figures import diagnostic_comparison_svg, select_diagnostic_view, zoomed_view
 from monitor.publishing.reports import reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
 from monitor.reconcile.result import AxisResult, DiagnosticGap, DiagnosticSnapshot, PlotData, Reconciliation
@@ -83,14 +83,14 @@ def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list
 
 def _draw_single(view: PlotData, axis: str) -> str:
     """Draw one diagnostic for one model."""
-    return compared_diagnostic_svg([("", view)], axis, *SINGLE_INCHES)
+    return diagnostic_comparison_svg([("", view)], axis, *SINGLE_INCHES)
 
 
 def _draw_pairs(before: DiagnosticSnapshot, after: DiagnosticSnapshot, axis: str) -> list[str]:
     """Draw each diagnostic before and after a step."""
     later = {view.lens: view for view in after.plots}
     return [
-        compared_diagnostic_svg([("before", view), ("after", later[view.lens])], axis, *PAIR_INCHES)
+        diagnostic_comparison_svg([("before", view), ("after", later[view.lens])], axis, *PAIR_INCHES)
         for view in before.plots
         if view.lens in later
     ]
@@ -98,13 +98,13 @@ def _draw_pairs(before: DiagnosticSnapshot, after: DiagnosticSnapshot, axis: str
 
 def _draw_range(snapshot: DiagnosticSnapshot, found: DiagnosticGap, axis: str) -> list[str]:
     """Draw the diagnostic that shows a range best, and a detail plot if the range is narrow."""
-    view = select_view(snapshot.plots, found.lens, found.where)
+    view = select_diagnostic_view(snapshot.plots, found.lens, found.where)
     if view is None:
         return []
-    detail = detail_view(view, found.where)
+    detail = zoomed_view(view, found.where)
     if detail is None:
-        return [compared_diagnostic_svg([("", view)], axis, *RANGE_INCHES, where=found.where)]
-    whole = compared_diagnostic_svg(
+        return [diagnostic_comparison_svg([("", view)], axis, *RANGE_INCHES, where=found.where)]
+    whole = diagnostic_comparison_svg(
         [("", view)], axis, *RANGE_WITH_DETAIL_INCHES, where=replace(found.where, source=None)
     )
-    return [whole, compared_diagnostic_svg([("", detail)], axis, *DETAIL_INCHES, where=found.where)]
+    return [whole, diagnostic_comparison_svg([("", detail)], axis, *DETAIL_INCHES, where=found.where)]

@@ -22,17 +22,17 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from monitor.common.units import format_duration
 from monitor.publishing.plots import axis_colours as colours
-from monitor.publishing.plots.reconcile_figures import MAX_MARKERS, DiagnosticPlot, to_field_units, value_limits
+from monitor.publishing.plots.reconcile_figures import MAX_MARKERS, DiagnosticPlot, common_y_limits, to_displayed_units
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH, Scale, clip_to_box, decade_range, finite_sections
+from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH, ChartScale, clip_to_box, decade_range, finite_sections
 from monitor.publishing.rerun.allan_drawing import fill_band, log_grid, log_lines
-from monitor.publishing.rerun.shared_views import collapsed_blueprint, drawing_view, markdown
+from monitor.publishing.rerun.shared_views import collapsed_blueprint, drawing_view, markdown_document
 from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation
 
 APPLICATION: Final = "imu-monitor"
 TIMELINE: Final = "step"
 MAX_PLOTTED_DIAGNOSTICS: Final = 2  # number of diagnostics drawn per axis; the first ones are used
-BAND_COLOUR: Final = colours.blend(colours.FRAME, 0.55)
+BAND_COLOUR: Final = colours.blend_colours(colours.FRAME, 0.55)
 LEGEND_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
 RANGE_COLOUR: Final = colours.TEMPERATURE  # orange, as on the HTML page
 GAP_LINE_COLOURS: Final = (  # more lines would not fit into the legend
@@ -63,7 +63,7 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.save(path, default_blueprint=blueprint(r))
-    stream.log("overview", markdown(_overview(r)), static=True)
+    stream.log("overview", markdown_document(_overview(r)), static=True)
     for axis in _axes(r):
         _log_axis(stream, r, r.axes[axis])
     stream.flush()
@@ -162,7 +162,7 @@ def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
 
 def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
     """Log all entities of one axis."""
-    stream.log(f"{result.axis}/steps", markdown(_steps_text(r, result)), static=True)
+    stream.log(f"{result.axis}/steps", markdown_document(_steps_text(r, result)), static=True)
     for lens in _drawn_diagnostics(result):
         _log_diagnostic(stream, result, lens)
     _log_gaps(stream, result)
@@ -197,9 +197,9 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
     views = [
         next((view for view in snapshot.plots if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
     ]
-    plots = {step: to_field_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
+    plots = {step: to_displayed_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
-    scale = Scale(decade_range(plot.x for plot in every), decade_range([np.array(value_limits(every))]))
+    scale = ChartScale(decade_range(plot.x for plot in every), decade_range([np.array(common_y_limits(every))]))
     for when in ("before", "after") if result.steps else ("before",):
         _log_grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
     stream.reset_time()
@@ -211,36 +211,36 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
 
 
 def _log_curves(
-    stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str, static: bool
+    stream: rr.RecordingStream, path: str, scale: ChartScale, plot: DiagnosticPlot, axis: str, static: bool
 ) -> None:
     """Draw the band, the measured curve and the expected curve."""
     # A lower end of zero has no logarithm. It is drawn below the box.
-    low, high = (scale.to_chart(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
+    low, high = (scale.to_chart_positions(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
     log = partial(stream.log, static=static)
     log(f"{path}/band", fill_band(low, high, BAND_COLOUR))
-    colour, at = colours.AXIS_COLOURS[axis], _inside(scale.to_chart(plot.x, plot.measured))
+    colour, at = colours.AXIS_COLOURS[axis], _inside(scale.to_chart_positions(plot.x, plot.measured))
     log_lines(log, f"{path}/measured", finite_sections(at), [colour], 0.8, 5.0)
     if len(at) <= MAX_MARKERS:
         log(f"{path}/points", rr.Points2D(at, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
-    expected = finite_sections(_inside(scale.to_chart(plot.x, plot.expected)))
+    expected = finite_sections(_inside(scale.to_chart_positions(plot.x, plot.expected)))
     log_lines(log, f"{path}/expected", expected, [colours.TEXT], 1.0, 10.0)
 
 
-def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, result: AxisResult, lens: str) -> None:
+def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: ChartScale, result: AxisResult, lens: str) -> None:
     """Draw a frame around each range in which a diagnostic found a gap."""
     view = next(view for view in result.start.plots if view.lens == lens)
     founds = [step.before for step in result.steps] + list(result.left_over)
-    marks = [to_field_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
+    marks = [to_displayed_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
     bounds = [mark.mark for mark in marks if mark.mark is not None]
     if not bounds:
         return
     one = 10.0 ** np.array([scale.y[0], scale.y[0]], float)
-    ends = [np.clip(scale.to_chart(np.array(bound), one)[:, 0], 0.0, WIDTH) for bound in bounds]
+    ends = [np.clip(scale.to_chart_positions(np.array(bound), one)[:, 0], 0.0, WIDTH) for bound in bounds]
     frames = [np.array([[a, 0], [b, 0], [b, HEIGHT], [a, HEIGHT], [a, 0]]) for a, b in ends]
     log_lines(partial(stream.log, static=True), f"{path}/place", frames, [RANGE_COLOUR], 0.75, -5.0)
 
 
-def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str) -> None:
+def _log_grid(stream: rr.RecordingStream, path: str, scale: ChartScale, plot: DiagnosticPlot, axis: str) -> None:
     """Draw the frame, the decade lines, the labels and the legend."""
     log = partial(stream.log, static=True)
     key = [("measured", colours.AXIS_COLOURS[axis]), ("model", colours.TEXT), ("95 %", BAND_COLOUR)]

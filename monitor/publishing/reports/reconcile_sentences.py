@@ -85,7 +85,7 @@ SYMMETRY_TOLERANCE: Final = 0.1  # sides of an interval that differ by less than
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
+class FormattedParameter:
     """Texts for one parameter. Unknown parts are empty."""
 
     name: str
@@ -96,24 +96,24 @@ class Parameter:
     given: str  # value in the model under test, if the model has the effect exactly once
 
 
-def field_unit(si: str, size: float) -> Unit:
+def displayed_unit(si_unit: str, value_si: float) -> Unit:
     """Return the displayed unit of a quantity.
 
-    >>> field_unit("rad/s", 1e-4).name, field_unit("rad/s", 5.0).name, field_unit("Hz", 17.0).name
+    >>> displayed_unit("rad/s", 1e-4).name, displayed_unit("rad/s", 5.0).name, displayed_unit("Hz", 17.0).name
     ('°/h', '°/s', 'Hz')
 
     Parameters
     ----------
-    si
+    si_unit
         SI unit.
-    size
+    value_si
         Value of the quantity in the SI unit.
     """
     for kind in KINDS:
-        if si == SAMPLE_SI_UNITS[kind]:
+        if si_unit == SAMPLE_SI_UNITS[kind]:
             large = SAMPLE_UNITS[kind]
-            return DEVIATION_UNITS[kind] if abs(size) * large.factor < SMALL_UNIT_BELOW else large
-    return FIELD_UNITS.get(si, Unit(1.0, si))
+            return DEVIATION_UNITS[kind] if abs(value_si) * large.factor < SMALL_UNIT_BELOW else large
+    return FIELD_UNITS.get(si_unit, Unit(1.0, si_unit))
 
 
 def readable_name(name: str) -> str:
@@ -121,22 +121,22 @@ def readable_name(name: str) -> str:
     return name.replace("_", " ")
 
 
-def diagnostic_name(lens: str) -> str:
+def diagnostic_name(diagnostic_id: str) -> str:
     """Return the name of a diagnostic for the user."""
-    return DIAGNOSTIC_NAMES.get(lens, readable_name(lens))
+    return DIAGNOSTIC_NAMES.get(diagnostic_id, readable_name(diagnostic_id))
 
 
-def format_probability(share: float) -> str:
+def format_probability(probability: float) -> str:
     """Format a probability. Values near 0 and 1 are written as inequalities.
 
     >>> format_probability(0.998), format_probability(0.99999), format_probability(0.0002)
     ('99.8 %', '> 99.9 %', '< 0.1 %')
     """
-    if not isfinite(share):
+    if not isfinite(probability):
         return "—"
-    if share > 0.999:
+    if probability > 0.999:
         return "> 99.9 %"
-    return "< 0.1 %" if share < 0.001 else f"{100.0 * share:.1f} %"
+    return "< 0.1 %" if probability < 0.001 else f"{100.0 * probability:.1f} %"
 
 
 def format_range(where: Location, axis: str) -> str:
@@ -159,7 +159,7 @@ def format_range(where: Location, axis: str) -> str:
             continue
         prefix, unit = RANGE_FORMATS.get(name, ("", Unit(1.0, "")))
         if name == "value":
-            unit = field_unit(SAMPLE_SI_UNITS[sensor_kind(axis)], max(map(abs, ends)))
+            unit = displayed_unit(SAMPLE_SI_UNITS[sensor_kind(axis)], max(map(abs, ends)))
         low, high = (end * unit.factor for end in ends)
         narrow = not abs(high - low) > MIN_RANGE_SHARE * max(abs(low), abs(high))
         text = _short(0.5 * (low + high)) if narrow else f"{_short(low)} … {_short(high)}"
@@ -167,38 +167,38 @@ def format_range(where: Location, axis: str) -> str:
     return ", ".join(texts) or "everywhere"
 
 
-def describe_gap(one: DiagnosticGap, axis: str) -> str:
+def describe_gap(gap: DiagnosticGap, axis: str) -> str:
     """Return one line with the diagnostic, its range, its gap and its threshold.
 
     Parameters
     ----------
-    one
+    gap
         Gap of a diagnostic.
     axis
         Name of the axis, which selects the units.
     """
-    gap = f"gap {format_gap(one.gap)}, threshold {format_gap(one.threshold)}"
-    return f"{diagnostic_name(one.lens)}, {format_range(one.where, axis)}: {gap}"
+    sizes = f"gap {format_gap(gap.gap)}, threshold {format_gap(gap.threshold)}"
+    return f"{diagnostic_name(gap.lens)}, {format_range(gap.where, axis)}: {sizes}"
 
 
-def format_gap(size: float) -> str:
+def format_gap(gap: float) -> str:
     """Format the size of a gap.
 
     >>> format_gap(0.6), format_gap(41.23), format_gap(12345.0)
     ('0.60', '41.2', '12300')
     """
-    if not isfinite(size) or size >= 1000.0:
-        return format_number(size)
-    return f"{size:.2f}" if size < 10.0 else f"{size:.1f}"
+    if not isfinite(gap) or gap >= 1000.0:
+        return format_number(gap)
+    return f"{gap:.2f}" if gap < 10.0 else f"{gap:.1f}"
 
 
-def gap_to_threshold_ratio(one: DiagnosticGap) -> float:
+def gap_to_threshold_ratio(gap: DiagnosticGap) -> float:
     """Return the gap divided by the threshold, or 0 if this ratio is not finite."""
-    share = one.gap / one.threshold if one.threshold > 0.0 else 0.0
+    share = gap.gap / gap.threshold if gap.threshold > 0.0 else 0.0
     return share if isfinite(share) else 0.0
 
 
-def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> tuple[Parameter, ...]:
+def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> tuple[FormattedParameter, ...]:
     """Return the texts of all parameters of a step.
 
     Parameters
@@ -283,7 +283,7 @@ def describe_held_out_gap(step: AddedOrResizedEffect) -> str:
     return f"{format_gap(before.gap)} → {format_gap(after.gap)}, threshold {format_gap(after.threshold)}"
 
 
-def parameter_unit(effect: str, name: str, axis: str, size: float) -> Unit:
+def parameter_unit(effect: str, name: str, axis: str, value_si: float) -> Unit:
     """Return the displayed unit of a parameter of an effect.
 
     Parameters
@@ -294,17 +294,17 @@ def parameter_unit(effect: str, name: str, axis: str, size: float) -> Unit:
         Name of the parameter.
     axis
         Name of the axis.
-    size
+    value_si
         Value of the parameter in the SI unit.
     """
     si = gyro_and_accel_units(EFFECTS[effect])[name][KINDS.index(sensor_kind(axis))]
-    return UNITS_BY_NAME.get(name) or field_unit(si, size)
+    return UNITS_BY_NAME.get(name) or displayed_unit(si, value_si)
 
 
-def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: str, given: Any) -> Parameter:
+def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: str, given: Any) -> FormattedParameter:
     """Return the text of one parameter."""
     if isinstance(bounds.value, str):
-        return Parameter(name, bounds.value, "", bounds.value, "", "" if given is None else str(given))
+        return FormattedParameter(name, bounds.value, "", bounds.value, "", "" if given is None else str(given))
     unit = parameter_unit(effect, name, axis, bounds.value)
 
     def with_unit(text: str) -> str:
@@ -315,10 +315,10 @@ def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: s
     whole = any(f.name == name and f.metadata["whole"] for f in fields(EFFECTS[effect]))  # type: ignore[arg-type]
     if whole or not isfinite(hi - lo) or hi <= lo:
         text = f"{value:.0f}" if whole else format_number(value)
-        return Parameter(name, text, "", with_unit(text), unit.name, was)
+        return FormattedParameter(name, text, "", with_unit(text), unit.name, was)
     texts = _with_interval(value, lo, hi)
     short = with_unit(_plus_minus(value, lo, hi, texts))
-    return Parameter(name, texts[0], f"{texts[1]} … {texts[2]}", short, unit.name, was)
+    return FormattedParameter(name, texts[0], f"{texts[1]} … {texts[2]}", short, unit.name, was)
 
 
 def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str:

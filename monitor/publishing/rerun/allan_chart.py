@@ -22,13 +22,13 @@ FILL_STEPS: Final = 96  # number of vertical strokes that fill a band
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
+class ChartScale:
     """Range of averaging times and deviations that the box shows, as exponents of ten."""
 
     x: tuple[int, int]
     y: tuple[int, int]
 
-    def to_chart(self, tau: Floats, sigma: Floats) -> Floats:
+    def to_chart_positions(self, tau: Floats, sigma: Floats) -> Floats:
         """Return positions in chart units, shape [n, 2]. NaN where the deviation is not positive.
 
         Parameters
@@ -47,7 +47,7 @@ class Scale:
         return np.column_stack([across, down])
 
 
-def decade_range(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tuple[int, int]:
+def decade_range(values: Iterable[Floats], min_decades: int = int(MIN_DECADES)) -> tuple[int, int]:
     """Return the exponents of the decades that contain all positive finite numbers.
 
     >>> decade_range([np.array([0.02, 300.0])])
@@ -57,15 +57,15 @@ def decade_range(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tup
     ----------
     values
         Arrays of numbers.
-    least
+    min_decades
         Smallest number of decades.
     """
     good = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values])
     if good.size == 0:
-        return 0, least
+        return 0, min_decades
     low = math.floor(math.log10(float(good.min())) + 1e-9)
     high = math.ceil(math.log10(float(good.max())) - 1e-9)
-    return low, max(high, low + least)
+    return low, max(high, low + min_decades)
 
 
 def clip_to_box(y: Floats) -> Floats:
@@ -132,7 +132,7 @@ def interval_strokes(low: Floats, high: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
+class ChartGrid:
     """Lines and tick labels of a scale."""
 
     frame: list[Floats]
@@ -141,14 +141,14 @@ class Grid:
     ticks: list[tuple[float, float, str]]  # x, y, label
 
 
-def grid_lines(scale: Scale) -> Grid:
+def chart_grid(scale: ChartScale) -> ChartGrid:
     """Return lines at the powers of ten, minor lines at multiples, and labels below and to the left of the box."""
     x_at, x_minor = _line_positions(scale.x, WIDTH)
     y_at, y_minor = _line_positions(scale.y, HEIGHT)
     flip = HEIGHT
     ticks = [(x, HEIGHT + 0.25, _tick(p)) for x, p in zip(x_at, range(scale.x[0], scale.x[1] + 1), strict=True)]
     ticks += [(-0.75, flip - y - 0.35, _tick(p)) for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)]
-    return Grid(
+    return ChartGrid(
         frame=[np.array([[0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT], [0, 0]], float)],
         major=[_vertical(x) for x in x_at[1:-1]] + [_horizontal(flip - y) for y in y_at[1:-1]],
         minor=[_vertical(x) for x in x_minor] + [_horizontal(flip - y) for y in y_minor],

@@ -130,7 +130,7 @@ def _event_log(origin: str) -> rrb.View:
 
 def _heat_map(device: str, axis: str) -> rrb.View:
     """Return the view of the heat map of one axis."""
-    x, y = dynamic_heat_map.view_bounds(TYPICAL_TAU_COUNT)
+    x, y = dynamic_heat_map.heat_map_bounds(TYPICAL_TAU_COUNT)
     name = f"{axis}: Allan deviation over time, divided by its median"
     return drawing_view(f"/{device}/dynamic/{axis}", name, "$origin/**", x, y)
 

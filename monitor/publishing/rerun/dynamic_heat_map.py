@@ -30,13 +30,13 @@ BAR_STEPS: Final = 24
 LABEL_MARGINS_PX: Final = (24.0, 7.0, 32.0, 13.0)  # left, above, right and below the image, for labels
 
 
-def view_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
+def heat_map_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return the limits in x and y of a view with the given number of averaging times."""
     left, above, right, below = LABEL_MARGINS_PX
     return (-left, COLUMNS + right), (-above, _rows(tau_count) * tau_count + below)
 
 
-def draw_heat_maps(log: Log, path: str, surface: AllanHistory) -> None:
+def draw_heat_maps(log: Log, path: str, allan_history: AllanHistory) -> None:
     """Log the images and labels of all measured axes at the current time of the stream.
 
     Parameters
@@ -45,21 +45,21 @@ def draw_heat_maps(log: Log, path: str, surface: AllanHistory) -> None:
         Function that logs an entity.
     path
         Path of the heat maps.
-    surface
+    allan_history
         Deviations over time.
     """
-    whole = surface.log_ratio_to_median()
+    whole = allan_history.log_ratio_to_median()
     if len(whole) < MIN_COLUMNS:
         return
     for i, axis in enumerate(AXES):
         if not np.isfinite(whole[:, :, i]).any():
             continue
-        height = _rows(surface.tau_s.size) * surface.tau_s.size
+        height = _rows(allan_history.tau_s.size) * allan_history.tau_s.size
         log(
             f"{path}/{axis}",
             rr.EncodedImage(contents=encode_heat_map(whole[:, :, i]), media_type="image/png", draw_order=-20.0),
         )
-        labels = _tau_labels(surface.tau_s, height) + _time_labels(surface, height) + _bar_labels(height)
+        labels = _tau_labels(allan_history.tau_s, height) + _time_labels(allan_history, height) + _bar_labels(height)
         log(f"{path}/{axis}/labels", label_points(labels))
         log(f"{path}/{axis}/scale", _bar(height))
 
@@ -78,8 +78,10 @@ def encode_heat_map(log_ratio: Floats) -> bytes:
 
 def _palette() -> tuple[colours.Colour, ...]:
     """Return the palette: blue below the median, dark at the median, vermilion above, black for missing values."""
-    below = [colours.blend(colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, colours.MINOR) for i in range(SHADES)]
-    above = [colours.blend(colours.AXIS_COLOURS["gx"], i / SHADES, colours.MINOR) for i in range(SHADES + 1)]
+    below = [
+        colours.blend_colours(colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, colours.MINOR) for i in range(SHADES)
+    ]
+    above = [colours.blend_colours(colours.AXIS_COLOURS["gx"], i / SHADES, colours.MINOR) for i in range(SHADES + 1)]
     return (*below, *above, colours.BACKGROUND)
 
 

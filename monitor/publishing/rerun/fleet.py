@@ -16,12 +16,12 @@ from drivers.zenoh.sample_message import decode_samples
 from monitor.common import topics
 from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import AllanMessage, EventMessage, StatusMessage
-from monitor.publishing.remote_devices import DeviceStates, split_key
+from monitor.publishing.remote_devices import DeviceStates, split_device_and_topic
 from monitor.publishing.rerun.panel_text import fleet_text
 from monitor.publishing.rerun.queued_view import RerunView
 from monitor.publishing.result_kinds import DeviceTableText, SampleRows
 from monitor.publishing.terminal.watch import connection_note
-from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
+from monitor.publishing.zenoh.subscriber import ReceivedMessage, ZenohSubscriber
 
 RECEIVE_TIMEOUT_S: Final = 0.1
 TABLE_PERIOD_S: Final = 1.0
@@ -71,19 +71,19 @@ class FleetView:
         self.board = DeviceStates()
         self.malformed = 0  # number of messages of devices in detail that could not be decoded
 
-    def run(self, stop: threading.Event, tell: Callable[[str], None], seconds: float | None = None) -> None:
+    def run(self, stop: threading.Event, report: Callable[[str], None], duration_s: float | None = None) -> None:
         """Process messages until ``stop`` is set.
 
         Parameters
         ----------
         stop
             Event that ends the method.
-        tell
+        report
             Function that is called with the address of the page and a description of problems when one of them changes.
-        seconds
+        duration_s
             Longest duration [s]; None: no limit.
         """
-        end_s = None if seconds is None else time.monotonic() + seconds
+        end_s = None if duration_s is None else time.monotonic() + duration_s
         table_s, reported = 0.0, ""
         while not stop.is_set() and (end_s is None or time.monotonic() < end_s):
             for message in self._subscriber.take(RECEIVE_TIMEOUT_S):
@@ -94,18 +94,18 @@ class FleetView:
             table_s = now_s
             self.draw_device_table(time.time(), now_s)
             page = self._viewer.url if self._viewer.url.startswith("http") else ""
-            report = "; ".join(part for part in (page, self._problems()) if part)
-            if report != reported:
-                reported = report
-                tell(report)
+            text = "; ".join(part for part in (page, self._problems()) if part)
+            if text != reported:
+                reported = text
+                report(text)
 
-    def process_message(self, message: Message) -> None:
+    def process_message(self, message: ReceivedMessage) -> None:
         """Update the table with a message, and the viewer if the device is shown in detail."""
         if message.payload is None:
-            self.board.set_token(message.key, message.there)
+            self.board.set_liveliness_token(message.key, message.token_exists)
             return
         decoded = self.board.process_message(message.key, message.payload)
-        device, topic = split_key(message.key) or ("", topics.ALIVE)
+        device, topic = split_device_and_topic(message.key) or ("", topics.ALIVE)
         if isinstance(decoded, EventMessage) and decoded.t is not None:
             self._viewer.put(device, decoded.t, decoded.to_event())
         elif device not in self._detail:
@@ -129,7 +129,7 @@ class FleetView:
         now_s
             Current time on the clock of the messages [s].
         """
-        devices = self.board.devices(now_s)
+        devices = self.board.sorted_devices(now_s)
         note = connection_note(self.board, self._subscriber)
         self._viewer.put("", wall_s, DeviceTableText(fleet_text(devices, now_s, MAX_ROWS, note)))
 
@@ -141,7 +141,7 @@ class FleetView:
             if unix_s.size:
                 self._viewer.put(device, float(unix_s[-1]), SampleRows(unix_s, rows.values, rows.temperature_c))
         elif topic is topics.ALLAN:
-            message, known = decode_message(AllanMessage, payload), self.board.coefficients(device)
+            message, known = decode_message(AllanMessage, payload), self.board.device_coefficients(device)
             if known is not None:
                 estimate = message.to_estimate(known.coefficients, known.k_or_r)
                 self._viewer.put(device, estimate.t_ns / 1e9, estimate)

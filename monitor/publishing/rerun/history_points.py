@@ -11,7 +11,7 @@ from monitor.history.history_table import ColumnStatistics, HistoryTable
 from monitor.publishing.plots.style import omit_wide_intervals
 
 
-def history_points(past: HistoryTable, course: ColumnStatistics, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
+def history_points(past: HistoryTable, column: ColumnStatistics, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
     """Return the Unix times [m] of the points, and their value, lo and hi [m, 3].
 
     A row of NaN marks each gap and the end, so that the line is interrupted there.
@@ -20,21 +20,21 @@ def history_points(past: HistoryTable, course: ColumnStatistics, lo: Floats, hi:
     ----------
     past
         History that contains the p buckets.
-    course
+    column
         Statistics of a number in each bucket.
     lo, hi
         Ends of the interval of each last value, shape [p]; NaN if there is none.
     """
     start_s, width_s = past.start_s.astype(np.float64), past.width_s.astype(np.float64)
     newest_s = start_s + width_s
-    lo, hi = omit_wide_intervals(course.last, lo, hi)
-    ends = [np.fmin(lo, course.last), np.fmax(hi, course.last)]
-    parts = [_rows(newest_s, course.last, lo, hi, np.isfinite(course.last))]
-    parts.append(_rows(start_s + width_s / 3.0, course.low, lo, hi, course.low < ends[0]))
-    parts.append(_rows(start_s + width_s / 1.5, course.high, lo, hi, course.high > ends[1]))
+    lo, hi = omit_wide_intervals(column.last, lo, hi)
+    ends = [np.fmin(lo, column.last), np.fmax(hi, column.last)]
+    parts = [_rows(newest_s, column.last, lo, hi, np.isfinite(column.last))]
+    parts.append(_rows(start_s + width_s / 3.0, column.low, lo, hi, column.low < ends[0]))
+    parts.append(_rows(start_s + width_s / 1.5, column.high, lo, hi, column.high > ends[1]))
     missing = np.full(start_s.size, np.nan)
     broken = np.append(past.start_s[1:] > past.end_s[:-1], True)
-    broken |= ~np.isfinite(course.last)
+    broken |= ~np.isfinite(column.last)
     parts.append(_rows(newest_s + 1e-3, missing, missing, missing, broken))
     table = np.concatenate(parts)
     table = table[np.argsort(table[:, 0], kind="stable")]

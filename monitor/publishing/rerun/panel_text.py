@@ -115,7 +115,7 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
     """Return the row of one device in the table of many devices."""
     state, status = one.state(now_s), one.status
     name = _escape_cell(one.key)
-    state_text = f"**{state.upper()}**" if one.rank(now_s) == 0 else _escape_cell(state)
+    state_text = f"**{state.upper()}**" if one.display_rank(now_s) == 0 else _escape_cell(state)
     noise = [
         "" if one.coefficients is None else format_coefficient(one.coefficients.coefficients, "N", axis).value
         for axis in FLEET_AXES
@@ -123,7 +123,7 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
     if status is None:
         return f"| **{name}** | {state_text} | | | | | {' | '.join(noise)} | no data yet |"
     rate = format_sample_rate(status.rate_hz)
-    problems = _escape_cell(one.problems()) or (
+    problems = _escape_cell(one.describe_problems()) or (
         f"no data for {now_s - one.last_message_s:.1f} s" if state in ("gone", "silent") else ""
     )
     counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"

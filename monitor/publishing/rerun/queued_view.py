@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING, Any, Final
 from monitor.history.history_table import HistoryTable
 from monitor.publishing.bounded_queue import BoundedQueue
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerClosed, ViewerError, ViewerSettings
-from monitor.publishing.result_kinds import RESULT_KINDS, Drawing, TimedResult, kind_of
+from monitor.publishing.result_kinds import RESULT_KINDS, DrawingRule, TimedResult, kind_of
 
 if TYPE_CHECKING:
-    from monitor.publishing.rerun.sinks import Output, ViewerProcess
+    from monitor.publishing.rerun.sinks import RerunOutput, ViewerProcess
     from monitor.publishing.rerun.viewer_content import Scene
 
 BACKLOG_BYTES: Final = 16_000_000  # about 25 s of 16 devices at 1 kHz with six axes
@@ -176,7 +176,7 @@ class RerunView:
             self._child = None
             output.close()
 
-    def _send_layout(self, output: "Output", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
+    def _send_layout(self, output: "RerunOutput", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
         """Send the layout for the devices and create their entities."""
         from monitor.publishing.rerun import blueprint
 
@@ -193,7 +193,7 @@ class RerunView:
         if past is not None:
             scene.draw_history(device, past)
 
-    def _draw(self, output: "Output", scene: "Scene") -> None:
+    def _draw(self, output: "RerunOutput", scene: "Scene") -> None:
         """Draw new data until closed. Raise ViewerError if the viewer has ended."""
         waiting = _WaitingResults()
         shown: tuple[DeviceInfo, ...] | None = None
@@ -201,7 +201,7 @@ class RerunView:
         checked = time.monotonic()
         while True:
             closing = self._closing.is_set()
-            waiting.add(
+            waiting.add_results(
                 self._backlog.take(0.0)
             )  # before the devices are read, so that the device of each result is known
             self._inside_since = time.monotonic()
@@ -212,7 +212,7 @@ class RerunView:
                 for device in [one.name for one in shown if one.name not in begun]:
                     begun.add(device)
                     self._draw_history(scene, device)
-            waiting.draw(scene, everything=closing)
+            waiting.draw_due_results(scene, draw_all=closing)
             now = time.monotonic()
             if closing or now - checked > CONFIRM_PERIOD_S:
                 self._confirm(output)
@@ -223,7 +223,7 @@ class RerunView:
             output.check_viewer()
             self._closing.wait(output.flush_every_s)
 
-    def _confirm(self, output: "Output") -> None:
+    def _confirm(self, output: "RerunOutput") -> None:
         """Wait until all drawn data have reached the viewer. This limits the data held by Rerun to one second."""
         while not output.confirm_delivery(PATIENCE_S):
             self._stalled = not self._closing.is_set()
@@ -238,24 +238,24 @@ class _WaitingResults:
 
     def __init__(self) -> None:
         self.period_factor = 1.0  # factor for the periods of drawings whose rate the devices share
-        self._waiting: dict[Drawing, dict[str, list[TimedResult]]] = {
+        self._waiting: dict[DrawingRule, dict[str, list[TimedResult]]] = {
             drawing: {} for kind in RESULT_KINDS for drawing in kind.drawings
         }
-        self._drawn_s: dict[tuple[Drawing, str], float] = {}  # monotonic time of the last drawing of a device [s]
+        self._drawn_s: dict[tuple[DrawingRule, str], float] = {}  # monotonic time of the last drawing of a device [s]
 
-    def add(self, results: Sequence[tuple[str, float, Any]]) -> None:
+    def add_results(self, results: Sequence[tuple[str, float, Any]]) -> None:
         """Add results, given by device, Unix time [s] and result."""
         for device, unix_s, result in results:
             for drawing in kind_of(result).drawings:
                 drawing.merge(self._waiting[drawing].setdefault(device, []), (unix_s, result))
 
-    def draw(self, scene: "Scene", everything: bool) -> None:
-        """Draw the results whose period has passed, or all results if ``everything`` is True."""
+    def draw_due_results(self, scene: "Scene", draw_all: bool) -> None:
+        """Draw the results whose period has passed, or all results if ``draw_all`` is True."""
         for drawing, devices in self._waiting.items():
             period_s = drawing.period_s * (self.period_factor if drawing.shares_rate else 1.0)
             for device in list(devices):
                 now_s = time.monotonic()
-                if everything or now_s - self._drawn_s.get((drawing, device), float("-inf")) >= period_s:
+                if draw_all or now_s - self._drawn_s.get((drawing, device), float("-inf")) >= period_s:
                     self._drawn_s[drawing, device] = now_s
                     scene.draw(device, drawing.panel, devices.pop(device))
 

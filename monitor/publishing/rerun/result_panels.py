@@ -37,7 +37,7 @@ from monitor.publishing.rerun import history_points as past_points
 from monitor.publishing.rerun.allan_history_table import AllanHistory
 from monitor.publishing.rerun.decimation import average_buckets, decimate_extremes
 from monitor.publishing.rerun.panel_text import drift_text, health_text, noise_text, overview_text
-from monitor.publishing.rerun.shared_views import RAW_SAMPLES_S, markdown, temperature_view, time_series_view
+from monitor.publishing.rerun.shared_views import RAW_SAMPLES_S, markdown_document, temperature_view, time_series_view
 from monitor.publishing.rerun.viewer_settings import DeviceInfo
 
 if TYPE_CHECKING:
@@ -129,8 +129,8 @@ class Panel:
 
     def _log_text(self, name: str, unix_s: float, text: str) -> None:
         """Log a Markdown text at a Unix time [s]."""
-        self.scene.set_time(unix_s)
-        self.scene.log(self.entity_path(name), markdown(text))
+        self.scene.set_log_time(unix_s)
+        self.scene.log(self.entity_path(name), markdown_document(text))
 
 
 class SamplesPanel(Panel):
@@ -176,7 +176,7 @@ class DriftPanel(Panel):
         """Log the styles of the lines."""
         unit = DEVIATION_UNITS["gyro"].name
         for axis in axes_of("gyro"):
-            colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
+            colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
             lines = [(f"{axis} at rest, {unit}", dim, 0.75), (f"{axis} expected", colours.TEXT, 1.5)]
             lines += [(f"{axis} 95 % low", colour, 1.0), (f"{axis} 95 % high", colour, 1.0)]
             self._style_lines(f"drift/{axis}", lines)
@@ -221,7 +221,7 @@ class ThermalPanel(Panel):
     def log_styles(self) -> None:
         """Log the styles of the lines."""
         for axis in AXES:
-            colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
+            colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
             unit = DEVIATION_UNITS[sensor_kind(axis)].name
             lines = [(f"{axis} bias, {unit}", colour, 2.0), (f"{axis} expected", colours.TEXT, 1.0)]
             self._style_lines(
@@ -266,7 +266,7 @@ class GapPanel(Panel):
         """Log the styles of the lines."""
         for axis in AXES:
             self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", colours.AXIS_COLOURS[axis], 1.5)])
-        self._style_lines("gap/threshold", [("threshold", colours.blend(colours.TEXT, 0.6), 1.0)])
+        self._style_lines("gap/threshold", [("threshold", colours.blend_colours(colours.TEXT, 0.6), 1.0)])
 
     def draw(self, unix_s: Floats, results: Sequence[ModelGap]) -> None:
         """Draw the results."""
@@ -291,7 +291,7 @@ class AllanPanel(Panel):
         """Draw the results."""
         at_s, estimate = float(unix_s[-1]), results[-1]
         self._log_text("coefficients", at_s, noise_text(estimate))
-        self._plot.draw(estimate, self.scene.panel(self.device, GapPanel).newest)
+        self._plot.draw(estimate, self.scene.get_or_create_panel(self.device, GapPanel).newest)
         if self._history.add_estimate(at_s, estimate):
             dynamic_heat_map.draw_heat_maps(self.scene.log, self.entity_path("dynamic"), self._history)
 
@@ -302,7 +302,7 @@ class CoefficientsPanel(Panel):
     def log_styles(self) -> None:
         """Log the styles of the lines."""
         for axis in AXES:
-            colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
+            colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
             for symbol in SYMBOLS:
                 unit = COEFFICIENT_UNITS[sensor_kind(axis)][symbol].name
                 lines = [(f"{axis}, {unit}", colour, 2.0), (f"{axis} 95 % low", dim, 0.75)]
@@ -358,7 +358,7 @@ class EventsPanel(Panel):
         for at_s, event in zip(unix_s.tolist(), results, strict=True):
             level = "ERROR" if event.kind == "link_lost" else "WARN" if event.kind in WARNING_EVENTS else "INFO"
             clock_time = format_utc(at_s)[-8:]  # the date column of the viewer is too narrow for the time
-            self.scene.set_time(at_s)
+            self.scene.set_log_time(at_s)
             if self.scene.fleet or len(self.scene.devices) > 1:
                 line = rr.TextLog(f"{clock_time}  {self.device}: {event.text}", level=level)
                 self.scene.log("overview/events", line)
@@ -376,7 +376,7 @@ class EventsPanel(Panel):
         """Mark the new values of changed coefficients."""
         if event.axis is None:
             return
-        coefficients = self.scene.panel(self.device, CoefficientsPanel)
+        coefficients = self.scene.get_or_create_panel(self.device, CoefficientsPanel)
         for symbol, sides in event.values.items():
             if symbol in SYMBOLS and "after" in sides:
                 at, after = np.array([unix_s]), np.array([sides["after"]])
@@ -394,7 +394,9 @@ class HealthPanel(Panel):
         about = devices[self.device].about if self.device in devices else ""
         self._log_text("status", at_s, health_text(self.device, health, about))
         if len(devices) > 1 and not self.scene.fleet:
-            self.scene.panel("", DeviceTablePanel).log_device_table(at_s, overview_text(self.scene.healths))
+            self.scene.get_or_create_panel("", DeviceTablePanel).log_device_table(
+                at_s, overview_text(self.scene.healths)
+            )
 
 
 class DeviceTablePanel(Panel):
@@ -414,8 +416,8 @@ class DeviceTablePanel(Panel):
         text
             Table as Markdown.
         """
-        self.scene.set_time(unix_s)
-        self.scene.log("overview", markdown(text))
+        self.scene.set_log_time(unix_s)
+        self.scene.log("overview", markdown_document(text))
 
 
 def _points_until(unix_s: float, estimate: Estimate) -> tuple[Floats, Floats]:

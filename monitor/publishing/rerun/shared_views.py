@@ -85,7 +85,7 @@ def collapsed_blueprint(root: rrb.Container, timeline: str) -> rrb.Blueprint:
     )
 
 
-def markdown(text: str) -> rr.TextDocument:
+def markdown_document(text: str) -> rr.TextDocument:
     """Return a Markdown document."""
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
 

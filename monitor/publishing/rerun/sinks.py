@@ -1,6 +1,6 @@
 """Outputs of a Rerun stream: a viewer window, a page in the browser, or a file.
 
-``open_output`` returns an ``Output``: a Rerun stream and the child process that belongs to it. The message of a
+``open_output`` returns an ``RerunOutput``: a Rerun stream and the child process that belongs to it. The message of a
 ``ViewerError`` states the problem in one line, and the caller repeats the attempt later. The viewer program is started
 directly, because its Python wrapper would leave the program running when killed. The program listens on the loopback
 interface only, and usage statistics are off. For the daemon, a window and a page are both a Rerun server in a separate
@@ -58,7 +58,7 @@ class ViewerProcess:
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
         quiet = {"RERUN_ANALYTICS": "0", "RERUN_APP_ONLY": "true", "NO_COLOR": "1", "RUST_LOG": "warn"}
         self._process = subprocess.Popen(
-            [*_death_signal_prefix(), str(viewer_program()), *arguments],
+            [*_death_signal_prefix(), str(viewer_program_path()), *arguments],
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=self._log,
@@ -79,12 +79,12 @@ class ViewerProcess:
         """Return True if the process ended normally, as after its window was closed."""
         return self._process.poll() == 0
 
-    def end(self, patience_s: float = 0.5) -> None:
-        """Terminate the process. Kill it after ``patience_s`` seconds, because a stopped process ignores SIGTERM."""
+    def terminate(self, timeout_s: float = 0.5) -> None:
+        """Terminate the process. Kill it after ``timeout_s`` seconds, because a stopped process ignores SIGTERM."""
         with contextlib.suppress(OSError):
             self._process.terminate()
         try:
-            self._process.wait(patience_s)
+            self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait(5.0)
@@ -102,7 +102,7 @@ class ViewerProcess:
 
 
 @dataclass
-class Output:
+class RerunOutput:
     """Open viewer or file."""
 
     stream: rr.RecordingStream
@@ -131,22 +131,22 @@ class Output:
         if trouble is not None:
             raise ViewerError(trouble)
 
-    def confirm_delivery(self, patience_s: float) -> bool:
-        """Return True if all logged data were sent within ``patience_s`` seconds and the viewer answers.
+    def confirm_delivery(self, timeout_s: float) -> bool:
+        """Return True if all logged data were sent within ``timeout_s`` seconds and the viewer answers.
 
         Sending alone is not sufficient, because the sockets of a stopped viewer accept two more megabytes.
         """
         try:
-            self.stream.flush(timeout_sec=patience_s)
+            self.stream.flush(timeout_sec=timeout_s)
         except RuntimeError:  # raised by Rerun after a timeout and for a lost connection
             return False
-        return self.port is None or _grpc_call(self.port, "/imu.monitor/Ping", patience_s) is not None
+        return self.port is None or _grpc_call(self.port, "/imu.monitor/Ping", timeout_s) is not None
 
     def close(self) -> None:
         """Complete the file, or end the viewer process that belongs to this output."""
         try:
             if self.child is not None:
-                self.child.end()
+                self.child.terminate()
             if self.port is None:
                 self.stream.disconnect()
         finally:
@@ -154,7 +154,7 @@ class Output:
                 self.lock.close()
 
 
-def viewer_program() -> Path:
+def viewer_program_path() -> Path:
     """Return the path of the viewer program in the package ``rerun_cli``."""
     folder = Path(rerun_cli.__file__).parent
     names = ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun")
@@ -180,7 +180,7 @@ def is_listening(port: int) -> bool:
     return False
 
 
-def is_rerun(port: int) -> bool:
+def is_rerun_server(port: int) -> bool:
     """Return True if a Rerun server answers on the port.
 
     Other gRPC servers answer a call of the Rerun service with "unimplemented" (status 12).
@@ -202,14 +202,14 @@ def _grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
         connection.close()
 
 
-def free_port(wanted: int, taken: int | None = None) -> int:
-    """Return the first free port from ``wanted`` on.
+def find_free_port(first_port: int, skipped_port: int | None = None) -> int:
+    """Return the first free port from ``first_port`` on.
 
     Parameters
     ----------
-    wanted
+    first_port
         First port to try.
-    taken
+    skipped_port
         Port to skip.
 
     Raises
@@ -217,10 +217,10 @@ def free_port(wanted: int, taken: int | None = None) -> int:
     ViewerError
         If PORTS_TRIED ports are in use.
     """
-    for port in range(wanted, min(wanted + PORTS_TRIED, 65536)):
-        if port != taken and _bindable(port):
+    for port in range(first_port, min(first_port + PORTS_TRIED, 65536)):
+        if port != skipped_port and _bindable(port):
             return port
-    raise ViewerError(f"cannot listen on {wanted} to {wanted + PORTS_TRIED - 1}: all busy")
+    raise ViewerError(f"cannot listen on {first_port} to {first_port + PORTS_TRIED - 1}: all busy")
 
 
 def _bindable(port: int) -> bool:
@@ -235,7 +235,7 @@ def _bindable(port: int) -> bool:
     return True
 
 
-def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
+def open_output(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
     """Open the output that the settings select, and wait until it listens.
 
     Parameters
@@ -244,7 +244,7 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
         Settings of the viewer.
     recording_id
         Identifier of the recording in Rerun.
-    given_up
+    should_stop
         Function that returns True to stop waiting.
 
     Raises
@@ -257,11 +257,11 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
     if settings.mode.endswith(".rrd"):
         return _open_file(Path(settings.mode), recording_id)
     if settings.mode in ("native", "join") or (settings.mode == "auto" and has_desktop()):
-        return _open_native(settings, recording_id, given_up)
-    return _open_web(settings, recording_id, given_up)
+        return _open_native(settings, recording_id, should_stop)
+    return _open_web(settings, recording_id, should_stop)
 
 
-def _open_file(path: Path, recording_id: str) -> Output:
+def _open_file(path: Path, recording_id: str) -> RerunOutput:
     """Open and lock a file."""
     try:
         if path.exists():
@@ -285,14 +285,14 @@ def _open_file(path: Path, recording_id: str) -> Output:
     except BaseException:
         lock.close()
         raise
-    return Output(stream, flush_every_s=1.0, lock=lock)
+    return RerunOutput(stream, flush_every_s=1.0, lock=lock)
 
 
-def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
+def _open_native(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
     """Join the Rerun server on the port, or open a window."""
     port = settings.port
     if is_listening(port):
-        if not is_rerun(port):
+        if not is_rerun_server(port):
             raise ViewerError(f"cannot listen on {port}: busy")
         return _connected(port, recording_id)
     if settings.mode == "join":
@@ -304,19 +304,19 @@ def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable
         *("--memory-limit", _add_program_memory(settings.memory), "--server-memory-limit", "64MiB"),
         *("--hide-welcome-screen", "--expect-data-soon"),
     ])  # fmt: skip
-    _wait_for(port, child, given_up)
+    _wait_for(port, child, should_stop)
     return _connected(port, recording_id, child=child)
 
 
-def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
+def _open_web(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
     """Start a Rerun server with a web page, and open the page if there is a desktop."""
-    port = free_port(settings.port)
-    web_port = free_port(settings.web_port, taken=port)
+    port = find_free_port(settings.port)
+    web_port = find_free_port(settings.web_port, skipped_port=port)
     child = ViewerProcess([
         *("--serve-web", "--bind", LOOPBACK, "--port", str(port), "--web-viewer-port", str(web_port)),
         *("--server-memory-limit", settings.memory),
     ])  # fmt: skip
-    _wait_for(port, child, given_up)
+    _wait_for(port, child, should_stop)
     output = _connected(port, recording_id, child=child)
     moved = {settings.port: port, settings.web_port: web_port}
     output.note = ", ".join(f"port {old} is busy: {new} is used" for old, new in moved.items() if old != new)
@@ -344,11 +344,11 @@ def server_url(port: int) -> str:
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
-def _connected(port: int, recording_id: str, child: ViewerProcess | None = None) -> Output:
+def _connected(port: int, recording_id: str, child: ViewerProcess | None = None) -> RerunOutput:
     """Return an output that is connected to a Rerun server."""
     stream = _stream(recording_id)
     stream.set_sinks(rr.GrpcSink(server_url(port)))
-    return Output(stream, LIVE_FLUSH_PERIOD_S, server_url(port), child, port)
+    return RerunOutput(stream, LIVE_FLUSH_PERIOD_S, server_url(port), child, port)
 
 
 def _stream(recording_id: str) -> rr.RecordingStream:
@@ -365,16 +365,16 @@ def _stream(recording_id: str) -> rr.RecordingStream:
     return stream
 
 
-def _wait_for(port: int, child: ViewerProcess, given_up: Callable[[], bool]) -> None:
+def _wait_for(port: int, child: ViewerProcess, should_stop: Callable[[], bool]) -> None:
     """Wait until the viewer listens. If the viewer does not listen in time, end it and raise ViewerError."""
     end = time.monotonic() + START_TIMEOUT_S
-    while time.monotonic() < end and not given_up():
+    while time.monotonic() < end and not should_stop():
         trouble = child.exit_reason()
         if trouble is not None:
-            child.end()
+            child.terminate()
             raise ViewerError(trouble)
         if is_listening(port):
             return
         time.sleep(0.05)
-    child.end()
+    child.terminate()
     raise ViewerError(f"the viewer did not listen on port {port} within {START_TIMEOUT_S:.0f} s")

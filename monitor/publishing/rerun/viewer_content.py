@@ -51,9 +51,9 @@ class Scene:
         self.healths = {name: health for name, health in self.healths.items() if name in self.devices}
         for name in self.devices:
             for kind in PANELS:
-                self.panel(name, kind).log_styles()
+                self.get_or_create_panel(name, kind).log_styles()
 
-    def panel(self, device: str, kind: type[P]) -> P:
+    def get_or_create_panel(self, device: str, kind: type[P]) -> P:
         """Return a panel of a device. Create the panel if it does not exist.
 
         Parameters
@@ -81,7 +81,9 @@ class Scene:
             At least one result with its Unix time [s], in order of time.
         """
         kind: type[Panel] = getattr(panels, panel)
-        self.panel(device, kind).draw(np.array([unix_s for unix_s, _ in results]), [one for _, one in results])
+        self.get_or_create_panel(device, kind).draw(
+            np.array([unix_s for unix_s, _ in results]), [one for _, one in results]
+        )
 
     def draw_history(self, device: str, history: HistoryTable) -> None:
         """Draw the stored history of a device.
@@ -96,9 +98,9 @@ class Scene:
             The history.
         """
         for kind in PANELS:
-            self.panel(device, kind).draw_history(history)
+            self.get_or_create_panel(device, kind).draw_history(history)
 
-    def set_time(self, unix_s: float) -> None:
+    def set_log_time(self, unix_s: float) -> None:
         """Set the Unix time [s] of the following log calls."""
         self._stream.set_time(TIMELINE, timestamp=_timestamps(np.array([unix_s]))[0])
 

@@ -36,24 +36,26 @@ def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()
     return Group(*coefficient_tables(DeviceCoefficients.from_estimate(estimate), axes_of_temperature))
 
 
-def coefficient_tables(known: DeviceCoefficients, axes_of_temperature: Collection[str] = ()) -> list[RenderableType]:
+def coefficient_tables(
+    coefficients: DeviceCoefficients, axes_of_temperature: Collection[str] = ()
+) -> list[RenderableType]:
     """Return a legend and a table for each kind of sensor, with a row for each axis and a column for each coefficient.
 
     Parameters
     ----------
-    known
+    coefficients
         Coefficients of the device.
     axes_of_temperature
         Axes to mark because temperature explains most of their slow variance.
     """
-    time_text = "" if known.filled_s is None else f"last {format_duration(known.filled_s)}; "
-    marks = f"; {K_OR_R}: one of them" if known.k_or_r else ""
+    time_text = "" if coefficients.filled_s is None else f"last {format_duration(coefficients.filled_s)}; "
+    marks = f"; {K_OR_R}: one of them" if coefficients.k_or_r else ""
     marks += f"; {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
     legend = Text(f"{time_text}[95 % interval]; ≤ bound; {NO_VALUE} too few data yet{marks}", style="dim")
     parts: list[RenderableType] = [legend]
     for kind in KINDS:
-        if set(axes_of(kind)) & set(known.axes):
-            wide, narrow = (_kind_table(known, kind, stacked, axes_of_temperature) for stacked in (False, True))
+        if set(axes_of(kind)) & set(coefficients.axes):
+            wide, narrow = (_kind_table(coefficients, kind, stacked, axes_of_temperature) for stacked in (False, True))
             parts.append(WidthDependentTable(wide, narrow))
     return parts
 

@@ -36,7 +36,7 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
         highlight=False,
     )
     rows = plain_table(
-        "axis", wrapped=("drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S))
+        "axis", wrapped_headers=("drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S))
     )
     for axis, one in result.axes.items():
         pairs = [

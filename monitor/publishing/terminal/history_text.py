@@ -143,7 +143,7 @@ def _temperature_and_loss_lines(past: HistoryTable) -> list[str]:
     return lines
 
 
-def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int = SPARKLINE_WIDTH) -> str:
+def sparkline(values: Floats, t_s: Floats, range_s: tuple[float, float], width: int = SPARKLINE_WIDTH) -> str:
     """Return values between two times as text. Each character shows the mean of a time interval.
 
     >>> steps = np.arange(8.0)
@@ -152,21 +152,21 @@ def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int =
 
     Parameters
     ----------
-    last
+    values
         Values, shape [p]; NaN if missing.
     t_s
         Times of the values [s], shape [p].
-    span
+    range_s
         Start and end of the sparkline [s].
     width
         Number of characters.
     """
-    there = np.isfinite(last)
-    if not there.any() or span[1] <= span[0]:
+    there = np.isfinite(values)
+    if not there.any() or range_s[1] <= range_s[0]:
         return GAP * width
-    at = np.clip(((t_s - span[0]) / (span[1] - span[0]) * width).astype(np.int64), 0, width - 1)[there]
+    at = np.clip(((t_s - range_s[0]) / (range_s[1] - range_s[0]) * width).astype(np.int64), 0, width - 1)[there]
     count = np.bincount(at, minlength=width)
-    means = np.bincount(at, last[there], width)[count > 0] / count[count > 0]
+    means = np.bincount(at, values[there], width)[count > 0] / count[count > 0]
     low, wide = means.min(), np.ptp(means)
     heights = ((means - low) / wide if wide > 0.0 else np.full(means.size, 0.5)) * len(SPARKLINE_HEIGHTS)
     marks = iter([SPARKLINE_HEIGHTS[min(int(one), len(SPARKLINE_HEIGHTS) - 1)] for one in heights])

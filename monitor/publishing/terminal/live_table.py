@@ -33,7 +33,7 @@ from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import EventMessage
 from monitor.publishing.remote_devices import MAX_DEVICES, MAX_EVENTS, DeviceStates, RemoteDevice
 from monitor.publishing.terminal.coefficient_tables import coefficient_tables
-from monitor.publishing.terminal.tables import plain_table, table_width
+from monitor.publishing.terminal.tables import plain_table, unwrapped_table_width
 
 MAX_PROBLEM_LINES: Final = 6
 HEADER_LINES: Final = 6
@@ -54,7 +54,7 @@ UNKNOWN_STATE_STYLE: Final = ("?", "yellow")
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class DeviceTableLayout:
     """Level of detail of the table."""
 
     digits: int
@@ -63,8 +63,12 @@ class Layout:
     gap: int  # number of blanks between columns
 
 
-LAYOUTS: Final = (Layout(3, True, False, 2), Layout(3, False, False, 1), Layout(2, False, False, 1))
-NARROW_LAYOUT: Final = Layout(3, False, True, 1)
+LAYOUTS: Final = (
+    DeviceTableLayout(3, True, False, 2),
+    DeviceTableLayout(3, False, False, 1),
+    DeviceTableLayout(2, False, False, 1),
+)
+NARROW_LAYOUT: Final = DeviceTableLayout(3, False, True, 1)
 
 
 class LiveTable:
@@ -86,18 +90,18 @@ class LiveTable:
         self._live: Live | None = None
         self._ended = False
 
-    def render(self, log_lines: Sequence[str], last: bool) -> str:
+    def render(self, log_lines: Sequence[str], is_last: bool) -> str:
         """Return the text and control codes that print log lines above the table and redraw the table.
 
         Parameters
         ----------
         log_lines : sequence of str
             Lines of the log, with colours as ANSI codes.
-        last : bool
+        is_last : bool
             True to show the cursor again and print the final table.
         """
         with self._console.capture() as captured:
-            if self.states is not None and self._live is None and self._console.is_terminal and not last:
+            if self.states is not None and self._live is None and self._console.is_terminal and not is_last:
                 live = Live(
                     console=self._console,
                     auto_refresh=False,
@@ -109,9 +113,9 @@ class LiveTable:
                 self._live = live
             if log_lines:
                 self._console.print(Text.from_ansi("".join(log_lines)))
-            if not last and self._live is not None and self.states is not None:
+            if not is_last and self._live is not None and self.states is not None:
                 self._live.update(device_table(self.states, time.monotonic()), refresh=True)
-            if last and not self._ended:
+            if is_last and not self._ended:
                 self._ended = True
                 if self._live is not None:
                     self._live.stop()
@@ -130,7 +134,7 @@ def device_table(states: DeviceStates, now_s: float) -> RenderableType:
     now_s
         Current time on the clock of the messages [s].
     """
-    devices, events = states.devices(now_s), states.newest_events()
+    devices, events = states.sorted_devices(now_s), states.newest_events()
     names = _display_names([*(one.key for one in devices), *(key for key, _ in events)])
     parts: list[RenderableType] = [_summary(states, devices, now_s)]
     if devices:
@@ -154,13 +158,13 @@ class _FittedDeviceRows:
         for layout in (*LAYOUTS, NARROW_LAYOUT):
             count = self._visible_rows(layout, console)
             table = _device_rows(self._devices[:count], self._now_s, layout)
-            if layout is NARROW_LAYOUT or table_width(table, console, options) <= options.max_width:
+            if layout is NARROW_LAYOUT or unwrapped_table_width(table, console, options) <= options.max_width:
                 break
         yield table
         if len(self._devices) > count:
             yield Text(f"… and {len(self._devices) - count} more with fewer problems", style="dim")
 
-    def _visible_rows(self, layout: Layout, console: Console) -> int:
+    def _visible_rows(self, layout: DeviceTableLayout, console: Console) -> int:
         """Return the number of rows that are shown; all rows if the output is not a terminal."""
         if not console.is_terminal:
             return len(self._devices)
@@ -168,7 +172,7 @@ class _FittedDeviceRows:
         return max(lines // (3 if layout.stacked else 1), MIN_ROWS)
 
 
-def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) -> Table:
+def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: DeviceTableLayout) -> Table:
     """Return the table of devices in the given layout."""
     table = plain_table("device", "state", gap=layout.gap)
     shown = [pair for pair in TABLE_COEFFICIENTS if any(_measures(one, pair[0]) for one in devices)]
@@ -216,7 +220,7 @@ def _state_cell(state: str) -> Text:
     return Text(f"{symbol} {state}", style=colour)
 
 
-def _count_cells(one: RemoteDevice, layout: Layout) -> list[Text]:
+def _count_cells(one: RemoteDevice, layout: DeviceTableLayout) -> list[Text]:
     """Return the cells of the rate and of the sample counters."""
     if one.status is None:
         return [Text(NO_VALUE, style="dim")] * 4
@@ -238,7 +242,7 @@ def _measures(one: RemoteDevice, kind: Kind) -> bool:
 
 
 def _coefficient_column(
-    devices: Sequence[RemoteDevice], kind: Kind, symbol: str, layout: Layout
+    devices: Sequence[RemoteDevice], kind: Kind, symbol: str, layout: DeviceTableLayout
 ) -> tuple[Text, list[Text]]:
     """Return the header and cells of one coefficient on three axes. Values are aligned between rows."""
     axes = axes_of(kind)
@@ -270,7 +274,7 @@ def _problem_lines(devices: Sequence[RemoteDevice], now_s: float) -> list[Text]:
     names = _display_names([one.key for one in devices])
     lines = []
     for one in devices:
-        if problems := one.problems():
+        if problems := one.describe_problems():
             symbol, colour = STATES.get(one.state(now_s), UNKNOWN_STATE_STYLE)
             symbol = "!" if symbol == "●" else symbol
             lines.append(Text.assemble((f"{symbol} {names[one.key]}  ", colour), problems))

@@ -118,11 +118,11 @@ class QueuedWriter:
         """Queue whole lines and return at once."""
         self._queue.push(text, len(text))
 
-    def redraw(self) -> None:
+    def request_redraw(self) -> None:
         """Call ``render`` soon, without waiting for the end of the period."""
         self._queue.wake()
 
-    def finish(self, stop: threading.Event) -> None:
+    def wait_until_written(self, stop: threading.Event) -> None:
         """Write all queued text. Wait until the text is written or ``stop`` is set."""
         self._begin_closing()
         while self._thread.is_alive() and not stop.is_set():

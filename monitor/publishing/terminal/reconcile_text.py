@@ -31,7 +31,7 @@ RESULT_STYLES: Final = {
 """Symbol and colour of each result."""
 
 
-def print_report(r: Reconciliation, console: Console) -> None:
+def print_reconciliation(r: Reconciliation, console: Console) -> None:
     """Print the result of a reconciliation.
 
     Parameters
@@ -117,7 +117,7 @@ def _axes_by_runs(c: Comparison) -> Table:
 
 def _cell(result: AxisResult | None) -> Text:
     """Return the cell of one axis in one recording."""
-    said = Text(comparison_sentences.count_findings(result), style="dim")
+    said = Text(comparison_sentences.describe_finding_counts(result), style="dim")
     return (
         said
         if result is None
@@ -144,7 +144,8 @@ def _common(c: Comparison) -> list[tuple[str, Text]]:
         for seen in one.common:
             said = _effect(c, axis, seen)
             said.append(
-                f"; {comparison_sentences.describe_agreement(seen)}", style="yellow" if seen.consistent is False else ""
+                f"; {comparison_sentences.describe_size_agreement(seen)}",
+                style="yellow" if seen.consistent is False else "",
             )
             found.append((axis, said))
     return found

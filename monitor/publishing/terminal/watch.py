@@ -67,12 +67,12 @@ def watch(
             stop.wait(once_s)
             _receive_messages(states, subscriber)
             with QueuedWriter(stream, STDOUT, LiveTable(console, states).render) as writer:
-                writer.finish(stop)
+                writer.wait_until_written(stop)
         elif console.is_terminal:
             with QueuedWriter(stream, STDOUT, LiveTable(console, states).render, REFRESH_PERIOD_S) as writer:
                 while not stop.wait(REFRESH_PERIOD_S) and writer.error is None:
                     _receive_messages(states, subscriber)
-                    writer.redraw()
+                    writer.request_redraw()
         else:
             with QueuedWriter(stream, STDOUT, limit=1) as writer:  # at most one table is queued
                 while not stop.wait(PLAIN_PERIOD_S) and writer.error is None:
@@ -86,7 +86,7 @@ def _receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None
     """Process all received messages, and update the note about the connection."""
     for message in subscriber.take(0.0):
         if message.payload is None:
-            states.set_token(message.key, message.there)
+            states.set_liveliness_token(message.key, message.token_exists)
         else:
             states.process_message(message.key, message.payload)
     states.note = connection_note(states, subscriber)
@@ -104,7 +104,11 @@ def connection_note(states: DeviceStates, subscriber: ZenohSubscriber) -> str:
     """
     state, dropped = subscriber.state, subscriber.dropped
     notes = [state] if state != "ok" else []
-    if state == "ok" and subscriber.all_connected_s > SILENCE_NOTE_S and not states.devices(time.monotonic()):
+    if (
+        state == "ok"
+        and subscriber.all_connected_duration_s > SILENCE_NOTE_S
+        and not states.sorted_devices(time.monotonic())
+    ):
         notes.append("connected, but no messages: no daemon is there, or access control refuses them")
     notes += [f"{dropped:,} messages dropped: this computer is too slow"] if dropped else []
     return "; ".join(notes)

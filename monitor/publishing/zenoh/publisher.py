@@ -142,7 +142,7 @@ class ZenohPublisher(RetriedSession):
         else:
             self._unsent = ""
 
-    def put_key(self, key: str, payload: bytes) -> str:
+    def publish_json_return_error(self, key: str, payload: bytes) -> str:
         """Publish JSON under a key that the user has chosen. Return "" or the reason why the text was not sent.
 
         Parameters
@@ -163,18 +163,18 @@ class ZenohPublisher(RetriedSession):
             return f"not sent: zenoh: {format_zenoh_error(error)}"
         return ""
 
-    def set_alive(self, device: str, flowing: bool) -> None:
+    def set_alive(self, device: str, samples_arrive: bool) -> None:
         """Declare or remove the liveliness token of a device.
 
         Parameters
         ----------
         device
             Name of the device.
-        flowing
+        samples_arrive
             True if samples of the device arrive.
         """
-        if self._alive[device] != flowing:
-            self._alive[device] = flowing
+        if self._alive[device] != samples_arrive:
+            self._alive[device] = samples_arrive
             self._update_token(device)
 
     def add_device(self, device: str) -> None:

@@ -55,12 +55,12 @@ MAX_REMEMBERED_MESSAGES: Final = 20_000
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
+class ReceivedMessage:
     """Received message, or the appearance or disappearance of a liveliness token."""
 
     key: str
     payload: bytes | None  # None for a liveliness token
-    there: bool = True  # False if a liveliness token has disappeared
+    token_exists: bool = True  # False if a liveliness token has disappeared
 
 
 class ZenohSubscriber:
@@ -93,7 +93,7 @@ class ZenohSubscriber:
         keys = {topic: topic_keys(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
         _check_keys(keyexpr, [key for part in keys.values() for key in part])
         keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL_TOPICS}
-        self._backlog: BoundedQueue[Message] = BoundedQueue(BACKLOG_BYTES)
+        self._backlog: BoundedQueue[ReceivedMessage] = BoundedQueue(BACKLOG_BYTES)
         found = client_configurations(connect, file)
         self._duplicate_filter = _DuplicateFilter() if len(found) > 1 else None
         self._sessions = [_EndpointSession(endpoint, config, keys, self._push) for endpoint, config in found.items()]
@@ -117,16 +117,16 @@ class ZenohSubscriber:
         return f"{there}; {reasons + '; ' if reasons else ''}trying the rest again"
 
     @property
-    def all_connected_s(self) -> float:
+    def all_connected_duration_s(self) -> float:
         """Duration for which all endpoints have been connected [s]; 0 if any endpoint is not connected."""
-        return min(session.connected_s for session in self._sessions)
+        return min(session.connected_duration_s for session in self._sessions)
 
     def start(self) -> None:
         """Open the sessions in separate threads and return at once."""
         for session in self._sessions:
             session.start()
 
-    def take(self, timeout_s: float) -> list[Message]:
+    def take(self, timeout_s: float) -> list[ReceivedMessage]:
         """Return the messages received since the last call. Wait up to ``timeout_s`` seconds for the first one."""
         return self._backlog.take(timeout_s)
 
@@ -138,7 +138,7 @@ class ZenohSubscriber:
             session.close()
         self._backlog.wake()
 
-    def _push(self, message: Message, stamp: str) -> None:
+    def _push(self, message: ReceivedMessage, stamp: str) -> None:
         """Add a message to the queue unless the message is a duplicate."""
         if self._duplicate_filter is None or self._duplicate_filter.is_unseen(message.key, stamp):
             self._backlog.push(message, 100 + len(message.payload or b""))
@@ -174,7 +174,7 @@ class _EndpointSession(RetriedSession):
         endpoint: str,
         config: "zenoh.Config",
         keys: Mapping[topics.Topic, Sequence[str]],
-        push: Callable[[Message, str], None],
+        push: Callable[[ReceivedMessage, str], None],
     ) -> None:
         self.endpoint = mask_secrets(endpoint)
         super().__init__(self.endpoint)
@@ -190,7 +190,7 @@ class _EndpointSession(RetriedSession):
         return session is not None and not is_unconnected(session)
 
     @property
-    def connected_s(self) -> float:
+    def connected_duration_s(self) -> float:
         """Duration of the current connection [s]; 0 if the endpoint is not connected."""
         since_s = self._since_s
         return 0.0 if since_s is None else time.monotonic() - since_s
@@ -218,7 +218,7 @@ class _EndpointSession(RetriedSession):
                 continue
             self._since_s = None
             while self._tokens:
-                self._push(Message(self._tokens.pop(), None, there=False), "")
+                self._push(ReceivedMessage(self._tokens.pop(), None, token_exists=False), "")
             if time.monotonic() - checked_s >= REFUSAL_CHECK_S:
                 self.refusal = explain_refusal(self._endpoint, self._config)
                 checked_s = time.monotonic()
@@ -226,18 +226,18 @@ class _EndpointSession(RetriedSession):
     def _process_message(self, sample: Any) -> None:
         """Pass on a message with its timestamp."""
         stamp = "" if sample.timestamp is None else str(sample.timestamp)
-        self._push(Message(str(sample.key_expr), bytes(sample.payload)), stamp)
+        self._push(ReceivedMessage(str(sample.key_expr), bytes(sample.payload)), stamp)
 
     def _process_token(self, sample: Any) -> None:
         """Pass on the change of a liveliness token."""
         import zenoh
 
-        key, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
-        if not there:
+        key, exists = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+        if not exists:
             self._tokens.discard(key)
         elif len(self._tokens) < MAX_TOKENS:
             self._tokens.add(key)
-        self._push(Message(key, None, there), "")
+        self._push(ReceivedMessage(key, None, exists), "")
 
 
 def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
