@@ -108,13 +108,13 @@ def test_ranks_and_words_of_trouble() -> None:
     assert device(state="waiting").display_rank(100.0) == 1
     assert device().display_rank(100.0) == 2
     assert device(state="ended").display_rank(100.0) == 3
-    assert device().problems() == ""
-    assert device(outputs={"zenoh": "off", "viewer": "ok"}).problems() == ""
+    assert device().describe_problems() == ""
+    assert device(outputs={"zenoh": "off", "viewer": "ok"}).describe_problems() == ""
     stalled = device(outputs={"zenoh": "ok", "viewer": "stalled"}, text="odd", overflowed=1200)
     assert stalled.display_rank(100.0) == 1
-    assert stalled.problems().startswith("odd; viewer: stalled; 1,200 samples overwritten")
+    assert stalled.describe_problems().startswith("odd; viewer: stalled; 1,200 samples overwritten")
     elsewhere = device(outputs={"zenoh": "ok, but the port is busy"})
-    assert (elsewhere.display_rank(100.0), elsewhere.problems()) == (2, "zenoh: ok, but the port is busy")
+    assert (elsewhere.display_rank(100.0), elsewhere.describe_problems()) == (2, "zenoh: ok, but the port is busy")
 
 
 def test_a_topic_of_two_parts_and_keys_that_are_none() -> None:
@@ -146,4 +146,4 @@ def test_a_limit_that_is_passed_is_trouble() -> None:
     assert one.display_rank(100.0) == 1
     assert one.describe_problems() == "limits exceeded: gz N"
     many = device(crossed=tuple(f"gz {i}" for i in range(100)))
-    assert many.problems() == "limits exceeded: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"
+    assert many.describe_problems() == "limits exceeded: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"

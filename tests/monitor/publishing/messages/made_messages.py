@@ -183,8 +183,8 @@ def messages() -> dict[str, Message | AnalysisMessage | FailedAnalysisMessage]:
         "status": StatusMessage.from_result(device, UNIX_S, 0, health()),
         "status_before_the_first_sample": StatusMessage.from_result(device, None, 0, waiting),
         "reset": ResetReply.from_result(device, UNIX_S, 7, "the window is empty"),
-        "history": HistoryMessage.reply(past(), query, UNIX_S, 7),
-        "history_of_one_coefficient": HistoryMessage.reply(
+        "history": HistoryMessage.build_reply(past(), query, UNIX_S, 7),
+        "history_of_one_coefficient": HistoryMessage.build_reply(
             past(), HistoryQuery(what=("coefficients",), axes=("gz",), symbols=("B", "N")), UNIX_S, 7
         ),
         "analyze": AnalysisMessage.from_analysis(analysis()),
