@@ -1,7 +1,7 @@
-"""State of all devices that daemons publish, from their messages.
+"""State of all devices on the network, updated from zenoh messages.
 
-``watch``, ``view`` and the table of ``run`` show these states. The messages may be sent by any program on the network.
-Malformed messages are counted, and the memory for devices and texts is limited. The module does no I/O.
+Malformed messages are counted. The memory for devices and texts is limited, because any program on the network may send
+messages.
 """
 
 import copy
@@ -52,7 +52,7 @@ DECODERS: Final[dict[topics.Topic, Callable[[bytes], Message]]] = {
 
 @dataclass(frozen=True, slots=True)
 class DeviceCoefficients:
-    """Newest coefficients of a device."""
+    """Newest noise coefficients of a device."""
 
     coefficients: Coefficients
     axes: tuple[str, ...]  # measured axes
@@ -61,14 +61,14 @@ class DeviceCoefficients:
 
     @classmethod
     def from_estimate(cls, estimate: Estimate) -> "DeviceCoefficients":
-        """Return the coefficients of an estimate."""
+        """Build the coefficients of a device from an estimate."""
         measured = measured_axes(estimate.curve)
         k_or_r = frozenset(axis for i, axis in measured if estimate.k_or_r[i])
         return cls(estimate.coefficients, tuple(axis for _, axis in measured), k_or_r)
 
     @classmethod
     def from_message(cls, message: CoefficientsMessage) -> "DeviceCoefficients":
-        """Return the coefficients of a message.
+        """Build the coefficients of a device from a message.
 
         Raises
         ------
@@ -82,7 +82,7 @@ class DeviceCoefficients:
 
 @dataclass(slots=True)
 class RemoteDevice:
-    """State of a remote device. All times are measured with the monotonic clock of the receiver."""
+    """State of a remote device. All times refer to the monotonic clock of the receiver."""
 
     key: str  # key of the device, without the topic
     last_message_s: float  # time of the newest message of any topic
@@ -92,7 +92,7 @@ class RemoteDevice:
     token_exists: bool | None = None  # True if the liveliness token of the device exists; None if unknown
 
     def state(self, now_s: float) -> str:
-        """Return the state that the daemon reports. Return gone, silent or present if there is no current status."""
+        """Return the state that the daemon reports, or gone, silent or present without a current status."""
         age_s = now_s - self.last_message_s
         ended = self.status is not None and self.status.state == "ended"
         if age_s > GONE_TIMEOUT_S and self.token_exists is False and not ended:
@@ -102,7 +102,7 @@ class RemoteDevice:
         return "present" if self.status is None else self.status.state
 
     def display_rank(self, now_s: float) -> int:
-        """Return the display_rank in tables: 0 no data, 1 a problem or not ready, 2 running, 3 ended."""
+        """Return the sort rank in device tables: 0 without data, 1 with a problem, 2 running, 3 ended."""
         state, status = self.state(now_s), self.status
         if state in ("lost", "gone", "silent"):
             return 0
@@ -115,7 +115,7 @@ class RemoteDevice:
         return 2 if outputs_work and not troubled else 1
 
     def describe_problems(self) -> str:
-        """Return a description of all problems, or "" if there are none."""
+        """Describe all problems of the device. Return an empty string if there are none."""
         if self.status is None:
             return ""
         found = [self.status.text] if self.status.text else []
@@ -131,7 +131,7 @@ class RemoteDevice:
         return "; ".join([*found, *self.disagreements])
 
     def update_from_message(self, message: Message) -> None:
-        """Update the state from a message.
+        """Update the state of the device from a message.
 
         Raises
         ------
@@ -148,7 +148,7 @@ class RemoteDevice:
 
 
 class DeviceStates:
-    """State of all devices, updated from the messages of ``monitor.common.topics``; thread-safe.
+    """Thread-safe collection of the states of all remote devices.
 
     Parameters
     ----------
@@ -166,7 +166,9 @@ class DeviceStates:
         self._lock = threading.Lock()
 
     def process_message(self, key: str, payload: bytes) -> Message | None:
-        """Process a message and return it. Return None if the topic is not shown in tables or the message is malformed.
+        """Update the state of a device from a message, and return the decoded message.
+
+        Return None if the message is malformed or the topic is not used.
 
         Parameters
         ----------
@@ -194,7 +196,7 @@ class DeviceStates:
         return message
 
     def set_liveliness_token(self, key: str, exists: bool) -> None:
-        """Process the change of a liveliness token.
+        """Record that the liveliness token of a device has appeared or disappeared.
 
         Parameters
         ----------
@@ -212,7 +214,7 @@ class DeviceStates:
                 known.token_exists = exists
 
     def remove_device(self, key: str) -> None:
-        """Remove the state and the events of the device to which a key belongs."""
+        """Remove the state and the events of the device that owns a key."""
         device, _ = split_device_and_topic(key) or ("", None)
         with self._lock:
             self._devices.pop(device, None)
@@ -220,24 +222,24 @@ class DeviceStates:
                 self._events.remove(one)
 
     def sorted_devices(self, now_s: float) -> list[RemoteDevice]:
-        """Return copies of the states of all devices. Devices with problems at time ``now_s`` [s] come first."""
+        """Return copies of all device states. Devices with problems at time ``now_s`` [s] precede the others."""
         with self._lock:
             found = [copy.copy(one) for one in self._devices.values()]
         return sorted(found, key=lambda one: (one.display_rank(now_s), one.key))
 
     def device_coefficients(self, device: str) -> DeviceCoefficients | None:
-        """Return the newest coefficients of a device, or None if there are none."""
+        """Return the newest noise coefficients of a device, or None if there are none."""
         with self._lock:
             known = self._devices.get(device)
         return None if known is None else known.coefficients
 
     def newest_events(self) -> list[tuple[str, EventMessage]]:
-        """Return the newest events with the keys of their devices, oldest first."""
+        """Return the newest events with device keys, oldest event first."""
         with self._lock:
             return list(self._events)
 
     def _add(self, device: RemoteDevice) -> bool:
-        """Add a device if it is new. Return False if there are too many devices."""
+        """Add a new device. Return False if the limit MAX_DEVICES is reached."""
         if device.key in self._devices:
             return True
         full = len(self._devices) >= MAX_DEVICES
@@ -252,7 +254,7 @@ class DeviceStates:
 
 
 def split_device_and_topic(key: str) -> tuple[str, topics.Topic] | None:
-    """Split a key into the key of the device and the topic. Return None if the topic is unknown.
+    """Split a zenoh key into device key and topic. Return None if the topic is unknown.
 
     >>> split_device_and_topic("imu/bench-1/status")
     ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz', kept=1))
@@ -266,7 +268,6 @@ def split_device_and_topic(key: str) -> tuple[str, topics.Topic] | None:
 
 
 def _describe_disagreements(message: ModelGapMessage) -> list[str]:
-    """Return a text for each axis that disagrees with its model."""
     found = [(axis, message.axes[axis]) for axis in AXES if axis in message.axes]
     return [
         f"{axis} disagrees with its model: {one.gap:.3g} σ at τ {one.where.tau[0]:.3g} to {one.where.tau[1]:.3g} s"

@@ -1,10 +1,8 @@
-"""Table of the kinds of results that leave the pipeline of a device.
+"""Table of the kinds of results that a device produces.
 
-A row of ``RESULT_KINDS`` lists the messages that are published and the viewer panels that draw the result. It also
-states how often the panels draw, and how results are merged while they wait for a slow viewer. A new kind of result
-needs a row here, a message in ``monitor.publishing.messages.results``, a panel in
-``monitor.publishing.rerun.result_panels`` and the code that produces the result. The module does no I/O and does not
-import Rerun.
+``RESULT_KINDS`` lists the messages that are published and the viewer panels that draw each kind of result. To add a
+kind of result, add an entry here, a message in ``monitor.publishing.messages.results`` and a panel in
+``monitor.publishing.rerun.result_panels``. This module does not import Rerun.
 """
 
 from collections.abc import Callable
@@ -51,7 +49,7 @@ class SampleRows:
 
 @dataclass(frozen=True, slots=True)
 class CompensatedRows:
-    """Batch of angular rates without drift."""
+    """Batch of angular rates after drift removal."""
 
     unix_s: Floats  # [n]
     values: Floats  # [n, 3] rad/s
@@ -59,7 +57,7 @@ class CompensatedRows:
 
 @dataclass(frozen=True, slots=True)
 class DeviceTableText:
-    """Table of all devices as Markdown. It is passed on with an empty device name."""
+    """Table of all devices as Markdown, which belongs to no device."""
 
     text: str
 
@@ -83,9 +81,9 @@ def keep_newest(waiting: list[TimedResult], new: TimedResult) -> None:
 
 
 def keep_newest_and_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
-    """Add the new result, and drop the previous result if it follows the result before it too closely.
+    """Append the new result, and replace the previous result if the interval between results is too short.
 
-    The coefficients for each sample of a dropped estimate are kept. The parameters are those of ``keep_all``.
+    The coefficient history of a replaced estimate is kept. The parameters are those of ``keep_all``.
     """
     if len(waiting) > 1 and new[0] - waiting[-2][0] < POINT_INTERVAL_S:
         _, previous = waiting.pop()
@@ -111,7 +109,7 @@ class DrawingRule:
 
 @dataclass(frozen=True, slots=True)
 class ResultKind:
-    """Row of the table."""
+    """Messages, drawing rules and size of one kind of result."""
 
     result: type
     """Class of the results."""
@@ -161,5 +159,5 @@ _BY_TYPE: Final = {kind.result: kind for kind in RESULT_KINDS}
 
 
 def kind_of(result: Any) -> ResultKind:
-    """Return the row of a result."""
+    """Return the entry of RESULT_KINDS for a result."""
     return _BY_TYPE[type(result)]

@@ -1,14 +1,12 @@
-"""Export of noise parameters for other tools: Kalibr, MATLAB (gyroparams and accelparams) and Kalman filters.
+"""Export of noise coefficients as parameter files for Kalibr, MATLAB and Kalman filters.
 
-The input is a ``NoiseCoefficients`` object, from a model file or from ``analyze --json``. The output is the text of a
-file that states units, the source of the numbers and the inflation factor. No other factor is applied. N of IEEE Std
-952 in rad/√s equals the two-sided density of white noise in rad/s/√Hz. K in rad/s/√s equals the density of the white
-noise that drives the bias, in rad/s²/√Hz.
+Each exporter returns the text of a file with units, the source of the coefficients and the inflation factor. N of IEEE
+Std 952 in rad/√s equals the two-sided density of white noise in rad/s/√Hz. K in rad/s/√s equals the density, in
+rad/s²/√Hz, of the white noise that drives the bias.
 
-The inflation factor multiplies N, B and K, because a sensor at rest at constant temperature has less noise than the
-same sensor on a vehicle. The formats for filters use an upper bound as if it were a value, with a comment. The format
-for simulation ignores upper bounds. Comments name the terms that a format cannot represent. All text is ASCII, because
-some of the target programs require it.
+The inflation factor multiplies N, B and K, because a sensor on a vehicle has more noise than a sensor at rest.
+Exporters for filters use an upper bound as the value and add a comment. The exporter for simulation ignores upper
+bounds. All text is ASCII, because some target programs require ASCII.
 """
 
 from collections.abc import Callable
@@ -38,7 +36,7 @@ FORMATS: Final[dict[str, Callable[..., str]]] = {
 
 
 def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, **options: Any) -> str:
-    """Return the text of a parameter file.
+    """Export noise coefficients as the text of a parameter file.
 
     Parameters
     ----------

@@ -1,9 +1,7 @@
-"""Noise coefficients to export, and the comments that are common to all formats.
+"""Noise coefficients to export, and comments that all export formats share.
 
-A ``NoiseCoefficients`` object holds Q, N, B, K and R of each axis in SI. All coefficients of a model file are values.
-In the output of ``analyze --json``, a coefficient with the status ``estimated`` is a value, and a coefficient with the
-status ``upper_bound`` is marked as a bound. Coefficients with another status are absent. Other effects, such as a
-spectral line or a bias, are kept only by name, so that a comment can list what the file omits.
+The coefficients are read from a noise model or from the output of ``analyze --json``. Noise effects that have no
+exported coefficient, such as a spectral line, are listed by name in a comment.
 """
 
 import math
@@ -32,7 +30,7 @@ COEFFICIENT_EFFECTS: Final[dict[str, type[Source]]] = {
 
 
 def ascii_unit(letter: str, kind: Kind) -> str:
-    """Return the SI unit of a coefficient in ASCII.
+    """Return the SI unit of a noise coefficient in ASCII.
 
     >>> ascii_unit("K", "gyro"), ascii_unit("R", "accel")
     ('rad/s/sqrt(s)', 'm/s^3')
@@ -50,7 +48,7 @@ def ascii_unit(letter: str, kind: Kind) -> str:
 
 @dataclass(frozen=True, slots=True)
 class ExportedCoefficient:
-    """Coefficient of one axis, SI."""
+    """Noise coefficient of one axis in SI units, as a value or an upper bound."""
 
     value: float
     bound: bool = False  # True if the value is an upper bound
@@ -58,7 +56,7 @@ class ExportedCoefficient:
 
 @dataclass(frozen=True, slots=True)
 class NoiseCoefficients:
-    """Noise coefficients by axis and letter. Unknown axes and letters are absent."""
+    """Noise coefficients by axis and symbol. Unknown coefficients are absent."""
 
     axes: Mapping[str, Mapping[str, ExportedCoefficient]]
     sample_rate_hz: float | None
@@ -68,7 +66,7 @@ class NoiseCoefficients:
     warnings: tuple[str, ...] = ()  # ASCII sentences for the header of the file
 
     def coefficient_by_axis(self, kind: Kind, letter: str) -> dict[str, ExportedCoefficient]:
-        """Return one coefficient of the axes that have it.
+        """Return one noise coefficient for each axis on which the coefficient is known.
 
         Parameters
         ----------
@@ -81,7 +79,7 @@ class NoiseCoefficients:
 
 
 def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficients:
-    """Return the coefficients of a noise model. The variances of equal effects on one axis are added.
+    """Return the coefficients of a noise model, adding the variances of equal effects on one axis.
 
     >>> model = NoiseModel.from_toml('sample_rate = 100.0\\n["g*".angle_random_walk]\\nN = 1.5e-4')
     >>> from_model(model).axes["gz"]["N"].value
@@ -111,28 +109,22 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
 
 
 class _Coefficient(msgspec.Struct):
-    """One coefficient in the JSON of an analysis."""
-
     value: float | None
     hi: float | None
     status: str
 
 
 class _Temperature(msgspec.Struct):
-    """Key ``temperature`` of an axis in the JSON of an analysis."""
-
     share: float
 
 
 class _Axis(msgspec.Struct):
-    """One axis in the JSON of an analysis."""
-
     coefficients: dict[str, _Coefficient]
     temperature: _Temperature | None = None
 
 
 class _Analysis(msgspec.Struct):
-    """JSON of an analysis with only the keys that an export needs."""
+    """Keys of the analysis JSON that an export needs."""
 
     schema: str
     axes: dict[str, _Axis]
@@ -140,7 +132,7 @@ class _Analysis(msgspec.Struct):
 
 
 def from_analysis_json(json_text: bytes | str, source: str = "analysis of a recording") -> NoiseCoefficients:
-    """Return the coefficients in the output of ``imu-monitor analyze --json``.
+    """Read noise coefficients from the output of ``imu-monitor analyze --json``.
 
     Parameters
     ----------
@@ -195,7 +187,7 @@ def missing_coefficient_error(noise: NoiseCoefficients, message: str) -> ImuErro
 
 
 def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: str) -> list[str]:
-    """Return comments on the origin of the numbers, the inflation factor and the warnings.
+    """Return comments with the source of the coefficients, the inflation factor and warnings.
 
     Parameters
     ----------
@@ -218,7 +210,7 @@ def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: st
 def comment_on_omitted_terms(
     noise: NoiseCoefficients, represented_letters: Collection[str], comment_sign: str
 ) -> list[str]:
-    """Return a comment that lists the terms of the source that the format cannot represent.
+    """Return a comment that lists the noise terms that the export format cannot represent.
 
     Parameters
     ----------
@@ -239,7 +231,7 @@ def comment_on_omitted_terms(
 
 
 def format_float(value: float) -> str:
-    """Format a number with seven digits so that YAML 1.1, TOML and MATLAB read it as a float.
+    """Format a number with seven digits in a notation that YAML 1.1, TOML and MATLAB read as a float.
 
     >>> format_float(1.5e-4)
     '1.500000e-04'
@@ -248,5 +240,5 @@ def format_float(value: float) -> str:
 
 
 def join_lines(lines: Iterable[str]) -> str:
-    """Return the lines as the text of a file."""
+    """Join lines with newlines, and end the text with a newline."""
     return "\n".join(lines) + "\n"

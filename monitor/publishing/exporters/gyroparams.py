@@ -1,13 +1,12 @@
-"""Export as a MATLAB script with ``gyroparams`` and ``accelparams`` for ``imuSensor``, one value per axis.
+"""Export of noise coefficients as a MATLAB script for the MathWorks model ``imuSensor``.
 
-Properties and units follow the reference pages of MathWorks. ``single-sided`` is the MathWorks term for white noise
-with σ = NoiseDensity·√rate per sample, where the density is N of IEEE Std 952. The default of MathWorks would be
-smaller by √2. ``BiasInstability`` is the σ of the white noise that drives a filter. With the filter ``fractalcoef``
-(Kasdin, Proc. IEEE 83(5), 1995), the bias has the spectrum B²/(2πf), where B is the bias instability of IEEE Std 952.
-The default filter has one pole at 0.5, and its output is not flicker noise.
+``NoiseDensity`` is N of IEEE Std 952 with the noise type ``single-sided``, for which σ = NoiseDensity·√rate per sample.
+The default noise type of MathWorks would give noise that is smaller by √2. ``BiasInstability`` is the σ of the white
+noise at the input of a filter. With the filter ``fractalcoef`` (Kasdin, Proc. IEEE 83(5), 1995), the bias has the
+spectrum B²/(2πf) of IEEE Std 952. The default filter of MathWorks has one pole at 0.5 and does not generate flicker
+noise.
 
-The script is meant for simulation. A coefficient with only an upper bound is therefore set to 0, and a comment states
-the bound.
+A coefficient with only an upper bound is set to 0, because the script is meant for simulation.
 """
 
 from typing import Final
@@ -27,7 +26,7 @@ N_POLES: Final = 500
 
 
 def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
-    """Return the text of the MATLAB script.
+    """Export noise coefficients as a MATLAB script.
 
     Parameters
     ----------
@@ -67,7 +66,7 @@ def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
 
 
 def _property(noise: NoiseCoefficients, kind: Kind, letter: str, name: str, unit: str, inflation: float) -> str:
-    """Return one property of three axes. An unknown value is 0, and a comment names the axis."""
+    """Write 0 for an unknown coefficient, and name the axis in a comment."""
     known, values, said = noise.coefficient_by_axis(kind, letter), [], ""
     for axis in axes_of(kind):
         term = known.get(axis)

@@ -1,10 +1,9 @@
-"""Export as ``imu.yaml`` of Kalibr, with continuous-time noise densities.
+"""Export of noise coefficients as ``imu.yaml`` of Kalibr, with continuous-time noise densities.
 
-The file has one value for each kind of sensor: the largest of the three axes. Keys and units follow the pages "YAML
-formats" and "IMU Noise Model" in the wiki of Kalibr. Kalibr multiplies the white-noise density by 1/√Δt to get the σ of
-a sample. The random-walk density is multiplied by √Δt to get a step of the bias. The densities are therefore N and K of
-IEEE Std 952. Kalibr rejects zero, so a term that no axis has is an error. If the axes have only upper bounds, the
-largest bound is used, and a comment in the file says that the value is a bound.
+The file contains one value for each kind of sensor, which is the largest of the three axes. Keys and units follow the
+pages "YAML formats" and "IMU Noise Model" in the Kalibr wiki. Kalibr multiplies the white-noise density by 1/√Δt and
+the random-walk density by √Δt, so the densities are N and K of IEEE Std 952. Kalibr rejects zero, so a missing
+coefficient is an error. If all axes have only upper bounds, the largest bound is exported with a comment.
 """
 
 from typing import Final
@@ -30,7 +29,7 @@ INFLATION_COMMENT: Final = (
 
 
 def export_kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
-    """Return the text of the file.
+    """Export noise coefficients as the text of ``imu.yaml``.
 
     Parameters
     ----------
@@ -67,7 +66,7 @@ def export_kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: st
 
 
 def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[ExportedCoefficient, str]:
-    """Return the largest estimate, or the largest bound if there is no estimate, and a comment on the choice."""
+    """Return the largest estimate of three axes, or the largest upper bound if there is no estimate."""
     known = noise.coefficient_by_axis(kind, letter)
     if not known:
         raise missing_coefficient_error(

@@ -1,4 +1,4 @@
-"""Export of the process noise of a Kalman filter as TOML: densities, and discrete F and Q of each axis.
+"""Export of the process noise of a Kalman filter as TOML, with the discrete matrices F and Q of each axis.
 
 The error model of one gyroscope has three states. For an accelerometer, velocity replaces the angle.
 
@@ -6,15 +6,14 @@ The error model of one gyroscope has three states. For an accelerometer, velocit
     walk' = white noise of density K²
     markov' = -markov/T + white noise of density 2σ²/T
 
-The white noise of the rate has the density N². Flicker noise has no finite-dimensional state model, so a first-order
-Gauss-Markov process approximates it. The Allan deviation of this process peaks at 0.618 σ and τ = 1.89 T (IEEE Std
-952). σ is chosen so that the peak equals the Allan deviation of flicker noise, 0.664 B. The correlation time T is
-chosen so that the peak lies in the middle (of log τ) of the range in which flicker noise dominates. This range extends
-from τ = N²/(0.664 B)² to 3 (0.664 B)²/K², so its middle is √3 N/K. Without N or K, the range is not bounded. The user
-must then give T. Otherwise the flicker noise B is omitted, and a comment in the file states the omission.
+The white noise of the rate has the density N². A first-order Gauss-Markov process approximates flicker noise, because
+flicker noise has no finite-dimensional state model. The Allan deviation of the Gauss-Markov process peaks at 0.618 σ
+and τ = 1.89 T (IEEE Std 952). σ is chosen so that the peak equals the Allan deviation of flicker noise, 0.664 B.
 
-An upper bound is used as if it were the value, because a larger process noise is the safer choice. A comment in the
-file names the coefficient.
+Flicker noise dominates from τ = N²/(0.664 B)² to τ = 3 (0.664 B)²/K². The correlation time T places the peak at the
+geometric mean of these limits, τ = √3 N/K. If N or K is unknown, the user must specify T. Without T, the file omits
+flicker noise and states the omission in a comment. An upper bound is used as the value, because a larger process noise
+is the safer choice.
 """
 
 import math
@@ -58,7 +57,7 @@ HEADER_COMMENT: Final = (
 def export_kalman(
     noise: NoiseCoefficients, inflation: float = 1.0, dt_s: float | None = None, correlation_time_s: float | None = None
 ) -> str:
-    """Return the text of the file.
+    """Export the process noise of a Kalman filter as TOML.
 
     Parameters
     ----------
@@ -99,7 +98,7 @@ def export_kalman(
 
 
 def _markov_sigma(B: float) -> float:
-    """Return σ of the Gauss-Markov process whose peak Allan deviation equals the Allan deviation of flicker noise.
+    """Return σ of the Gauss-Markov process with the peak Allan deviation 0.664 B.
 
     >>> round(_markov_sigma(1.0), 3)
     1.075
@@ -108,7 +107,7 @@ def _markov_sigma(B: float) -> float:
 
 
 def _markov_time_s(N: float, K: float) -> float:
-    """Return the correlation time [s] of the process that peaks at τ = √3 N/K, the middle of the flicker range.
+    """Return the correlation time [s] of the Gauss-Markov process that peaks at τ = √3 N/K.
 
     >>> round(_markov_time_s(N=1.5e-4, K=1.5e-6), 1)
     91.6
@@ -117,7 +116,7 @@ def _markov_time_s(N: float, K: float) -> float:
 
 
 def state_transition_matrix(dt_s: float, correlation_time_s: float) -> Floats:
-    """Return the transition matrix F [3, 3] of angle, random-walk bias and Gauss-Markov bias.
+    """Return the transition matrix F, shape [3, 3], of angle, random-walk bias and Gauss-Markov bias.
 
     Parameters
     ----------
@@ -131,7 +130,7 @@ def state_transition_matrix(dt_s: float, correlation_time_s: float) -> Floats:
 
 
 def process_noise_matrix(dt_s: float, N: float, K: float, markov_sigma: float, correlation_time_s: float) -> Floats:
-    """Return the covariance Q [3, 3] of the process noise of angle, random-walk bias and Gauss-Markov bias.
+    """Return the process noise covariance Q, shape [3, 3], of angle, random-walk bias and Gauss-Markov bias.
 
     Q is the integral of F(s) G F(s)ᵀ over 0 ≤ s ≤ dt, where F is the transition matrix and G = diag(N², K², 2σ²/T).
 
@@ -158,7 +157,7 @@ def process_noise_matrix(dt_s: float, N: float, K: float, markov_sigma: float, c
 
 
 def _integrated_markov_variance(x: float) -> float:
-    """Return x - 2(1 - e^-x) + (1 - e^-2x)/2. For small x, the power series from x³/3 on avoids cancellation."""
+    """Return x - 2(1 - e^-x) + (1 - e^-2x)/2, with a power series for small x to avoid cancellation."""
     if x > SERIES_BELOW:
         return x + 2.0 * math.expm1(-x) - 0.5 * math.expm1(-2.0 * x)
     return math.fsum((-x) ** k * (2.0 - 2.0 ** (k - 1)) / math.factorial(k) for k in range(3, 14))
@@ -167,7 +166,6 @@ def _integrated_markov_variance(x: float) -> float:
 def _axis(
     axis: str, terms: Mapping[str, ExportedCoefficient], inflation: float, dt_s: float, correlation_time_s: float | None
 ) -> list[str]:
-    """Return the TOML table of one axis: comments, densities, F and Q."""
     kind = sensor_kind(axis)
     rate, drift = ascii_unit("B", kind), ascii_unit("R", kind)
     N, B, K = (terms[letter].value * inflation if letter in terms else 0.0 for letter in "NBK")
@@ -201,7 +199,6 @@ def _axis(
 
 
 def _remarks(terms: Mapping[str, ExportedCoefficient]) -> list[str]:
-    """Return comments on the unknown coefficients and upper bounds of one axis."""
     unknown = [letter for letter in "NBK" if letter not in terms]
     bounds = [letter for letter in "NBK" if letter in terms and terms[letter].bound]
     lines = [f"# unknown, set to 0: {', '.join(unknown)}"] if unknown else []
@@ -209,5 +206,4 @@ def _remarks(terms: Mapping[str, ExportedCoefficient]) -> list[str]:
 
 
 def _matrix(rows: Floats) -> str:
-    """Format a matrix as a TOML array."""
     return "[" + ", ".join("[" + ", ".join(f"{x:.9e}" for x in row) + "]" for row in rows.tolist()) + "]"

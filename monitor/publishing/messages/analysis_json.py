@@ -1,4 +1,4 @@
-"""Output of ``analyze --json``: coefficients and deviations of a recording."""
+"""Output of ``analyze --json`` with the noise coefficients and Allan deviations of a recording."""
 
 from typing import Final, Self
 
@@ -28,7 +28,7 @@ SCHEMA: Final = "imu-monitor/analyze/1"
 
 
 class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
-    """Deviations of one axis with their averaging times and the ends of their 95 % intervals."""
+    """Deviations of one axis with averaging times and 95 % intervals."""
 
     tau: Floats
     deviation: Floats
@@ -37,12 +37,12 @@ class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
 
     @classmethod
     def from_curve(cls, curve: AllanCurve | TotalCurve | HadamardCurve, axis: int) -> Self:
-        """Return the deviations of column ``axis`` of a curve."""
+        """Build the deviations of one axis from a curve."""
         return cls(curve.tau_s, *deviations_with_interval_ends(curve, axis))
 
 
 class TemperatureDependenceValues(msgspec.Struct, frozen=True, rename={"interval_s": "interval"}):
-    """Measures of the dependence of the bias of an axis on temperature."""
+    """Statistics of the dependence of the bias of one axis on temperature."""
 
     share: float
     p_value: float
@@ -52,7 +52,7 @@ class TemperatureDependenceValues(msgspec.Struct, frozen=True, rename={"interval
 
 
 class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
-    """K and R of an axis after its temperature-correlated bias has been removed."""
+    """Coefficients K and R of one axis after removal of the temperature-correlated bias."""
 
     model: str
     coefficients: dict[str, CoefficientValue]
@@ -60,7 +60,7 @@ class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
 
     @classmethod
     def from_temperature_removal(cls, removal: TemperatureRemoval, axis: str) -> Self:
-        """Return the values of one axis."""
+        """Build the coefficients of one axis."""
         i = AXES.index(axis)
         values = coefficient_values(removal.coefficients, i, removal.k_or_r[i])
         return cls(
@@ -71,7 +71,7 @@ class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
 
 
 class AxisAnalysis(msgspec.Struct, frozen=True, kw_only=True):
-    """Results of one axis. Deviations that were not computed are absent."""
+    """Analysis results of one axis. Deviations that were not computed are absent."""
 
     allan: AxisDeviations
     total: AxisDeviations | UnsetType = UNSET
@@ -105,13 +105,13 @@ class ChangeValues(msgspec.Struct, frozen=True):
 
     @classmethod
     def from_change(cls, change: Change, rate_hz: float) -> Self:
-        """Return the values of a change."""
+        """Build the JSON values of a detected change."""
         t = change.since / rate_hz
         return cls(change.kind, AXES[change.axis], t, change.sigma, change.sides(), change.text)
 
 
 class CoefficientSeries(msgspec.Struct, frozen=True, eq=False):
-    """Coefficient of one axis at each time step."""
+    """Time series of one noise coefficient of one axis."""
 
     value: Floats
     lo: Floats
@@ -120,7 +120,7 @@ class CoefficientSeries(msgspec.Struct, frozen=True, eq=False):
 
 
 class DynamicAllanAxis(msgspec.Struct, frozen=True, eq=False):
-    """Dynamic Allan deviations of one axis, shape [time steps, τ], and its coefficients over time."""
+    """Dynamic Allan deviations of one axis, shape [time steps, τ], and coefficients over time."""
 
     deviation: NDArray[np.float64]
     lo: NDArray[np.float64]
@@ -129,7 +129,7 @@ class DynamicAllanAxis(msgspec.Struct, frozen=True, eq=False):
 
     @classmethod
     def from_dynamic_allan(cls, dynamic: DynamicAllan, axis: int) -> Self:
-        """Return the values of column ``axis``."""
+        """Build the dynamic Allan deviations of one axis."""
         coefficients = {
             symbol: CoefficientSeries(
                 dynamic.value[:, row, axis],
@@ -172,7 +172,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
         dynamic: DynamicAllan | None = None,
         temperature: TemperatureRemoval | None = None,
     ) -> Self:
-        """Build the output of an analysis.
+        """Build the JSON output of an analysis.
 
         Parameters
         ----------
@@ -244,7 +244,6 @@ class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag
 def _temperature_values(
     result: Analysis, temperature: TemperatureRemoval | None, axis: str
 ) -> TemperatureDependenceValues | UnsetType:
-    """Return the measures of an axis if temperature explains most of its slow variance."""
     if temperature is None or axis not in result.axes_of_temperature:
         return UNSET
     return TemperatureDependenceValues(

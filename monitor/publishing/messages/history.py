@@ -1,9 +1,8 @@
-"""Past results: the reply to ``imu/<device>/history`` and the output of ``history --json``.
+"""Stored results as JSON, for the zenoh reply ``imu/<device>/history`` and for ``history --json``.
 
-All lists are indexed by bucket. For each number, ``value`` is the last value of its bucket, and ``low`` and ``high``
-are the extremes. A coefficient also has a status and the interval of its last value. The status is ``upper_bound`` if
-the coefficient was bounded but never estimated within the bucket. Numbers are written with nine digits, so that the
-decoded float32 values equal the stored values exactly.
+All lists are indexed by time bucket. For each quantity, ``value`` is the last value in the bucket, and ``low`` and
+``high`` are the extremes. The status of a coefficient is ``upper_bound`` if the bucket contains upper bounds but no
+estimates. Numbers are written with nine digits, which preserve every float32 value exactly.
 """
 
 from typing import Any, Final, Literal, Self
@@ -37,7 +36,7 @@ _STATUS_NAMES: Final = {status.value: status.name.lower() for status in Status}
 
 
 class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Last value, minimum and maximum of a number in each bucket."""
+    """Last value, minimum and maximum of a quantity in each time bucket."""
 
     value: Floats
     low: Floats
@@ -45,17 +44,17 @@ class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @classmethod
     def from_column(cls, column: ColumnStatistics) -> Self:
-        """Return the history of a stored column."""
+        """Build the history of a quantity from a stored column."""
         return cls(value=_nine_digits(column.last), low=_nine_digits(column.low), high=_nine_digits(column.high))
 
     def to_column(self, *shape: int) -> ColumnStatistics:
-        """Return the stored column, or several columns for an array of shape [buckets, columns]."""
+        """Return the stored column. A shape [buckets, columns] gives several columns."""
         low, high, last = (_checked(one, shape) for one in (self.low, self.high, self.value))
         return ColumnStatistics((~np.isnan(last)).astype(np.int64), low, high, last)
 
 
 class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
-    """Coefficient of one axis over time, with intervals, numbers of estimates and statuses."""
+    """History of one noise coefficient with intervals, numbers of estimates and statuses."""
 
     lo: Floats
     hi: Floats
@@ -64,7 +63,7 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
 
     @classmethod
     def coefficient_from_history(cls, past: HistoryTable, value_column: str) -> Self:
-        """Return the history of a coefficient, given the column of its value, such as gz.N."""
+        """Build the history of a coefficient from the column of its values, such as gz.N."""
         value, bound = past.column(value_column), past.column(f"{value_column}.bound")
         lo, hi = (past.column(f"{value_column}.{end}") for end in ("lo", "hi"))
         estimated, bounded = value.n > 0, bound.n > 0
@@ -81,7 +80,7 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
         )
 
     def coefficient_columns(self, value_column: str, bucket_count: int) -> dict[str, ColumnStatistics]:
-        """Return the stored columns of the coefficient.
+        """Return the stored columns of the coefficient by name.
 
         Parameters
         ----------
@@ -104,14 +103,14 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
 
 
 class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Deviations of all axes over time. The arrays of each axis have the shape [buckets, τ]."""
+    """History of Allan deviations, with arrays of shape [buckets, τ] for each axis."""
 
     tau: list[float]
     axes: dict[str, NumberHistory]
 
     @classmethod
     def deviations_from_history(cls, past: HistoryTable, axes: tuple[str, ...]) -> Self:
-        """Return the stored deviations of the given axes."""
+        """Build the history of the Allan deviations of the given axes."""
         taus, found = past.taus(), {}
         for axis in axes:
             columns = [past.column(f"{axis}.sigma.{tau}") for tau in taus]
@@ -123,7 +122,7 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return cls(tau=[float(tau) for tau in taus], axes=found)
 
     def deviation_columns(self, bucket_count: int) -> dict[str, ColumnStatistics]:
-        """Return the stored columns of all axes."""
+        """Return the stored columns of the Allan deviations by name."""
         columns = {}
         for axis in (axis for axis in self.axes if axis in AXES):
             one = self.axes[axis].to_column(bucket_count, len(self.tau))
@@ -135,7 +134,7 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """State and sample counters of the device over time."""
+    """History of the state and the sample counters of a device."""
 
     state: list[Literal["ended", "running", "waiting", "lost"]]
     received: Ints
@@ -149,7 +148,7 @@ class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @classmethod
     def status_from_history(cls, past: HistoryTable) -> Self:
-        """Return the stored states, counters and numbers."""
+        """Build the history of states, sample counters and temperature."""
         counts: dict[str, Any] = {name: past.counts[:, i] for i, name in enumerate(COUNTS)}
         numbers: dict[str, Any] = {
             name: NumberHistory.from_column(past.column(name)) for name in STATUS_COLUMNS if name in past.names
@@ -157,7 +156,7 @@ class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         return cls(state=[STATES[one] for one in past.state.tolist()], **counts, **numbers)
 
     def status_columns(self, bucket_count: int) -> dict[str, ColumnStatistics]:
-        """Return the stored columns of the numbers."""
+        """Return the stored columns of rate, latency, memory and temperature by name."""
         numbers = {name: getattr(self, name) for name in STATUS_COLUMNS}
         return {name: one.to_column(bucket_count) for name, one in numbers.items() if isinstance(one, NumberHistory)}
 
@@ -168,10 +167,7 @@ class PastEvent(
     kw_only=True,
     rename={"t_s": "t", "since_s": "since", "represented_events": "stands_for"},
 ):
-    """Stored event of the device.
-
-    ``stands_for`` is the number of events that the entry represents, because older events of the same kind are deleted.
-    """
+    """Stored event of a device. ``stands_for`` is the number of events that the entry represents."""
 
     t_s: float
     kind: str
@@ -184,14 +180,14 @@ class PastEvent(
 
     @classmethod
     def from_stored_event(cls, event: StoredEvent) -> Self:
-        """Return a stored event."""
+        """Build the message entry from a stored event."""
         return cls(
             **attributes_with_field_names(cls, event)
             | {"what": {name: dict(sides) for name, sides in event.what.items()}}
         )
 
     def to_event(self) -> StoredEvent:
-        """Return the stored event, without control characters in its texts."""
+        """Return the stored event with control characters removed from all texts."""
         what = {
             name: {side: np.nan if one is None else one for side, one in sides.items()}
             for name, sides in self.what.items()
@@ -206,7 +202,7 @@ class PastEvent(
 
 
 class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.schema()):
-    """Message ``imu/<device>/history``. Parts that were not requested are absent."""
+    """Message ``imu/<device>/history`` with stored results. Parts that were not requested are absent."""
 
     topic = topics.HISTORY
     from_: float = msgspec.field(name="from")
@@ -222,7 +218,7 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
 
     @classmethod
     def build_reply(cls, past: HistoryTable, query: HistoryQuery, t: float, samples: int) -> Self:
-        """Build the reply to a query.
+        """Build the reply to a history query.
 
         Parameters
         ----------
@@ -262,7 +258,7 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
         )
 
     def to_table(self) -> HistoryTable:
-        """Return the history as a table.
+        """Convert the message to a history table.
 
         Raises
         ------
@@ -319,17 +315,16 @@ def decode_history(payload: bytes) -> HistoryTable:
 
 
 def _column_without_extremes(last: Floats) -> ColumnStatistics:
-    """Return a column for which only last values are stored; they also serve as extremes."""
     return ColumnStatistics((~np.isnan(last)).astype(np.int64), last, last, last)
 
 
 def _nine_digits(column: Floats) -> Floats:
-    """Return values rounded to nine digits, which identify every float32."""
+    """Round values to nine digits, which identify every float32."""
     return np.array([float(f"{one:.9g}") for one in column.ravel().tolist()]).reshape(column.shape)
 
 
 def _checked(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return the array in the expected shape. An empty array is accepted if there are no buckets."""
+    """Return an array of the expected shape. Accept an empty array if there are no buckets."""
     if array.shape != shape and (array.size or 0 not in shape):
         raise ValueError("lists of different lengths")
     return array.reshape(shape)

@@ -38,14 +38,14 @@ STATUSES: Final = {status.name.lower(): status for status in Status}
 
 
 class TotalAndHadamardCurves(NamedTuple):
-    """Total and Hadamard deviations of the window, which are computed in small steps."""
+    """Total and Hadamard deviations of the samples in the window."""
 
     total: TotalCurve
     hadamard: HadamardCurve
 
 
 class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
-    """Deviations of one axis and the ends of their 95 % intervals."""
+    """Deviations of one axis with 95 % intervals."""
 
     deviation: Floats
     lo: Floats
@@ -53,13 +53,13 @@ class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
 
 
 class AllanAxis(DeviationCurve, frozen=True):
-    """Allan deviations of one axis. ``recent`` uses only the last max(10 s, 16 τ) at each averaging time τ."""
+    """Allan deviations of one axis. ``recent`` uses only the last max(10 s, 16 τ) of samples."""
 
     recent: DeviationCurve | UnsetType = UNSET
 
 
 class CoefficientValue(msgspec.Struct, frozen=True):
-    """Coefficient of one axis with its 95 % interval and status."""
+    """Noise coefficient of one axis with 95 % interval and status."""
 
     value: float | None = None
     lo: float | None = None
@@ -75,7 +75,7 @@ class WindowResultMessage(
     kw_only=True,
     rename={"rate_hz": "rate", "window_s": "window", "filled_s": "filled", "tau_s": "tau"},
 ):
-    """Base class of messages with results of the window."""
+    """Base class of messages with results of the sample window."""
 
     rate_hz: float | None = None
     window_s: float | None = None
@@ -85,7 +85,7 @@ class WindowResultMessage(
 
 
 class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema()):
-    """Message ``imu/<device>/allan``: Allan deviations of each measured axis."""
+    """Message ``imu/<device>/allan`` with the Allan deviations of each measured axis."""
 
     topic = topics.ALLAN
     tau_s: Floats
@@ -104,7 +104,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
         return {"filled_s": result.curve.n / result.rate_hz, "tau_s": result.curve.tau_s, "axes": axes}
 
     def to_estimate(self, coefficients: Coefficients, k_or_r: frozenset[str]) -> Estimate:
-        """Build an estimate. Its degrees of freedom and numbers of terms are unknown, because the message lacks them.
+        """Convert the message to an estimate with unknown degrees of freedom.
 
         Parameters
         ----------
@@ -144,7 +144,7 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
 
 
 class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema()):
-    """Message ``imu/<device>/coefficients``: Q, N, B, K and R of each measured axis."""
+    """Message ``imu/<device>/coefficients`` with Q, N, B, K and R of each measured axis."""
 
     topic = topics.COEFFICIENTS
     axes: dict[str, dict[str, CoefficientValue]]
@@ -158,7 +158,7 @@ class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=to
         return {"filled_s": result.curve.n / result.rate_hz, "axes": axes}
 
     def to_coefficients(self) -> Coefficients:
-        """Return the coefficients of all axes.
+        """Convert the message to the coefficients of all axes.
 
         Raises
         ------
@@ -185,7 +185,7 @@ class TauRange(msgspec.Struct, frozen=True):
 
 
 class AxisModelGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """Comparison of one axis with its model."""
+    """Comparison of the measured Allan deviation of one axis with the noise model."""
 
     agrees: bool | None = None
     """Decision with hysteresis. It changes later than ``gap`` crosses ``threshold``. None before the first decision."""
@@ -200,7 +200,7 @@ class AxisModelGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
 
 
 class ModelGapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
-    """Message ``imu/<device>/gap``: comparison of the measured Allan deviations with the noise model of the device."""
+    """Message ``imu/<device>/gap`` with the comparison of measured Allan deviations and noise model."""
 
     topic = topics.GAP
     tau_s: Floats | None = None
@@ -220,7 +220,7 @@ class ModelGapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics
 
 
 class AxisThermalValues(msgspec.Struct, frozen=True):
-    """Mean bias of one axis in an interval, and its predictions. ``text`` states why a prediction is missing."""
+    """Mean bias of one axis in an interval, with predictions. ``text`` states why a prediction is missing."""
 
     bias: float | None
     error: float | None
@@ -240,7 +240,7 @@ class ThermalMessage(
     tag=topics.THERMAL.schema(),
     rename={"interval_s": "interval", "temperature_c": "temperature"},
 ):
-    """Message ``imu/<device>/thermal``: mean biases of the interval that ends at ``t``, and their predictions."""
+    """Message ``imu/<device>/thermal`` with measured and predicted mean biases of the interval that ends at ``t``."""
 
     topic = topics.THERMAL
     interval_s: float
@@ -259,20 +259,20 @@ class ThermalMessage(
 
 
 class DeviationTable(msgspec.Struct, frozen=True, eq=False):
-    """Deviations of all measured axes at the same averaging times."""
+    """Deviations of all measured axes at common averaging times."""
 
     tau: Floats
     axes: dict[str, DeviationCurve]
 
     @classmethod
     def from_curve(cls, curve: TotalCurve | HadamardCurve) -> Self:
-        """Return the deviations of all axes that have at least one deviation."""
+        """Build the table of deviations, without the axes that have no deviation."""
         curves = {axis: DeviationCurve(*deviations_with_interval_ends(curve, i)) for i, axis in enumerate(AXES)}
         return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
 
 
 class TotalAndHadamardMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()):
-    """Message ``imu/<device>/total``: total and Hadamard deviations, each with its own averaging times."""
+    """Message ``imu/<device>/total`` with total and Hadamard deviations."""
 
     topic = topics.TOTAL
     total: DeviationTable
@@ -287,7 +287,7 @@ class TotalAndHadamardMessage(Message, frozen=True, kw_only=True, tag=topics.TOT
 
 
 class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()):
-    """Message ``imu/<device>/event``."""
+    """Message ``imu/<device>/event`` with a detected event."""
 
     topic = topics.EVENT
     kind: str
@@ -309,7 +309,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode a message of another process. Control characters are removed from all texts.
+        """Decode an event of another process, and remove control characters from all texts.
 
         Raises
         ------
@@ -322,7 +322,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
         return msgspec.structs.replace(found, kind=_clean(found.kind), text=_clean(found.text))
 
     def to_event(self) -> Event:
-        """Build an event with the changed coefficients."""
+        """Convert the message to an event with the changed coefficients."""
         values: dict[str, dict[str, float]] = {
             symbol: {side: value for side, value in self.what[symbol].items() if isinstance(value, float | int)}
             for symbol in SYMBOLS
@@ -346,7 +346,7 @@ class StatusMessage(
     tag=topics.STATUS.schema(),
     rename={"rate_hz": "rate", "memory_bytes": "memory", "uptime_s": "uptime"},
 ):
-    """Message ``imu/<device>/status``. The fields have the meaning of the fields of ``Health``."""
+    """Message ``imu/<device>/status`` with the fields of ``Health``."""
 
     topic = topics.STATUS
     state: str
@@ -377,7 +377,7 @@ class StatusMessage(
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode a message of another process. Control characters are removed from all texts.
+        """Decode a status of another process, and remove control characters from all texts.
 
         Raises
         ------
@@ -392,7 +392,7 @@ class StatusMessage(
         )
 
     def to_health(self) -> Health:
-        """Build the health of the device."""
+        """Convert the message to a ``Health`` object."""
         known = {field.name: getattr(self, field.name) for field in fields(Health) if hasattr(self, field.name)}
         return Health(**known, latency_p50_s=self.latency.p50, latency_p99_s=self.latency.p99)
 
@@ -409,12 +409,12 @@ class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
 
 
 class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
-    """First keys of the reply to ``imu/<device>/command/reconcile``. The keys of the report follow."""
+    """First keys of the reply to ``imu/<device>/command/reconcile``, which precede the keys of the report."""
 
     topic = topics.RECONCILE
 
     def encode_report(self, report: Mapping[str, Any], exit_status: int, folder: str | None) -> bytes:
-        """Encode the reply.
+        """Encode the reply with the report as JSON.
 
         Parameters
         ----------
@@ -433,7 +433,7 @@ class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.sc
 def coefficient_values(
     coefficients: Coefficients, axis: int, k_r_ambiguous: bool = False
 ) -> dict[str, CoefficientValue]:
-    """Return the coefficients of one axis by symbol, as in messages and in ``analyze --json``.
+    """Return the noise coefficients of one axis by symbol.
 
     Parameters
     ----------
@@ -458,7 +458,7 @@ def coefficient_values(
 
 
 def event_start_s(unix_s: float, event: Event) -> float | None:
-    """Return the Unix time [s] at which the condition reported by an event began; None if unknown.
+    """Return the Unix time [s] at which the condition of an event began, or None if unknown.
 
     Parameters
     ----------
@@ -471,7 +471,7 @@ def event_start_s(unix_s: float, event: Event) -> float | None:
 
 
 def fitted_allan_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -> Floats:
-    """Return the Allan variance of the estimated terms, shape [m, 6]. It is NaN on axes without estimated terms.
+    """Return the Allan variance of the estimated noise terms, shape [m, 6]. Axes without estimates are NaN.
 
     Parameters
     ----------
@@ -490,7 +490,7 @@ def fitted_allan_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficie
 def deviations_with_interval_ends(
     curve: AllanCurve | TotalCurve | HadamardCurve, axis: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the deviations of one axis and the ends of their intervals, each of shape [m].
+    """Return the deviations of one axis and the ends of the 95 % intervals, each of shape [m].
 
     Parameters
     ----------
@@ -510,10 +510,9 @@ def deviations_with_interval_ends(
 
 
 def measured_axes(curve: AllanCurve) -> list[tuple[int, str]]:
-    """Return the column and name of each axis with Allan variances."""
+    """Return the column index and the name of each axis with Allan variances."""
     return [(i, axis) for i, axis in enumerate(AXES) if not np.isnan(curve.avar[:, i]).all()]
 
 
 def _clean(text: str) -> str:
-    """Return a received text without control characters, cut to MAX_TEXT_LENGTH."""
     return remove_control_characters(text[:MAX_TEXT_LENGTH])

@@ -1,9 +1,8 @@
 """Allan plot of one kind of sensor, for the image of ``analyze --plot`` and for the HTML report.
 
-The plot shows the measured Allan deviation of three axes with 95 % bands, and the fitted deviation as a dashed line.
-Each estimated noise term has a thin line. A ring on this line marks the averaging time at which the coefficient is read
-(IEEE Std 952). Rings that would overlap share one label. Markers, rings and dashes differ between the axes, so that
-identical deviations of two axes do not hide each other.
+The plot shows the measured Allan deviations with 95 % bands, and the fitted deviations as dashed lines. Each estimated
+noise term has a thin line with a ring at the averaging time at which the coefficient is read (IEEE Std 952). Markers,
+rings and dashes differ between axes, so that equal deviations of two axes remain visible.
 """
 
 from collections.abc import Collection, Sequence
@@ -50,7 +49,7 @@ MIN_LETTER_DISTANCE: Final = 0.045  # rings closer than this share of the height
 
 @dataclass(frozen=True, slots=True)
 class AdditionalDeviation:
-    """Total or Hadamard deviation that is drawn in addition to the Allan deviation."""
+    """Total or Hadamard deviation to draw in addition to the Allan deviation."""
 
     name: str  # "total" or "Hadamard"
     tau_s: Floats  # [k]
@@ -60,7 +59,7 @@ class AdditionalDeviation:
     only_beyond: bool = False  # True to draw only τ longer than the longest τ of the Allan deviation
 
     def drawn_points_mask(self, axis: int, longest_allan_tau_s: float) -> NDArray[np.bool_]:
-        """Return a mask of the points of an axis that are drawn, shape [k].
+        """Return a mask of the points of one axis that the plot shows, shape [k].
 
         Parameters
         ----------
@@ -76,7 +75,9 @@ class AdditionalDeviation:
 def additional_deviations(
     total: TotalCurve | None = None, hadamard: HadamardCurve | None = None
 ) -> list[AdditionalDeviation]:
-    """Return the total deviation, to be drawn beyond the longest τ of the Allan deviation, and the Hadamard deviation.
+    """Return the total and Hadamard deviations to draw.
+
+    The total deviation is drawn only beyond the longest averaging time of the Allan deviation.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ def additional_deviations(
 
 @dataclass(frozen=True, slots=True)
 class _Ring:
-    """Ring that marks where one coefficient of one axis is read from the plot."""
+    """Ring at the averaging time at which a coefficient is read from the Allan plot."""
 
     letter: str
     tau_s: float
@@ -155,7 +156,7 @@ def _draw_other(
     panel: "Axes", other: AdditionalDeviation, points: NDArray[np.bool_], number: int, i: int, factor: float,
     longest_allan_tau_s: float, line_style: str,
 ) -> Floats:  # fmt: skip
-    """Draw another deviation of one axis as a thin line; return the values that the plot must contain."""
+    """Draw an additional deviation of one axis, and return the drawn values."""
     # The line begins at the last point of the Allan deviation, so that its origin is visible.
     line = points | (other.tau_s == longest_allan_tau_s) if other.only_beyond else points
     y, colour = other.deviation[:, i] * factor, COLOURS[number]
@@ -168,7 +169,7 @@ def _draw_other(
 
 
 def _tau_of_minimum_s(estimate: Estimate, kind: Kind) -> float:
-    """Return the averaging time [s] at which the mean deviation of all axes has its minimum; B is read there."""
+    """Return the averaging time [s] with the lowest mean deviation, at which B is read."""
     avar = estimate.curve.avar[:, [AXES.index(axis) for axis in axes_of(kind)]]
     good = np.isfinite(avar) & (avar > 0)
     common = (good | ~good.any(axis=0)).all(axis=1) & good.any(axis=1)
@@ -179,7 +180,6 @@ def _tau_of_minimum_s(estimate: Estimate, kind: Kind) -> float:
 
 
 def _rings(estimate: Estimate, i: int, factor: float, minimum_tau_s: float, lowest: float) -> list[_Ring]:
-    """Return the rings of the estimated coefficients of one axis."""
     known, rings = estimate.coefficients, []
     for row, (letter, source) in enumerate(zip(SYMBOLS, UNIT_SOURCES, strict=True)):
         if known.status[row, i] != Status.ESTIMATED:
@@ -192,7 +192,6 @@ def _rings(estimate: Estimate, i: int, factor: float, minimum_tau_s: float, lowe
 
 
 def _set_limits(panel: "Axes", shown: Sequence[Floats], rings: Sequence[_Ring]) -> None:
-    """Set limits that contain all data, rings and labels."""
     panel.set(xscale="log", yscale="log")
     values = np.concatenate([*shown, [ring.sigma for ring in rings]]) if shown else np.array([1.0])
     values = values[np.isfinite(values) & (values > 0)]
@@ -203,7 +202,6 @@ def _set_limits(panel: "Axes", shown: Sequence[Floats], rings: Sequence[_Ring]) 
 
 
 def _draw_terms(panel: "Axes", rings: Sequence[_Ring]) -> None:
-    """Draw a line and a ring for each noise term, and a label for each group of rings."""
     for ring in rings:
         colour, size = COLOURS[ring.number], RING_SIZES[ring.number]
         panel.plot(LINE_TAU_S, ring.line, color=colour, linewidth=0.7, alpha=TERM_LINE_ALPHA, zorder=1, scalex=False)
@@ -225,7 +223,7 @@ def _draw_terms(panel: "Axes", rings: Sequence[_Ring]) -> None:
 
 
 def _group_rings(panel: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
-    """Group the rings of one coefficient whose labels would overlap; the lowest ring is first."""
+    """Group rings of one coefficient whose labels would overlap."""
     bottom, top = np.log(panel.get_ylim())
     groups: list[list[_Ring]] = []
     for ring in sorted(rings, key=lambda one: (one.letter, one.sigma)):
@@ -239,7 +237,6 @@ def _group_rings(panel: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
 
 
 def _draw_labels(panel: "Axes", kind: Kind, others: Sequence[AdditionalDeviation], drawn: Collection[str]) -> None:
-    """Draw axis labels, grid and legend."""
     panel.plot([], [], "--", color=GREY, label="fit")
     panel.fill_between([], [], [], color=GREY, alpha=0.25, label="95 %")
     for line_style, other in zip(OTHER_LINE_STYLES, others, strict=False):

@@ -1,7 +1,7 @@
 """Plot of one analysis, for ``imu-monitor analyze --plot FILE.png``.
 
-Gyroscopes and accelerometers are shown side by side: the Allan plot, a table of the coefficients, and the dynamic
-Allan deviation if it was computed.
+The figure shows Allan plots, tables of coefficients and dynamic Allan deviations, with one column for each kind of
+sensor.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ TABLE_LEGEND: Final = (
 
 @dataclass(frozen=True, slots=True)
 class AnalysisPlotData:
-    """Content of the plot and of the HTML report of one recording."""
+    """Content of the analysis plot and of the HTML report of one recording."""
 
     analysis: Analysis
     others: Sequence[AdditionalDeviation] = ()  # such as total and Hadamard deviation
@@ -49,7 +49,7 @@ class AnalysisPlotData:
 
 
 def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "") -> None:
-    """Write the plot.
+    """Write the analysis plot to a file.
 
     Parameters
     ----------
@@ -84,13 +84,13 @@ def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "")
 
 
 def measured_kinds(estimate: Estimate) -> list[Kind]:
-    """Return the measured kinds of sensor, or both kinds if no axis is measured."""
+    """Return the kinds of sensor with measured axes, or both kinds if no axis is measured."""
     present = {axis for _, axis in measured_axes(estimate.curve)}
     return [kind for kind in KINDS if set(axes_of(kind)) & present] or list(KINDS)
 
 
 def describe_recording(estimate: Estimate) -> str:
-    """Return one line with the number of samples, rate, duration and number of missing samples."""
+    """Return one line with the number of samples, the rate, the duration and the number of missing samples."""
     missing = estimate.curve.n - estimate.samples
     gaps = f", {missing:,} missing" if missing > 0 else ""
     duration = format_duration(estimate.curve.n / estimate.rate_hz)
@@ -98,7 +98,7 @@ def describe_recording(estimate: Estimate) -> str:
 
 
 def is_k_r_ambiguous(estimate: Estimate, letter: str, axis: str) -> bool:
-    """Return True if a coefficient is K or R with an upper bound, and the data do not show which of the two is present.
+    """Return True if a coefficient has only an upper bound because the data cannot distinguish K from R.
 
     Parameters
     ----------
@@ -115,7 +115,6 @@ def is_k_r_ambiguous(estimate: Estimate, letter: str, axis: str) -> bool:
 
 
 def _draw_table(panel: "Axes", analysis: Analysis, kind: Kind) -> None:
-    """Draw the table of coefficients with their intervals in small print."""
     estimate = analysis.estimate
     panel.axis("off")
     rows = np.linspace(0.97, 0.19, len(SYMBOLS) + 1)

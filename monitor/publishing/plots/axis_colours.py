@@ -1,8 +1,7 @@
-"""Colours of the axes in all plots: x red, y green, z blue, in shades that colour-blind readers can distinguish.
+"""Colours of the axes in all plots, which colour-blind readers can distinguish.
 
-The colours differ in lightness as well as in hue. They are close to vermilion, bluish green and sky blue of the
-palette of Okabe & Ito, which remain distinct with deuteranopia and protanopia. A gyroscope and an accelerometer of
-the same direction share a colour, because they never share a plot.
+The colours are close to vermilion, bluish green and sky blue of the Okabe-Ito palette, and also differ in lightness. A
+gyroscope and an accelerometer of the same direction share a colour, because they never share a plot.
 """
 
 from typing import Final

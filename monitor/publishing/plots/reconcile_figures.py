@@ -1,9 +1,8 @@
-"""Figures of the reports of ``reconcile``, as SVG elements.
+"""Figures of the ``reconcile`` reports as SVG elements.
 
-A diagnostic figure shows the measurement, the expectation of the model, and the band that contains 95 of 100 recordings
-simulated from the model. Panels side by side have the same limits, so that the figures of two models can be compared.
-A gap is the difference between measurement and model. A gap chart shows the gap of each diagnostic divided by the
-threshold. An interval chart shows one parameter in several recordings.
+A diagnostic figure shows the measurement, the model expectation, and the band that contains 95 % of recordings
+simulated from the model. A gap chart shows the difference between measurement and model (gap), divided by the threshold
+of each diagnostic. An interval chart shows one parameter in several recordings.
 """
 
 from collections.abc import Sequence
@@ -50,7 +49,7 @@ MIN_GAP_RATIO: Final = 0.05  # a smaller ratio of gap to threshold is drawn at t
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticPlot:
-    """Data of one panel in the units of the plot."""
+    """Curves of one diagnostic panel in displayed units."""
 
     title: str
     x_label: str
@@ -68,7 +67,7 @@ class DiagnosticPlot:
 def diagnostic_comparison_svg(
     model_panels: Sequence[tuple[str, PlotData]], axis: str, width: float, height: float, where: Location | None = None
 ) -> str:
-    """Draw one diagnostic, one panel for each model, and return it as an SVG element.
+    """Draw one diagnostic with a panel for each model, and return the figure as an SVG element.
 
     Parameters
     ----------
@@ -97,7 +96,7 @@ def diagnostic_comparison_svg(
 
 
 def select_diagnostic_view(views: Sequence[PlotData], diagnostic_id: str, where: Location) -> PlotData | None:
-    """Return the data of a diagnostic, or the data of the first diagnostic whose x axis contains the range.
+    """Return the data of a diagnostic, or of the first diagnostic whose x axis shows the range.
 
     Parameters
     ----------
@@ -113,7 +112,7 @@ def select_diagnostic_view(views: Sequence[PlotData], diagnostic_id: str, where:
 
 
 def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | None:
-    """Return the part of a range that lies along the x axis of a diagnostic, in the unit of the diagnostic.
+    """Return the range along the x axis of a diagnostic, or None if the x axis shows another quantity.
 
     Parameters
     ----------
@@ -137,7 +136,7 @@ def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | No
 
 
 def zoomed_view(view: PlotData, where: Location) -> PlotData | None:
-    """Return the data around a range that is too narrow to be visible. Return None if the range is wide enough.
+    """Return the diagnostic data near a narrow range, or None if the range is wide enough to be visible.
 
     Parameters
     ----------
@@ -164,7 +163,7 @@ def zoomed_view(view: PlotData, where: Location) -> PlotData | None:
 
 
 def to_displayed_units(title: str, view: PlotData, axis: str, where: Location | None) -> DiagnosticPlot:
-    """Convert the data of a diagnostic to the units of the plot.
+    """Convert the data of a diagnostic to displayed units.
 
     Parameters
     ----------
@@ -205,7 +204,7 @@ def to_displayed_units(title: str, view: PlotData, axis: str, where: Location | 
 
 
 def common_y_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
-    """Return the common limits of all panels, which contain all curves and the parts of the bands near the curves."""
+    """Return common limits of the y axis for all panels."""
     log = plots[0].log
     curves = _finite([line for plot in plots for line in (plot.measured, plot.expected)], log)
     if curves.size == 0:
@@ -221,14 +220,13 @@ def common_y_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
 
 
 def _finite(lines: Sequence[Floats], log: bool) -> Floats:
-    """Return all values that a panel can show. The values of a logarithmic panel are returned as logarithms."""
+    """Return all finite values, as logarithms for a logarithmic panel."""
     values = np.concatenate(lines)
     values = values[np.isfinite(values) & ((values > 0) | (not log))]
     return np.log10(values) if log else values
 
 
 def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[float, float]) -> None:
-    """Draw the band, the measurement, the expectation and the marked range of one panel."""
     x = plot.x[np.isfinite(plot.x) & ((plot.x > 0) | (not plot.log))]
     left, right = (float(x.min()), float(x.max())) if np.ptp(x) > 0 else (0.5, 1.5)
     scale = "log" if plot.log else "linear"
@@ -257,7 +255,7 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[
 
 
 def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap] = ()) -> str:
-    """Draw the gap of each diagnostic divided by its threshold, and return the chart as an SVG element.
+    """Draw the gap of each diagnostic divided by the threshold, and return the chart as an SVG element.
 
     Parameters
     ----------
@@ -291,7 +289,7 @@ def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap
 def interval_chart_svg(
     intervals: Sequence[tuple[str, ParameterInterval]], x_label: str, factor: float, colour: str
 ) -> str:
-    """Draw values with 95 % intervals, one row for each recording, and return the chart as an SVG element.
+    """Draw parameter values with 95 % intervals, and return the chart as an SVG element.
 
     Parameters
     ----------
@@ -320,7 +318,6 @@ def interval_chart_svg(
 
 
 def _create_row_panel(names: Sequence[str], x_label: str) -> "tuple[Figure, Axes]":
-    """Return a figure and a panel with one row for each name. The first name is on top."""
     figure = style.create_figure(ROWS_WIDTH_INCHES, 0.75 + ROW_INCHES * len(names))
     panel = figure.subplots()
     short = [name if len(name) <= MAX_NAME_LENGTH else f"{name[: MAX_NAME_LENGTH - 1]}…" for name in names]

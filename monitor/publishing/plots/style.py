@@ -1,8 +1,7 @@
-"""Style of all figures, and their output as image files and as SVG elements of a page.
+"""Style of all figures, and output of figures as image files and SVG elements.
 
-Figures are ``Figure`` objects of matplotlib without pyplot, so they need no display. ``figure_style`` applies the
-colours, line widths and text sizes. Two files of the same figure are identical: identifiers in an SVG depend only on
-its content, and no file contains a date. matplotlib is imported when a figure is drawn.
+Figures do not use pyplot and need no display. Equal figures give identical files, because files contain no date and no
+random identifiers. matplotlib is imported when a figure is drawn.
 """
 
 import hashlib
@@ -83,13 +82,13 @@ TIME_UNITS: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 2
 
 
 def axis_colour(axis: str) -> str:
-    """Return the colour of an axis, which is the same for both kinds of sensor."""
+    """Return the colour of an axis, which is the same for gyroscopes and accelerometers."""
     return COLOURS[AXES.index(axis) % 3]
 
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Apply the style to all figures that are drawn inside the ``with`` block.
+    """Apply the figure style inside the ``with`` block.
 
     Raises
     ------
@@ -142,7 +141,7 @@ def save_figure(figure: "Figure", path: Path) -> None:
 
 
 def to_svg_element(figure: "Figure", description: str) -> str:
-    """Return a figure as an SVG element without width and height, so that it fills its column in a page.
+    """Convert a figure to an SVG element without a fixed width and height.
 
     Parameters
     ----------
@@ -164,7 +163,6 @@ def to_svg_element(figure: "Figure", description: str) -> str:
 
 
 def _shorten(number: re.Match[str]) -> str:
-    """Return a coordinate of an SVG with one decimal."""
     return f"{float(number[0]):.1f}".removesuffix(".0")
 
 
@@ -183,9 +181,9 @@ def format_tick(value: float) -> str:
 
 
 def style_log_axis(panel: "Axes", which: str, minor_grid: bool = True) -> None:
-    """Label a logarithmic axis with plain numbers and draw its grid.
+    """Label a logarithmic axis with plain numbers and draw the grid.
 
-    Powers of ten have labels. If the axis spans only a few decades, 2 and 5 also have labels.
+    Powers of ten have labels. On an axis with few decades, the factors 2 and 5 also have labels.
 
     Parameters
     ----------
@@ -208,7 +206,7 @@ def style_log_axis(panel: "Axes", which: str, minor_grid: bool = True) -> None:
 
 
 def draw_band(panel: "Axes", x: Floats, lo: Floats, hi: Floats, colour: str, **options: Any) -> None:
-    """Draw the band of an interval.
+    """Draw a confidence interval as a translucent band.
 
     Parameters
     ----------
@@ -225,7 +223,7 @@ def draw_band(panel: "Axes", x: Floats, lo: Floats, hi: Floats, colour: str, **o
 
 
 def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
-    """Draw the legend above the panel, where it covers no curve.
+    """Draw the legend above the panel.
 
     Parameters
     ----------
@@ -240,7 +238,7 @@ def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
 
 
 def set_y_scale(panel: "Axes", smallest: float, largest: float, margin: float) -> None:
-    """Set scale and limits of the y axis of a positive quantity. The scale is logarithmic if the values differ much.
+    """Set the scale and the limits of the y axis, with a logarithmic scale for a wide range of values.
 
     Parameters
     ----------
@@ -261,7 +259,7 @@ def set_y_scale(panel: "Axes", smallest: float, largest: float, margin: float) -
 
 
 def omit_wide_intervals(value: Floats, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
-    """Return the ends of intervals, with NaN for intervals that would determine the scale of a plot.
+    """Return interval ends, with NaN for wide intervals that would dominate the scale of a plot.
 
     Parameters
     ----------
@@ -273,7 +271,7 @@ def omit_wide_intervals(value: Floats, lo: Floats, hi: Floats) -> tuple[Floats, 
 
 
 def select_time_unit(duration_s: float) -> tuple[str, float]:
-    """Return the name and the length [s] of the unit that suits a time axis of this duration [s].
+    """Return the name and the length [s] of a suitable time unit for a time axis.
 
     >>> select_time_unit(7200.0), select_time_unit(5e5)
     (('min', 60.0), ('d', 86400.0))

@@ -1,8 +1,6 @@
-"""Report of one analysis as a self-contained HTML page, for ``imu-monitor analyze --plot FILE.html``.
+"""HTML report of one analysis, for ``imu-monitor analyze --plot FILE.html``.
 
-The page needs no network. It contains the Allan plot of each kind of sensor, the table of coefficients with intervals,
-facts about the recording, notes, and the dynamic Allan deviation if it was computed. Heat maps are images inside the
-SVG, so that the page stays below one megabyte.
+The page is self-contained. Heat maps are raster images, so that the page stays below one megabyte.
 """
 
 from pathlib import Path
@@ -31,7 +29,7 @@ STATUS_TEXTS: Final = {Status.UPPER_BOUND: "(upper bound)", Status.UNESTIMATED: 
 
 
 def write_html_report(plot_data: AnalysisPlotData, path: Path, title: str = "") -> None:
-    """Write the page to a file.
+    """Write the HTML report of an analysis to a file.
 
     Parameters
     ----------
@@ -55,7 +53,7 @@ def write_html_report(plot_data: AnalysisPlotData, path: Path, title: str = "") 
 
 
 def render_page(plot_data: AnalysisPlotData, title: str = "") -> str:
-    """Return the page as text. The parameters and errors are those of ``write_html_report``."""
+    """Return the HTML report as text. The parameters and errors are those of ``write_html_report``."""
     analysis = plot_data.analysis
     return render_template(
         "report.html.j2",
@@ -73,7 +71,7 @@ def render_page(plot_data: AnalysisPlotData, title: str = "") -> str:
 
 
 def recording_facts(analysis: Analysis) -> tuple[tuple[str, str], ...]:
-    """Return names and values that describe the recording."""
+    """Return names and values of the properties of a recording."""
     estimate = analysis.estimate
     missing = max(estimate.curve.n - estimate.samples, 0)
     share = f" ({format_number(100.0 * missing / estimate.curve.n, 2)} %)" if missing else ""
@@ -87,7 +85,7 @@ def recording_facts(analysis: Analysis) -> tuple[tuple[str, str], ...]:
 
 
 def format_value_and_interval(estimate: Estimate, letter: str, axis: str) -> tuple[str, str]:
-    """Return the value of a coefficient with its unit, and its interval or the reason for a missing interval.
+    """Return the value of a coefficient with unit, and the interval or the reason for a missing interval.
 
     Parameters
     ----------
@@ -107,7 +105,6 @@ def format_value_and_interval(estimate: Estimate, letter: str, axis: str) -> tup
 
 
 def _part(plot_data: AnalysisPlotData, kind: Kind) -> dict[str, Any]:
-    """Return the values for the template for one kind of sensor."""
     name, heat_maps = KIND_NAMES[kind], ""
     with figure_style():
         figure = create_figure(*ALLAN_INCHES)

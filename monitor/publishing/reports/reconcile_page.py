@@ -1,9 +1,7 @@
-"""Report of a reconciliation as a self-contained HTML page, ``report.html``.
+"""HTML report of a reconciliation, ``report.html``.
 
-The page needs no network. It contains a summary, a table of the axes, and a section for each step. A section shows
-where measurement and model differed, the added or changed effect with its parameters, and every diagnostic before and
-after the step. Axes that agree with the model share a table of their diagnostics. The template ``reconcile.html.j2``
-arranges the sentences of ``reconcile_sentences`` and the figures of ``diagnostic_figure``.
+The page is self-contained and contains a summary, a table of the axes, and a section for each step. A section shows the
+added or changed noise effect, and all diagnostics before and after the step.
 """
 
 from collections.abc import Sequence
@@ -28,7 +26,7 @@ SINGLE_INCHES: Final = (3.4, 2.05)
 
 
 def render_page(r: Reconciliation, title: str = "") -> str:
-    """Return the page as text.
+    """Return the HTML report of a reconciliation as text.
 
     Parameters
     ----------
@@ -70,24 +68,20 @@ def render_page(r: Reconciliation, title: str = "") -> str:
 def _pair_scores(
     before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap]
 ) -> list[tuple[DiagnosticGap, DiagnosticGap | None]]:
-    """Return each score with the score of the same diagnostic after a step, or None if that score is missing."""
     later = {score.lens: score for score in after}
     return [(score, later.get(score.lens)) for score in before]
 
 
 def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list[DiagnosticGap | None]]]:
-    """Return each diagnostic with the scores of all axes for the first model. None if an axis has no score."""
     known = [{score.lens: score for score in result.start.gaps} for result in results]
     return [(lens, [scores.get(lens) for scores in known]) for lens in dict.fromkeys(one for k in known for one in k)]
 
 
 def _draw_single(view: PlotData, axis: str) -> str:
-    """Draw one diagnostic for one model."""
     return diagnostic_comparison_svg([("", view)], axis, *SINGLE_INCHES)
 
 
 def _draw_pairs(before: DiagnosticSnapshot, after: DiagnosticSnapshot, axis: str) -> list[str]:
-    """Draw each diagnostic before and after a step."""
     later = {view.lens: view for view in after.plots}
     return [
         diagnostic_comparison_svg([("before", view), ("after", later[view.lens])], axis, *PAIR_INCHES)
@@ -97,7 +91,6 @@ def _draw_pairs(before: DiagnosticSnapshot, after: DiagnosticSnapshot, axis: str
 
 
 def _draw_range(snapshot: DiagnosticSnapshot, found: DiagnosticGap, axis: str) -> list[str]:
-    """Draw the diagnostic that shows a range best, and a detail plot if the range is narrow."""
     view = select_diagnostic_view(snapshot.plots, found.lens, found.where)
     if view is None:
         return []

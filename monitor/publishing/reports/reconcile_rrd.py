@@ -1,10 +1,8 @@
-"""Result of a reconciliation as a Rerun recording, ``reconcile.rrd``, with a separate layout.
+"""Result of a reconciliation as a Rerun recording, ``reconcile.rrd``.
 
-Each axis has a tab. On the left are the steps as text and the gap of each diagnostic relative to its threshold. On the
-right, each diagnostic with logarithmic axes is drawn twice: for the first model and for the model after the steps. The
-timeline ``step`` is the index of the model. Index 0 is the model that was given or fitted first, and each step adds an
-index. The right plot of a pair follows this timeline. Rerun has no logarithmic axes, so ``allan_chart`` converts plots
-to lines. The stream is separate from the stream of the live view. Importing this module imports Rerun.
+Each axis has a tab with the steps as text, the gap of each diagnostic divided by the threshold, and plots of the
+diagnostics. A diagnostic with logarithmic axes is drawn for the first model and for the model after the steps. The
+timeline ``step`` selects the model, and index 0 is the first model. Importing this module imports Rerun.
 
 Entities: ``/<axis>/steps``, ``/<axis>/gap/<lens>``, ``/<axis>/<lens>/before``, ``/<axis>/<lens>/after``, ``/overview``.
 """
@@ -41,7 +39,7 @@ GAP_LINE_COLOURS: Final = (  # more lines would not fit into the legend
 
 
 def write_rrd(r: Reconciliation, path: Path) -> None:
-    """Write the recording.
+    """Write the result of a reconciliation as a Rerun recording.
 
     Parameters
     ----------
@@ -71,7 +69,7 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
 
 
 def blueprint(r: Reconciliation) -> rrb.Blueprint:
-    """Return the layout with one tab for each axis and one for all axes. Axes that differ from the model come first."""
+    """Return the Rerun layout with a tab for each axis and an overview. Axes that differ from the model come first."""
     axes = sorted(_axes(r), key=lambda axis: r.axes[axis].verdict == "agrees")
     tabs: list[rrb.View | rrb.Container] = [_tab(r.axes[axis]) for axis in axes]
     tabs.append(rrb.TextDocumentView(origin="/overview", contents="$origin", name="All axes"))
@@ -79,7 +77,6 @@ def blueprint(r: Reconciliation) -> rrb.Blueprint:
 
 
 def _overview(r: Reconciliation) -> str:
-    """Return the overview of all axes as Markdown."""
     rows = []
     for axis in _axes(r):
         result = r.axes[axis]
@@ -95,7 +92,6 @@ def _overview(r: Reconciliation) -> str:
 
 
 def _steps_text(r: Reconciliation, result: AxisResult) -> str:
-    """Return the steps and the unexplained differences of one axis as Markdown."""
     parts = [f"## {result.axis}: {words.RESULT_TEXTS[result.verdict]}", words.describe_result(result)]
     for count, step in enumerate(result.steps, start=1):
         known = words.format_parameters(step, result.axis, r.baseline)
@@ -116,22 +112,18 @@ def _steps_text(r: Reconciliation, result: AxisResult) -> str:
 
 
 def _axes(r: Reconciliation) -> list[str]:
-    """Return the axes of the result in the usual order."""
     return [axis for axis in AXES if axis in r.axes]
 
 
 def _snapshots_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
-    """Return the diagnostics for the first model and after each step. Withdrawn effects are not in the last model."""
     return [result.start, *(step.snapshot_after for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
 def _drawn_diagnostics(result: AxisResult) -> list[str]:
-    """Return the first diagnostics with logarithmic axes, which are drawn."""
     return [view.lens for view in result.start.plots if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
 
 def _tab(result: AxisResult) -> rrb.Container:
-    """Return the tab of one axis."""
     axis, steps = result.axis, len(result.steps)
     text = rrb.TextDocumentView(origin=f"/{axis}/steps", contents="$origin", name="What was found")
     gaps = rrb.TimeSeriesView(
@@ -152,7 +144,6 @@ def _tab(result: AxisResult) -> rrb.Container:
 
 
 def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
-    """Return the view of one diagnostic, before or after the steps."""
     what = words.diagnostic_name(lens)
     what = what[0].upper() + what[1:]
     names = {"before": f"{what}: first model", "after": f"{what}: after the steps"}
@@ -161,7 +152,6 @@ def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
 
 
 def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
-    """Log all entities of one axis."""
     stream.log(f"{result.axis}/steps", markdown_document(_steps_text(r, result)), static=True)
     for lens in _drawn_diagnostics(result):
         _log_diagnostic(stream, result, lens)
@@ -169,7 +159,6 @@ def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult)
 
 
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
-    """Log the largest gaps divided by their thresholds, and a line at 1 for the threshold."""
     snapshots = [
         {score.lens: words.gap_to_threshold_ratio(score) for score in snapshot.gaps}
         for snapshot in _snapshots_by_step(result)
@@ -186,13 +175,11 @@ def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
 
 
 def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float]) -> None:
-    """Log one value for each step."""
     steps = rr.TimeColumn(TIMELINE, sequence=range(len(values)))
     stream.send_columns(path, [steps], rr.Scalars.columns(scalars=np.array(values)))
 
 
 def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
-    """Draw both plots of one diagnostic with the same scale."""
     axis = result.axis
     views = [
         next((view for view in snapshot.plots if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
@@ -213,7 +200,6 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
 def _log_curves(
     stream: rr.RecordingStream, path: str, scale: ChartScale, plot: DiagnosticPlot, axis: str, static: bool
 ) -> None:
-    """Draw the band, the measured curve and the expected curve."""
     # A lower end of zero has no logarithm. It is drawn below the box.
     low, high = (scale.to_chart_positions(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
     log = partial(stream.log, static=static)
@@ -227,7 +213,6 @@ def _log_curves(
 
 
 def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: ChartScale, result: AxisResult, lens: str) -> None:
-    """Draw a frame around each range in which a diagnostic found a gap."""
     view = next(view for view in result.start.plots if view.lens == lens)
     founds = [step.before for step in result.steps] + list(result.left_over)
     marks = [to_displayed_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
@@ -241,7 +226,6 @@ def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: ChartScale, 
 
 
 def _log_grid(stream: rr.RecordingStream, path: str, scale: ChartScale, plot: DiagnosticPlot, axis: str) -> None:
-    """Draw the frame, the decade lines, the labels and the legend."""
     log = partial(stream.log, static=True)
     key = [("measured", colours.AXIS_COLOURS[axis]), ("model", colours.TEXT), ("95 %", BAND_COLOUR)]
     names = [(x, -0.85, name) for x, (name, _) in zip(LEGEND_X, key, strict=True)]
@@ -252,5 +236,5 @@ def _log_grid(stream: rr.RecordingStream, path: str, scale: ChartScale, plot: Di
 
 
 def _inside(at: Floats) -> Floats:
-    """Limit a curve to the box. Values outside are drawn on the edge of the box."""
+    """Clip a curve to the edges of the chart."""
     return np.column_stack([at[:, 0], clip_to_box(at[:, 1])])

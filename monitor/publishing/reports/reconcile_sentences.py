@@ -1,9 +1,8 @@
-"""Sentences and formatted values for the results of ``reconcile``, used by the page, the viewer and the terminal.
+"""Sentences and formatted values for the results of ``reconcile``.
 
-The functions of this module convert the types of ``monitor.reconcile.result``, which are in SI units, into short text.
-The SI unit of a quantity selects the displayed unit. A small rate is displayed in °/h and a large rate in °/s, although
-both have the SI unit rad/s. A value has as many digits as its 95 % interval allows. This module does not depend on
-HTML, Rerun or a terminal.
+The HTML report, the viewer and the terminal share these texts. Values in SI units are converted to displayed units. For
+example, a small angular rate is displayed in °/h and a large rate in °/s. The 95 % interval of a value determines the
+number of digits.
 """
 
 from collections.abc import Sequence
@@ -86,7 +85,7 @@ SYMMETRY_TOLERANCE: Final = 0.1  # sides of an interval that differ by less than
 
 @dataclass(frozen=True, slots=True)
 class FormattedParameter:
-    """Texts for one parameter. Unknown parts are empty."""
+    """Texts for one parameter of a noise effect. Unknown texts are empty."""
 
     name: str
     value: str  # "30.94", "ax"
@@ -122,12 +121,12 @@ def readable_name(name: str) -> str:
 
 
 def diagnostic_name(diagnostic_id: str) -> str:
-    """Return the name of a diagnostic for the user."""
+    """Return the displayed name of a diagnostic."""
     return DIAGNOSTIC_NAMES.get(diagnostic_id, readable_name(diagnostic_id))
 
 
 def format_probability(probability: float) -> str:
-    """Format a probability. Values near 0 and 1 are written as inequalities.
+    """Format a probability. Probabilities near 0 and 1 are written as inequalities.
 
     >>> format_probability(0.998), format_probability(0.99999), format_probability(0.0002)
     ('99.8 %', '> 99.9 %', '< 0.1 %')
@@ -140,7 +139,7 @@ def format_probability(probability: float) -> str:
 
 
 def format_range(where: Location, axis: str) -> str:
-    """Format the range in which a diagnostic found a gap. Return "everywhere" if no range is given.
+    """Format the range in which a diagnostic found a difference. Without a range, return "everywhere".
 
     >>> format_range(Location(tau=(1.0, 4.0), source="ax"), "gz"), format_range(Location(time=(1800.0, 1800.5)), "gz")
     ('τ = 1 … 4 s, from ax', 't = 1800 s')
@@ -168,7 +167,7 @@ def format_range(where: Location, axis: str) -> str:
 
 
 def describe_gap(gap: DiagnosticGap, axis: str) -> str:
-    """Return one line with the diagnostic, its range, its gap and its threshold.
+    """Describe a difference between model and recording (gap) with the diagnostic, range and threshold.
 
     Parameters
     ----------
@@ -182,7 +181,7 @@ def describe_gap(gap: DiagnosticGap, axis: str) -> str:
 
 
 def format_gap(gap: float) -> str:
-    """Format the size of a gap.
+    """Format the size of a difference between model and recording (gap).
 
     >>> format_gap(0.6), format_gap(41.23), format_gap(12345.0)
     ('0.60', '41.2', '12300')
@@ -193,13 +192,13 @@ def format_gap(gap: float) -> str:
 
 
 def gap_to_threshold_ratio(gap: DiagnosticGap) -> float:
-    """Return the gap divided by the threshold, or 0 if this ratio is not finite."""
+    """Return the gap of a diagnostic divided by the threshold. An infinite ratio becomes 0."""
     share = gap.gap / gap.threshold if gap.threshold > 0.0 else 0.0
     return share if isfinite(share) else 0.0
 
 
 def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> tuple[FormattedParameter, ...]:
-    """Return the texts of all parameters of a step.
+    """Format all parameters of the noise effect that a step adds or changes.
 
     Parameters
     ----------
@@ -219,9 +218,9 @@ def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseMode
 
 
 def describe_step(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> str:
-    """Return one line with an effect and its parameters.
+    """Describe the noise effect and the parameters of a step in one line.
 
-    Example: "sinusoidal: amplitude 30.94 ± 0.55 °/h, frequency 17.30000 ± 0.00010 Hz".
+    An example is "sinusoidal: amplitude 30.94 ± 0.55 °/h, frequency 17.30000 ± 0.00010 Hz".
 
     Parameters
     ----------
@@ -237,7 +236,7 @@ def describe_step(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -
 
 
 def summarize(r: Reconciliation) -> str:
-    """Return the result of the whole recording in a few sentences."""
+    """Summarize the result of a reconciliation in a few sentences."""
     differ = [axis for axis in AXES if axis in r.axes and r.axes[axis].verdict != "agrees"]
     unexplained = [axis for axis in differ if r.axes[axis].left_over]
     model = "The model of five classic terms, fitted first," if r.fitted_first else "The model"
@@ -255,7 +254,7 @@ def summarize(r: Reconciliation) -> str:
 
 
 def describe_result(result: AxisResult) -> str:
-    """Return the result of one axis in a sentence."""
+    """Describe the result of one axis in one sentence."""
     match result.verdict:
         case "agrees":
             return "In every diagnostic, model and measurement differ by no more than chance."
@@ -268,7 +267,7 @@ def describe_result(result: AxisResult) -> str:
 
 
 def describe_alternatives(step: AddedOrResizedEffect) -> str:
-    """Return a sentence on the effects that were also tried, with their probabilities."""
+    """Describe the alternative effects of a step and their probabilities."""
     if not step.runners_up:
         return "No other effect explains the gap nearly as well."
     tried = [f"{readable_name(one.effect)} ({format_probability(one.confidence)})" for one in step.runners_up]
@@ -276,7 +275,7 @@ def describe_alternatives(step: AddedOrResizedEffect) -> str:
 
 
 def describe_held_out_gap(step: AddedOrResizedEffect) -> str:
-    """Return the gap before and after a step on held-out data, which were not used to choose the effect."""
+    """Describe the gap before and after a step on data that were not used to choose the effect."""
     before, after = step.held_out_before, step.held_out_after
     if before is None or after is None:
         return f"None: {step.held_out_reason}."
@@ -284,7 +283,7 @@ def describe_held_out_gap(step: AddedOrResizedEffect) -> str:
 
 
 def parameter_unit(effect: str, name: str, axis: str, value_si: float) -> Unit:
-    """Return the displayed unit of a parameter of an effect.
+    """Return the displayed unit of a parameter of a noise effect.
 
     Parameters
     ----------
@@ -302,7 +301,6 @@ def parameter_unit(effect: str, name: str, axis: str, value_si: float) -> Unit:
 
 
 def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: str, given: Any) -> FormattedParameter:
-    """Return the text of one parameter."""
     if isinstance(bounds.value, str):
         return FormattedParameter(name, bounds.value, "", bounds.value, "", "" if given is None else str(given))
     unit = parameter_unit(effect, name, axis, bounds.value)
@@ -322,7 +320,7 @@ def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: s
 
 
 def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str:
-    """Format a value with ±, or with both ends of an asymmetric interval."""
+    """Format a value with ±, or with two interval ends if the interval is asymmetric."""
     below, above = value - lo, hi - value
     if abs(above - below) > SYMMETRY_TOLERANCE * (above + below):
         return f"{texts[0]} ({texts[1]} … {texts[2]})"
@@ -330,7 +328,7 @@ def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str
 
 
 def _with_interval(value: float, lo: float, hi: float) -> tuple[str, ...]:
-    """Format value, lo, hi and half width of an interval with the two leading digits of the half width."""
+    """Format a value, the interval ends and the half width to two digits of the half width."""
     half = 0.5 * (hi - lo)
     decimals = 1 - floor(log10(half))
     if 0 <= decimals <= 9 and max(map(abs, (value, lo, hi))) < 1e6:
@@ -347,7 +345,6 @@ def _short(value: float) -> str:
 
 
 def _count_steps(steps: Sequence[AddedOrResizedEffect]) -> list[str]:
-    """Return the numbers of added effects and of changed terms, with their names."""
     texts = []
     for kind, noun in (("added", "added effect"), ("retuned", "retuned term")):
         names = [readable_name(step.effect) for step in steps if step.kind == kind]

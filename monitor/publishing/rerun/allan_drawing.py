@@ -1,7 +1,7 @@
-"""Allan plots of the viewer, with measured points, intervals, the fitted deviation and the noise model.
+"""Allan plots in the viewer, with measured deviations, intervals, fitted deviations and the noise model.
 
-Rerun draws a plot as lines and points in chart units. The entity of an axis therefore also contains tau, deviation, lo
-and hi in SI units, for programs that read the recording. Importing this module imports Rerun.
+Rerun draws a plot as lines and points in chart units. The entity of an axis therefore also contains the deviations in
+SI units, for programs that read the recording. Importing this module imports Rerun.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +35,7 @@ Log = Callable[..., Any]
 
 
 class AllanPlot:
-    """Allan plots of a device, one for each kind of sensor.
+    """Allan plots of one device, with a plot for each kind of sensor.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class AllanPlot:
         self._scales: dict[Kind, ChartScale] = {}  # scale of the newest grid
 
     def draw(self, estimate: Estimate, gap: ModelGap | None) -> None:
-        """Draw the curves of an estimate.
+        """Draw the Allan deviations of an estimate.
 
         Parameters
         ----------
@@ -77,7 +77,6 @@ class AllanPlot:
                 self._draw_curve(scale, curve)
 
     def _draw_grid(self, kind: Kind, scale: ChartScale, axes: Sequence[str]) -> None:
-        """Draw frame, decade lines and tick labels of a plot, and a legend above the right end of the box."""
         path = f"{self._path}/{kind}"
         titles = [
             (WIDTH / 2, HEIGHT + 0.85, "averaging time τ, s"),
@@ -92,7 +91,6 @@ class AllanPlot:
         self._log(f"{path}/legend", label_points([(x, -0.85, axis) for axis, x in ends]))
 
     def _draw_curve(self, scale: ChartScale, curve: "_Curve") -> None:
-        """Draw band, fitted line, intervals and measured points of one axis, and the noise model as a dashed line."""
         path, colour = f"{self._path}/{curve.axis}", colours.AXIS_COLOURS[curve.axis]
         low, high, fitted, model, deviation = (
             scale.to_chart_positions(curve.tau, part)
@@ -117,7 +115,7 @@ class AllanPlot:
 
 @dataclass(frozen=True)
 class _Curve:
-    """Deviations of one axis at its measured averaging times, in the unit of the plot."""
+    """Deviations of one axis in the unit of the Allan plot."""
 
     axis: str
     tau: Floats
@@ -130,12 +128,12 @@ class _Curve:
 
     @property
     def curves_in_y_range(self) -> tuple[Floats, ...]:
-        """Curves that determine the range of the y axis. Intervals may extend beyond this range."""
+        """Curves that determine the range of the y axis. Intervals may extend beyond the range."""
         return self.deviation, self.fitted, self.model
 
     @classmethod
     def from_estimate(cls, estimate: Estimate, axis: str, gap: ModelGap | None) -> "_Curve | None":
-        """Return the deviations of an axis, or None if there are fewer than two points."""
+        """Return None if the axis has fewer than two deviations."""
         curve, i = estimate.curve, AXES.index(axis)
         rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)
         if int(rows.sum()) < 2:
@@ -152,7 +150,7 @@ class _Curve:
 def log_grid(
     log: Log, path: str, scale: ChartScale, labels_path: str, labels: Sequence[tuple[float, float, str]]
 ) -> None:
-    """Log frame, decade lines, tick labels and further labels of a plot.
+    """Log the grid lines, tick labels and further labels of a plot.
 
     Parameters
     ----------
@@ -177,7 +175,7 @@ def log_grid(
 def log_lines(
     log: Log, path: str, strips: Sequence[Floats], line_colours: Sequence[Colour], radius: float, order: float
 ) -> None:
-    """Log lines.
+    """Log lines with colours and a width.
 
     Parameters
     ----------
@@ -213,7 +211,7 @@ def fill_band(low: Floats, high: Floats, colour: Colour) -> rr.LineStrips2D:
 
 
 def label_points(labels: Sequence[tuple[float, float, str]]) -> rr.Points2D:
-    """Return labels as points of a 2D view, each given by x, y and text."""
+    """Return labels as points of a 2D view. Each label has the coordinates x and y and a text."""
     return rr.Points2D(
         [(x, y) for x, y, _ in labels],
         labels=[text for _, _, text in labels],

@@ -1,8 +1,8 @@
 """History of the Allan deviations of a device, in a table of limited size for the live view.
 
-Estimates are aggregated into columns, oldest first. Each column is the mean of the logarithms of the estimates in one
-time interval. When the table has COLUMNS columns, pairs of neighbouring columns are averaged, and each column then
-covers twice the time. The table therefore covers the whole history with constant memory. The module does no I/O.
+Each column is the mean logarithmic deviation of all estimates in a time interval. When the table has COLUMNS columns,
+neighbouring columns are averaged in pairs, and the time interval of a column doubles. The table therefore covers the
+whole history with constant memory.
 """
 
 import numpy as np
@@ -17,7 +17,10 @@ INITIAL_COLUMN_S = 2.0
 
 
 class AllanHistory:
-    """Allan deviations of one device over time. An estimate with other τ or an earlier time starts a new history."""
+    """Allan deviations of one device over time.
+
+    An estimate with different averaging times or an earlier time starts a new history.
+    """
 
     def __init__(self, column_s: float = INITIAL_COLUMN_S) -> None:
         """Create an empty history with columns of ``column_s`` seconds."""
@@ -25,7 +28,6 @@ class AllanHistory:
         self._reset(np.empty(0), 0.0)
 
     def _reset(self, tau_s: Floats, wall_s: float) -> None:
-        """Start a new, empty history."""
         self.column_s = self._first_s
         self.tau_s = tau_s  # [m]
         self.ends_s: list[float] = []  # Unix time of the newest estimate in each column
@@ -33,13 +35,12 @@ class AllanHistory:
         self._begin_column(wall_s)
 
     def _begin_column(self, wall_s: float) -> None:
-        """Start a new column."""
         self._since_s = self._newest_s = wall_s
         self._sums: Floats = np.zeros((self.tau_s.size, len(AXES)))
         self._counts: Ints = np.zeros((self.tau_s.size, len(AXES)), np.int64)
 
     def add_estimate(self, wall_s: float, estimate: Estimate) -> bool:
-        """Add an estimate, and return True if it completes a column.
+        """Add an estimate. Return True if the estimate completes a column.
 
         Parameters
         ----------
@@ -66,7 +67,6 @@ class AllanHistory:
         return True
 
     def _merge_pairs(self) -> None:
-        """Average neighbouring columns."""
         pairs = np.stack(self._columns).reshape(COLUMNS // 2, 2, self.tau_s.size, len(AXES))
         there = np.isfinite(pairs)
         means = np.where(there, pairs, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
@@ -75,7 +75,10 @@ class AllanHistory:
         self.column_s *= 2.0
 
     def log_ratio_to_median(self) -> Floats:
-        """Return ln(deviation / median over time), shape [columns, m, 6]. NaN if there is no deviation."""
+        """Return the logarithm of the deviation divided by the median over time, shape [columns, m, 6].
+
+        Missing deviations are NaN.
+        """
         whole = np.stack(self._columns) if self._columns else np.empty((0, self.tau_s.size, len(AXES)))
         there = np.isfinite(whole).any(axis=0)
         median = np.full(there.shape, np.nan)

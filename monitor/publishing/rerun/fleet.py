@@ -1,9 +1,7 @@
-"""Viewer for the devices of many daemons: ``imu-monitor view``.
+"""Viewer for the devices of many daemons, ``imu-monitor view``.
 
-Messages from zenoh are drawn as a table of all devices and a list of all events. Devices with problems are at the top
-of the table. Selected devices also have samples, Allan plots and coefficients over time, as in the viewer of a daemon.
-Only for these devices, samples and Allan deviations are received. ``DeviceStates`` holds the state of the devices, and
-``RerunView`` draws in a separate thread.
+The viewer shows a table of all devices and a list of all events. Devices shown in detail also have samples, Allan plots
+and coefficients over time. Samples and Allan deviations are received only for devices shown in detail.
 """
 
 import threading
@@ -30,7 +28,7 @@ MAX_ROWS: Final = 40
 
 
 def full_device_key(device: str, keyexpr: str) -> str:
-    """Return the full key of a device, whose key may be relative to the part of a key expression before any wildcard.
+    """Return the full key of a device whose key may be relative to a key expression.
 
     >>> full_device_key("nose", "imu/**"), full_device_key("fleet/a7/nose", "fleet/**")
     ('imu/nose', 'fleet/a7/nose')
@@ -72,7 +70,7 @@ class FleetView:
         self.malformed = 0  # number of messages of devices in detail that could not be decoded
 
     def run(self, stop: threading.Event, report: Callable[[str], None], duration_s: float | None = None) -> None:
-        """Process messages until ``stop`` is set.
+        """Process messages and draw the device table until ``stop`` is set.
 
         Parameters
         ----------
@@ -100,7 +98,7 @@ class FleetView:
                 report(text)
 
     def process_message(self, message: ReceivedMessage) -> None:
-        """Update the table with a message, and the viewer if the device is shown in detail."""
+        """Update the device table from a message, and draw the results of a device shown in detail."""
         if message.payload is None:
             self.board.set_liveliness_token(message.key, message.token_exists)
             return
@@ -134,7 +132,6 @@ class FleetView:
         self._viewer.put("", wall_s, DeviceTableText(fleet_text(devices, now_s, MAX_ROWS, note)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
-        """Pass samples or Allan deviations to the viewer."""
         if topic is topics.SAMPLES:
             rows = decode_samples(payload).block
             unix_s = rows.t_ns / 1e9
@@ -147,7 +144,6 @@ class FleetView:
                 self._viewer.put(device, estimate.t_ns / 1e9, estimate)
 
     def _problems(self) -> str:
-        """Return the problems of the viewer and of the subscriber."""
         viewer = self._viewer.state
         problems = [] if viewer in ("ok", "starting") else [f"viewer: {viewer}"]
         if self._subscriber.state != "ok":

@@ -1,7 +1,7 @@
-"""Points that the viewer draws for stored history. The module does no I/O.
+"""Points that the viewer draws for the stored history of a device.
 
-Each bucket has a point for its last value with the interval, at the end of the bucket. An extreme outside this interval
-has an additional point. A minimum is drawn after one third of the bucket, a maximum after two thirds.
+Each time bucket has a point at the end of the bucket for the last value, with the interval of the value. An extreme
+outside the interval has an additional point.
 """
 
 import numpy as np
@@ -12,9 +12,9 @@ from monitor.publishing.plots.style import omit_wide_intervals
 
 
 def history_points(past: HistoryTable, column: ColumnStatistics, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
-    """Return the Unix times [m] of the points, and their value, lo and hi [m, 3].
+    """Return Unix times, shape [m], and values with interval ends, shape [m, 3], of the points to draw.
 
-    A row of NaN marks each gap and the end, so that the line is interrupted there.
+    A row of NaN interrupts the line at the end and where buckets are missing.
 
     Parameters
     ----------
@@ -44,5 +44,5 @@ def history_points(past: HistoryTable, column: ColumnStatistics, lo: Floats, hi:
 def _rows(
     t_s: Floats, value: Floats, lo: Floats, hi: Floats, there: "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 ) -> Floats:
-    """Return the rows for which ``there`` is True, as time, value, lo and hi, shape [rows, 4]."""
+    """Return the selected points as rows of time, value and interval ends, shape [rows, 4]."""
     return np.column_stack([t_s, value, lo, hi])[there]

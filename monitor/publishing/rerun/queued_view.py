@@ -1,14 +1,11 @@
-"""Live view in Rerun. Results from the main loop of the service are drawn in a separate thread.
+"""Live view in Rerun, which draws results of the main loop in a separate thread.
 
-``put`` adds a result to a bounded queue and returns at once. The thread opens the viewer, draws new data five times a
-second, and checks once a second that the data have reached the viewer. If the viewer does not answer, the state is
-``stalled``: drawing waits, the queue drops its oldest entries, and ``state`` reports their number. If the viewer is
-missing, cannot start or was closed, ``state`` gives the reason and the attempt is repeated. No exception reaches the
-main loop.
+``put`` adds a result to a bounded queue and returns at once. If the viewer does not answer, ``state`` reports
+``stalled`` and the queue drops the oldest results. If the viewer is missing, cannot start or was closed, ``state``
+reports the reason and the thread repeats the attempt.
 
-Three properties of Rerun determine this design. A logging call blocks without limit if the viewer does not read. The
-exit handler of Rerun may block in the same way and is therefore removed. Freeing a stream may also block, so streams
-are never freed (see ``sinks``). The import of Rerun takes half a second and is done in the thread.
+A logging call of Rerun blocks without limit if the viewer does not read. The exit handler of Rerun may also block and
+is therefore removed. The import of Rerun takes half a second and is therefore done in the thread.
 """
 
 import importlib
@@ -43,7 +40,7 @@ HistorySource = Callable[[str], HistoryTable | None]
 
 
 class RerunView:
-    """Viewer of all devices. Only one thread may use it. Every call returns at once.
+    """Viewer of all devices. Every call returns at once, and only one thread may use the viewer.
 
     Parameters
     ----------
@@ -87,7 +84,7 @@ class RerunView:
         return self._phase
 
     def start(self) -> None:
-        """Start the thread. Errors are reported in ``state`` and the attempt is repeated."""
+        """Start the thread of the viewer."""
         if self._settings.mode == "none" or self._thread is not None:
             return
         self._phase = "starting"
@@ -95,11 +92,11 @@ class RerunView:
         self._thread.start()
 
     def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
-        """Set the devices to show in detail. A device must be set before its first result is passed."""
+        """Set the devices to show in detail. Call this method before the first result of a new device."""
         self._devices = tuple(devices)
 
     def put(self, device: str, unix_s: float, result: Any) -> None:
-        """Draw a result.
+        """Queue a result to be drawn.
 
         Parameters
         ----------
@@ -130,7 +127,6 @@ class RerunView:
     # ---- methods of the thread ----
 
     def _run(self) -> None:
-        """Open the viewer and draw until closed. Reopen the viewer after a failure."""
         settings, attempt = self._settings, 0
         while not self._closing.is_set():
             started = time.monotonic()
@@ -151,7 +147,7 @@ class RerunView:
     def _wait_and_select_mode(
         self, settings: ViewerSettings, started: float, attempt: int
     ) -> tuple[ViewerSettings, int]:
-        """Wait before the next attempt. If a window does not work on this host, use the web page instead."""
+        """Wait before the next attempt, and select the web page if windows fail on this host."""
         self._stalled, self._inside_since, self.url = False, None, ""
         lived_s = time.monotonic() - started
         if self._closing.is_set():
@@ -163,7 +159,6 @@ class RerunView:
         return settings, attempt
 
     def _show(self, settings: ViewerSettings) -> None:
-        """Open a viewer and draw until the viewer ends."""
         from monitor.publishing.rerun import sinks
         from monitor.publishing.rerun import viewer_content as rerun_scene
 
@@ -177,7 +172,6 @@ class RerunView:
             output.close()
 
     def _send_layout(self, output: "RerunOutput", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
-        """Send the layout for the devices and create their entities."""
         from monitor.publishing.rerun import blueprint
 
         layout = blueprint.blueprint(devices, self._fleet)
@@ -186,7 +180,6 @@ class RerunView:
         self._phase = f"ok, but {output.note}" if output.note else "ok"
 
     def _draw_history(self, scene: "Scene", device: str) -> None:
-        """Draw the stored history of a device before its live data."""
         self._inside_since = None  # a slow disk must not count as a stalled viewer
         past = self._history_source(device)
         self._inside_since = time.monotonic()
@@ -194,7 +187,6 @@ class RerunView:
             scene.draw_history(device, past)
 
     def _draw(self, output: "RerunOutput", scene: "Scene") -> None:
-        """Draw new data until closed. Raise ViewerError if the viewer has ended."""
         waiting = _WaitingResults()
         shown: tuple[DeviceInfo, ...] | None = None
         begun: set[str] = set()
@@ -224,7 +216,7 @@ class RerunView:
             self._closing.wait(output.flush_every_s)
 
     def _confirm(self, output: "RerunOutput") -> None:
-        """Wait until all drawn data have reached the viewer. This limits the data held by Rerun to one second."""
+        """Wait until the viewer has received all drawn data, which limits the memory use of Rerun."""
         while not output.confirm_delivery(PATIENCE_S):
             self._stalled = not self._closing.is_set()
             output.check_viewer()
@@ -234,8 +226,6 @@ class RerunView:
 
 
 class _WaitingResults:
-    """Results that wait for their next drawing."""
-
     def __init__(self) -> None:
         self.period_factor = 1.0  # factor for the periods of drawings whose rate the devices share
         self._waiting: dict[DrawingRule, dict[str, list[TimedResult]]] = {
@@ -244,13 +234,11 @@ class _WaitingResults:
         self._drawn_s: dict[tuple[DrawingRule, str], float] = {}  # monotonic time of the last drawing of a device [s]
 
     def add_results(self, results: Sequence[tuple[str, float, Any]]) -> None:
-        """Add results, given by device, Unix time [s] and result."""
         for device, unix_s, result in results:
             for drawing in kind_of(result).drawings:
                 drawing.merge(self._waiting[drawing].setdefault(device, []), (unix_s, result))
 
     def draw_due_results(self, scene: "Scene", draw_all: bool) -> None:
-        """Draw the results whose period has passed, or all results if ``draw_all`` is True."""
         for drawing, devices in self._waiting.items():
             period_s = drawing.period_s * (self.period_factor if drawing.shares_rate else 1.0)
             for device in list(devices):
@@ -261,9 +249,9 @@ class _WaitingResults:
 
 
 def _load_rerun() -> None:
-    """Import Rerun and remove its exit handler, which waits without limit for a viewer that does not answer.
+    """Import Rerun and remove the exit handler of Rerun, which may block without limit.
 
-    Rerun reads RUST_LOG at import. By default its log would report every closed viewer as an error of this process.
+    Rerun reads RUST_LOG at import and would otherwise report every closed viewer as an error.
     """
     given = os.environ.get("RUST_LOG")
     os.environ["RUST_LOG"] = given or "off"

@@ -1,6 +1,6 @@
-"""Panels of the Rerun viewer. Each panel draws one kind of result of one device.
+"""Panels of the Rerun viewer, each of which draws one kind of result of one device.
 
-The kinds of results are listed in ``monitor.publishing.result_kinds``. Importing this module imports Rerun.
+``monitor.publishing.result_kinds`` lists the kinds of results. Importing this module imports Rerun.
 """
 
 from collections.abc import Sequence
@@ -64,7 +64,7 @@ WARNING_EVENTS: Final = frozenset({
 
 
 class Panel:
-    """Part of the viewer that draws one kind of result of one device.
+    """Base class of the panels that draw one kind of result of one device.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Panel:
 
     @classmethod
     def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
-        """Return the layout of a separate tab, or None if the panel is part of another tab."""
+        """Return the layout of a separate tab, or None if the panel has no tab."""
         return None
 
     def entity_path(self, name: str) -> str:
@@ -106,20 +106,18 @@ class Panel:
         return f"{self.device}/{name}"
 
     def _style_lines(self, name: str, lines: Sequence[tuple[str, Colour, float]]) -> None:
-        """Log the name, colour and width of each time series of an entity."""
         names, line_colours, widths = zip(*lines, strict=True)
         self.scene.log(
             self.entity_path(name), rr.SeriesLines(colors=line_colours, widths=widths, names=names), static=True
         )
 
     def _style_samples(self, name: str, axes: Sequence[str]) -> None:
-        """Log the styles of the time series of samples."""
         for axis in axes:
             line = (f"{axis}, {SAMPLE_UNITS[sensor_kind(axis)].name}", colours.AXIS_COLOURS[axis], 1.0)
             self._style_lines(f"{name}/{axis}", [line])
 
     def _log_samples(self, name: str, axes: Sequence[str], results: "Sequence[SampleRows | CompensatedRows]") -> Floats:
-        """Log decimated time series of samples, and return the times of all samples."""
+        """Log decimated samples, and return the times of all samples."""
         times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
         for i, axis in enumerate(axes):
             t, y = decimate_extremes(times, values[:, i])
@@ -128,13 +126,12 @@ class Panel:
         return times
 
     def _log_text(self, name: str, unix_s: float, text: str) -> None:
-        """Log a Markdown text at a Unix time [s]."""
         self.scene.set_log_time(unix_s)
         self.scene.log(self.entity_path(name), markdown_document(text))
 
 
 class SamplesPanel(Panel):
-    """Time series of the temperature and of the samples, with at most 200 rows per second and axis."""
+    """Time series of temperature and decimated samples."""
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
@@ -142,7 +139,7 @@ class SamplesPanel(Panel):
         self._style_lines("temperature", [("temperature, °C", colours.TEMPERATURE, 1.5)])
 
     def draw(self, unix_s: Floats, results: "Sequence[SampleRows]") -> None:
-        """Draw the results."""
+        """Draw samples."""
         times = self._log_samples("samples", AXES, results)
         temperature_c = np.concatenate([one.temperature_c for one in results])
         self.scene.log_scalars(
@@ -150,7 +147,7 @@ class SamplesPanel(Panel):
         )
 
     def draw_history(self, history: HistoryTable) -> None:
-        """Draw the stored history."""
+        """Draw the stored temperature."""
         temperature = history.column("temperature")
         if np.isfinite(temperature.last).any():
             at, values = past_points.history_points(history, temperature, temperature.last, temperature.last)
@@ -158,19 +155,19 @@ class SamplesPanel(Panel):
 
 
 class CompensatedPanel(Panel):
-    """Time series of the angular rates without drift, decimated like the samples."""
+    """Time series of the angular rates after drift removal, decimated for display."""
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
         self._style_samples("compensated", axes_of("gyro"))
 
     def draw(self, unix_s: Floats, results: "Sequence[CompensatedRows]") -> None:
-        """Draw the results."""
+        """Draw compensated angular rates."""
         self._log_samples("compensated", axes_of("gyro"), results)
 
 
 class DriftPanel(Panel):
-    """Means at rest, predicted drift, innovations, and a table of the drift models."""
+    """Time series of the gyroscope drift, with a table of the drift models."""
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
@@ -183,7 +180,7 @@ class DriftPanel(Panel):
             self._style_lines(f"innovation/{axis}", [(f"{axis}, σ", colour, 1.0)])
 
     def draw(self, unix_s: Floats, results: Sequence[DriftUpdate]) -> None:
-        """Draw the results."""
+        """Draw updates of the drift models."""
         for i, axis in enumerate(axes_of("gyro")):
             expected = np.array([one.expected[i] for one in results])
             half = Z95 * np.array([one.error[i] for one in results])
@@ -197,7 +194,7 @@ class DriftPanel(Panel):
 
     @classmethod
     def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
-        """Return the tab if the device has results of this kind."""
+        """Return the drift tab if the drift of the device is compensated."""
         if not device.compensated:
             return None
         name = device.name
@@ -216,7 +213,7 @@ class DriftPanel(Panel):
 
 
 class ThermalPanel(Panel):
-    """Mean bias of each axis, and its one-step prediction with the interval that events are based on."""
+    """Mean bias of each axis, and the one-step prediction with the interval that triggers events."""
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
@@ -229,7 +226,7 @@ class ThermalPanel(Panel):
             )
 
     def draw(self, unix_s: Floats, results: Sequence[ThermalIntervalResult]) -> None:
-        """Draw the results."""
+        """Draw measured and predicted biases."""
         for axis in AXES:
             rows = np.array([self._row(one.axes.get(axis)) for one in results])
             if np.isfinite(rows).any():
@@ -238,14 +235,14 @@ class ThermalPanel(Panel):
 
     @staticmethod
     def _row(one: PredictedAxisInterval | None) -> tuple[float, float, float, float]:
-        """Return measured bias, predicted bias, and the ends of its interval."""
+        """Return the measured bias, the predicted bias and the ends of the prediction interval."""
         if one is None or one.one_step is None:
             return (np.nan if one is None else one.bias), np.nan, np.nan, np.nan
         return one.bias, one.one_step.bias, one.one_step.lo, one.one_step.hi
 
     @classmethod
     def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
-        """Return the tab if the device has results of this kind."""
+        """Return the thermal tab if the bias of the device is predicted from temperature."""
         if not device.has_thermal:
             return None
         columns = []
@@ -258,7 +255,7 @@ class ThermalPanel(Panel):
 
 
 class GapPanel(Panel):
-    """Gap between measurement and noise model over time. The next Allan plot also draws the model."""
+    """Time series of the difference between measurement and noise model."""
 
     newest: ModelGap | None = None
 
@@ -269,7 +266,7 @@ class GapPanel(Panel):
         self._style_lines("gap/threshold", [("threshold", colours.blend_colours(colours.TEXT, 0.6), 1.0)])
 
     def draw(self, unix_s: Floats, results: Sequence[ModelGap]) -> None:
-        """Draw the results."""
+        """Draw comparisons with the noise model."""
         self.newest = results[-1]
         highest = [max((axis.threshold for axis in one.axes.values()), default=np.nan) for one in results]
         self.scene.log_scalars(self.entity_path("gap/threshold"), unix_s, np.array(highest))
@@ -280,7 +277,7 @@ class GapPanel(Panel):
 
 
 class AllanPanel(Panel):
-    """Allan plots, the table of coefficients, and the heat map of the Allan deviation over time."""
+    """Allan plots, tables of coefficients, and heat maps of the Allan deviation over time."""
 
     def __init__(self, scene: "Scene", device: str) -> None:
         super().__init__(scene, device)
@@ -288,7 +285,7 @@ class AllanPanel(Panel):
         self._history = AllanHistory()
 
     def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
-        """Draw the results."""
+        """Draw the newest estimate."""
         at_s, estimate = float(unix_s[-1]), results[-1]
         self._log_text("coefficients", at_s, noise_text(estimate))
         self._plot.draw(estimate, self.scene.get_or_create_panel(self.device, GapPanel).newest)
@@ -297,7 +294,7 @@ class AllanPanel(Panel):
 
 
 class CoefficientsPanel(Panel):
-    """Time series of the coefficients. Only the points of an estimate have intervals."""
+    """Time series of the noise coefficients with intervals."""
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
@@ -313,7 +310,7 @@ class CoefficientsPanel(Panel):
                 self.scene.log(self.entity_path(f"coefficients/{symbol}/{axis}/changed"), mark, static=True)
 
     def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
-        """Draw the results."""
+        """Draw the coefficients of estimates."""
         parts = [_points_until(at_s, estimate) for at_s, estimate in zip(unix_s.tolist(), results, strict=True)]
         times, values = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
         for row, symbol in enumerate(SYMBOLS):
@@ -322,7 +319,7 @@ class CoefficientsPanel(Panel):
                     self.log_coefficient(symbol, axis, times, values[:, row, column])
 
     def draw_history(self, history: HistoryTable) -> None:
-        """Draw the stored history."""
+        """Draw the stored coefficients."""
         for symbol in SYMBOLS:
             for axis in history.axes():
                 value, lo, hi = (history.column(f"{axis}.{symbol}{end}") for end in ("", ".lo", ".hi"))
@@ -331,7 +328,7 @@ class CoefficientsPanel(Panel):
                     self.log_coefficient(symbol, axis, at, values)
 
     def log_coefficient(self, symbol: str, axis: str, unix_s: Floats, values: Floats, name: str = "") -> None:
-        """Log a coefficient over time.
+        """Log a noise coefficient over time.
 
         Parameters
         ----------
@@ -351,10 +348,10 @@ class CoefficientsPanel(Panel):
 
 
 class EventsPanel(Panel):
-    """Log of the events of a device and of all devices. A diamond marks the new value of a changed coefficient."""
+    """Log of events. A diamond marks the new value of a changed coefficient."""
 
     def draw(self, unix_s: Floats, results: Sequence[Event]) -> None:
-        """Draw the results."""
+        """Log events and mark changed coefficients."""
         for at_s, event in zip(unix_s.tolist(), results, strict=True):
             level = "ERROR" if event.kind == "link_lost" else "WARN" if event.kind in WARNING_EVENTS else "INFO"
             clock_time = format_utc(at_s)[-8:]  # the date column of the viewer is too narrow for the time
@@ -367,13 +364,12 @@ class EventsPanel(Panel):
                 self._mark_changes(at_s, event)
 
     def draw_history(self, history: HistoryTable) -> None:
-        """Draw the stored history."""
+        """Log the stored events."""
         for one in history.events[-MAX_PAST_EVENTS:]:
             text = f"{format_utc(one.t_s)[:10]}: {one.text}"  # a log line otherwise shows only the time of day
             self.draw(np.array([one.t_s]), [Event(one.kind, round(one.t_s * 1e9), text, one.axis, one.what)])
 
     def _mark_changes(self, unix_s: float, event: Event) -> None:
-        """Mark the new values of changed coefficients."""
         if event.axis is None:
             return
         coefficients = self.scene.get_or_create_panel(self.device, CoefficientsPanel)
@@ -384,10 +380,10 @@ class EventsPanel(Panel):
 
 
 class HealthPanel(Panel):
-    """Health of the device, and the table of all devices."""
+    """Health of the device as text."""
 
     def draw(self, unix_s: Floats, results: Sequence[Health]) -> None:
-        """Draw the results."""
+        """Draw the newest health of the device."""
         at_s, health, devices = float(unix_s[-1]), results[-1], self.scene.devices
         if self.device in devices:
             self.scene.healths[self.device] = health
@@ -403,11 +399,11 @@ class DeviceTablePanel(Panel):
     """Table of all devices."""
 
     def draw(self, unix_s: Floats, results: "Sequence[DeviceTableText]") -> None:
-        """Draw the results."""
+        """Draw the newest table of devices."""
         self.log_device_table(float(unix_s[-1]), results[-1].text)
 
     def log_device_table(self, unix_s: float, text: str) -> None:
-        """Log the table.
+        """Log the table of devices.
 
         Parameters
         ----------
@@ -421,9 +417,9 @@ class DeviceTablePanel(Panel):
 
 
 def _points_until(unix_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
-    """Return times [n] and coefficients with interval ends [n, 5, 6, 3] since the previous estimate.
+    """Return times [n] and coefficients [n, 5, 6, 3] since the previous estimate.
 
-    Only the newest coefficients have intervals.
+    Only the newest coefficients have confidence intervals.
     """
     c, history = estimate.coefficients, estimate.history
     newest = np.stack([c.value, *omit_wide_intervals(c.value, c.lo, c.hi)], axis=-1)

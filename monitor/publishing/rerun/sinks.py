@@ -1,13 +1,11 @@
-"""Outputs of a Rerun stream: a viewer window, a page in the browser, or a file.
+"""Outputs of a Rerun stream, which are a viewer window, a web page or a file.
 
-``open_output`` returns an ``RerunOutput``: a Rerun stream and the child process that belongs to it. The message of a
-``ViewerError`` states the problem in one line, and the caller repeats the attempt later. The viewer program is started
-directly, because its Python wrapper would leave the program running when killed. The program listens on the loopback
-interface only, and usage statistics are off. For the daemon, a window and a page are both a Rerun server in a separate
-process. The data of the viewer therefore do not use the memory of the daemon. Importing this module imports Rerun.
+A window and a web page use a Rerun server in a separate process, so that viewer data do not use the memory of the
+daemon. The viewer program is started directly, because the Python wrapper would leave the program running when killed.
+The program listens only on the loopback interface and sends no usage statistics.
 
-Rerun raises no error for a port that is in use, so ports are checked first. If a Rerun server listens on the port, this
-server is used instead of a new window. Any other listener is an error. The web page uses the next free port.
+Rerun raises no error for a port in use, so ports are checked first. A window joins a Rerun server that already listens
+on the port. The web page uses the next free port. Importing this module imports Rerun.
 """
 
 import contextlib
@@ -52,7 +50,7 @@ def has_desktop() -> bool:
 
 
 class ViewerProcess:
-    """Viewer process and the last line of its log."""
+    """Process of the viewer program, with access to the last log line."""
 
     def __init__(self, arguments: list[str]) -> None:
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
@@ -71,16 +69,18 @@ class ViewerProcess:
         return self._process.pid
 
     def exit_reason(self) -> str | None:
-        """Return why the process has ended, or None if the process is running."""
+        """Return the reason why the process has ended, or None if the process is running."""
         status = self._process.poll()
         return None if status is None else f"viewer ended ({status}): {self._last_log_line()}"
 
     def exited_normally(self) -> bool:
-        """Return True if the process ended normally, as after its window was closed."""
+        """Return True if the process ended normally, for example because a user closed the window."""
         return self._process.poll() == 0
 
     def terminate(self, timeout_s: float = 0.5) -> None:
-        """Terminate the process. Kill it after ``timeout_s`` seconds, because a stopped process ignores SIGTERM."""
+        """Terminate the process. Kill the process after ``timeout_s`` seconds, because a stopped process ignores
+        SIGTERM.
+        """
         with contextlib.suppress(OSError):
             self._process.terminate()
         try:
@@ -95,7 +95,6 @@ class ViewerProcess:
         self._process.kill()
 
     def _last_log_line(self) -> str:
-        """Return the last line of the viewer's log."""
         self._log.seek(0)
         lines = self._log.read()[-2000:].decode(errors="replace").strip().splitlines()
         return lines[-1].strip()[:200] if lines else "no message"
@@ -103,7 +102,7 @@ class ViewerProcess:
 
 @dataclass
 class RerunOutput:
-    """Open viewer or file."""
+    """Rerun stream with the viewer process or the file that receives the data."""
 
     stream: rr.RecordingStream
     flush_every_s: float
@@ -114,7 +113,7 @@ class RerunOutput:
     lock: IO[bytes] | None = None  # lock against other processes that write the file
 
     def check_viewer(self) -> None:
-        """Check that the viewer is still open.
+        """Raise an exception if the viewer has ended.
 
         Raises
         ------
@@ -132,9 +131,9 @@ class RerunOutput:
             raise ViewerError(trouble)
 
     def confirm_delivery(self, timeout_s: float) -> bool:
-        """Return True if all logged data were sent within ``timeout_s`` seconds and the viewer answers.
+        """Return True if the viewer has received all logged data within ``timeout_s`` seconds.
 
-        Sending alone is not sufficient, because the sockets of a stopped viewer accept two more megabytes.
+        A completed send does not prove delivery, because the sockets of a stopped viewer accept two more megabytes.
         """
         try:
             self.stream.flush(timeout_sec=timeout_s)
@@ -143,7 +142,7 @@ class RerunOutput:
         return self.port is None or _grpc_call(self.port, "/imu.monitor/Ping", timeout_s) is not None
 
     def close(self) -> None:
-        """Complete the file, or end the viewer process that belongs to this output."""
+        """Complete the file, or end the viewer process."""
         try:
             if self.child is not None:
                 self.child.terminate()
@@ -165,16 +164,16 @@ def viewer_program_path() -> Path:
 
 
 def _death_signal_prefix() -> list[str]:
-    """Return a command prefix that ends a program when the thread that started it ends (Linux only).
+    """Return a command prefix that ends a program when the starting thread ends (Linux only).
 
-    Without the program ``setpriv`` (util-linux), a viewer outlives a killed daemon.
+    Without the program ``setpriv`` (util-linux), the viewer outlives a killed daemon.
     """
     setpriv = shutil.which("setpriv") if sys.platform == "linux" else None
     return [] if setpriv is None else [setpriv, "--pdeathsig", "TERM", "--"]
 
 
 def is_listening(port: int) -> bool:
-    """Return True if a program accepts connections on this port of the loopback interface."""
+    """Return True if a program accepts connections on a port of the loopback interface."""
     with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), 0.5):
         return True
     return False
@@ -183,14 +182,14 @@ def is_listening(port: int) -> bool:
 def is_rerun_server(port: int) -> bool:
     """Return True if a Rerun server answers on the port.
 
-    Other gRPC servers answer a call of the Rerun service with "unimplemented" (status 12).
+    Other gRPC servers answer a Rerun call with "unimplemented" (status 12).
     """
     reply = _grpc_call(port, PROBE_METHOD, 1.0)
     return reply is not None and "grpc" in reply.get("content-type", "") and reply.get("grpc-status") != "12"
 
 
 def _grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
-    """Return the headers of the reply to an empty gRPC call on the loopback interface, or None without a reply."""
+    """Return the headers of the reply to an empty gRPC call, or None without a reply."""
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=timeout_s)
     headers = {"content-type": "application/grpc-web+proto", "x-grpc-web": "1"}
     try:
@@ -203,7 +202,7 @@ def _grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
 
 
 def find_free_port(first_port: int, skipped_port: int | None = None) -> int:
-    """Return the first free port from ``first_port`` on.
+    """Return the first free port, starting at a given port.
 
     Parameters
     ----------
@@ -224,7 +223,6 @@ def find_free_port(first_port: int, skipped_port: int | None = None) -> int:
 
 
 def _bindable(port: int) -> bool:
-    """Return True if the port can be bound."""
     with socket.socket() as probe:
         if os.name == "posix":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -236,7 +234,7 @@ def _bindable(port: int) -> bool:
 
 
 def open_output(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
-    """Open the output that the settings select, and wait until it listens.
+    """Open the output that the settings select, and wait until the viewer listens.
 
     Parameters
     ----------
@@ -262,7 +260,6 @@ def open_output(settings: ViewerSettings, recording_id: str, should_stop: Callab
 
 
 def _open_file(path: Path, recording_id: str) -> RerunOutput:
-    """Open and lock a file."""
     try:
         if path.exists():
             check_regular(path)  # opening a FIFO would block until a reader opens it
@@ -289,7 +286,6 @@ def _open_file(path: Path, recording_id: str) -> RerunOutput:
 
 
 def _open_native(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
-    """Join the Rerun server on the port, or open a window."""
     port = settings.port
     if is_listening(port):
         if not is_rerun_server(port):
@@ -309,7 +305,6 @@ def _open_native(settings: ViewerSettings, recording_id: str, should_stop: Calla
 
 
 def _open_web(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
-    """Start a Rerun server with a web page, and open the page if there is a desktop."""
     port = find_free_port(settings.port)
     web_port = find_free_port(settings.web_port, skipped_port=port)
     child = ViewerProcess([
@@ -327,7 +322,7 @@ def _open_web(settings: ViewerSettings, recording_id: str, should_stop: Callable
 
 
 def _add_program_memory(memory: str) -> str:
-    """Return the memory limit of a viewer window: the limit for data plus PROGRAM_MIB. A percentage is not changed.
+    """Return the memory limit of a viewer window, which is the limit for data plus PROGRAM_MIB.
 
     >>> _add_program_memory("256MiB"), _add_program_memory("1GiB"), _add_program_memory("25%")
     ('512MiB', '1280MiB', '25%')
@@ -345,18 +340,16 @@ def server_url(port: int) -> str:
 
 
 def _connected(port: int, recording_id: str, child: ViewerProcess | None = None) -> RerunOutput:
-    """Return an output that is connected to a Rerun server."""
     stream = _stream(recording_id)
     stream.set_sinks(rr.GrpcSink(server_url(port)))
     return RerunOutput(stream, LIVE_FLUSH_PERIOD_S, server_url(port), child, port)
 
 
 def _stream(recording_id: str) -> rr.RecordingStream:
-    """Create a stream whose only timeline is ``sample_time`` and which is never freed.
+    """Create a Rerun stream that is never freed.
 
-    Freeing a stream waits for its viewer and holds a lock that all streams of the process need. If the viewer ended
-    meanwhile, the next viewer and the exit of the process would be blocked. The additional reference costs a few
-    kilobytes for each opened viewer.
+    Freeing a stream waits for the viewer while holding a lock that all streams need. If the viewer has ended, the next
+    viewer and the exit of the process would block. The leak costs a few kilobytes for each opened viewer.
     """
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
@@ -366,7 +359,7 @@ def _stream(recording_id: str) -> rr.RecordingStream:
 
 
 def _wait_for(port: int, child: ViewerProcess, should_stop: Callable[[], bool]) -> None:
-    """Wait until the viewer listens. If the viewer does not listen in time, end it and raise ViewerError."""
+    """Wait until the viewer listens. Terminate the viewer and raise ViewerError after a timeout."""
     end = time.monotonic() + START_TIMEOUT_S
     while time.monotonic() < end and not should_stop():
         trouble = child.exit_reason()

@@ -1,8 +1,7 @@
-"""Content of the Rerun viewer: the panels of all devices, which log their results as entities of one stream.
+"""Content of the Rerun viewer, which consists of panels that log results to one stream.
 
-Results are logged as columns and drawings under the paths listed in the README, on the timeline ``sample_time``. A call
-may block in Rerun while the viewer does not read. Only the thread of the viewer may therefore call this module.
-Importing this module imports Rerun, which takes half a second.
+Only the thread of the viewer may call this module, because a call may block while the viewer does not read. Importing
+this module imports Rerun.
 """
 
 from collections.abc import Sequence
@@ -28,7 +27,7 @@ PANELS: tuple[type[Panel], ...] = tuple(
 
 
 class Scene:
-    """Panels of all devices in one Rerun stream. The class is not thread-safe, and its methods may block.
+    """Panels of all devices in one Rerun stream. The class is not thread-safe, and methods may block.
 
     Parameters
     ----------
@@ -46,7 +45,7 @@ class Scene:
         self._panels: dict[tuple[str, type[Panel]], Panel] = {}
 
     def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
-        """Set the devices to show. Later data of a removed device are still drawn."""
+        """Set the devices to show."""
         self.devices = {one.name: one for one in devices}
         self.healths = {name: health for name, health in self.healths.items() if name in self.devices}
         for name in self.devices:
@@ -54,7 +53,7 @@ class Scene:
                 self.get_or_create_panel(name, kind).log_styles()
 
     def get_or_create_panel(self, device: str, kind: type[P]) -> P:
-        """Return a panel of a device. Create the panel if it does not exist.
+        """Return a panel of a device, and create the panel if it does not exist.
 
         Parameters
         ----------
@@ -69,7 +68,7 @@ class Scene:
         return found
 
     def draw(self, device: str, panel: str, results: Sequence[TimedResult]) -> None:
-        """Draw results of a device.
+        """Draw results of a device in a panel.
 
         Parameters
         ----------
@@ -86,9 +85,7 @@ class Scene:
         )
 
     def draw_history(self, device: str, history: HistoryTable) -> None:
-        """Draw the stored history of a device.
-
-        A line has a gap where buckets are missing. After the last bucket, live data form a separate line.
+        """Draw the stored history of a device, separated from later live data.
 
         Parameters
         ----------
@@ -136,5 +133,4 @@ class Scene:
 
 
 def _timestamps(unix_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":
-    """Convert Unix times in seconds to nanosecond timestamps."""
     return np.round(unix_s * 1e9).astype("datetime64[ns]")

@@ -1,14 +1,14 @@
-"""Settings and errors of the viewer, and descriptions of its devices. This module does not import Rerun."""
+"""Settings and errors of the viewer, and descriptions of devices. This module does not import Rerun."""
 
 from dataclasses import dataclass
 
 
 class ViewerError(Exception):
-    """The viewer cannot be opened or has ended. The message is one line for the user."""
+    """Error of a viewer that cannot be opened or has ended. The message is one line for the user."""
 
 
 class ViewerClosed(ViewerError):
-    """A user has closed the window, so the program must not open it again."""
+    """Error of a window that a user has closed and that must not be opened again."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Tables of the coefficients of one device with their intervals, for ``analyze`` and for ``watch``."""
+"""Tables of the noise coefficients of one device with intervals, for ``analyze`` and ``watch``."""
 
 from collections.abc import Collection
 from typing import Final
@@ -24,7 +24,7 @@ K_OR_R: Final = "K or R"
 
 
 def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()) -> RenderableType:
-    """Return the table of coefficients with intervals for ``analyze``.
+    """Return the table of noise coefficients with intervals for ``analyze``.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()
 def coefficient_tables(
     coefficients: DeviceCoefficients, axes_of_temperature: Collection[str] = ()
 ) -> list[RenderableType]:
-    """Return a legend and a table for each kind of sensor, with a row for each axis and a column for each coefficient.
+    """Return a legend, and a table of noise coefficients for each kind of sensor.
 
     Parameters
     ----------
@@ -61,7 +61,6 @@ def coefficient_tables(
 
 
 def _kind_table(known: DeviceCoefficients, kind: Kind, stacked: bool, axes_of_temperature: Collection[str]) -> Table:
-    """Return the table of one kind of sensor. Intervals are below the values if ``stacked``, else beside the values."""
     table = plain_table(kind if stacked else KIND_NAMES[kind])
     for symbol in SYMBOLS:
         table.add_column(f"{symbol} {COEFFICIENT_UNITS[kind][symbol].name}", justify="right", no_wrap=True)
@@ -73,7 +72,6 @@ def _kind_table(known: DeviceCoefficients, kind: Kind, stacked: bool, axes_of_te
 
 
 def _cell(known: DeviceCoefficients, symbol: str, axis: str, separator: str) -> Text:
-    """Return value and interval of one coefficient, with K_OR_R if the coefficient is ambiguous."""
     one = format_coefficient(known.coefficients, symbol, axis)
     small = [f"[{one.interval}]"] if one.interval else []
     if axis in known.k_or_r and symbol in ("K", "R"):

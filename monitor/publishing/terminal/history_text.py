@@ -1,7 +1,6 @@
-"""History of a device as text for the terminal: tables of coefficients, sparklines and events.
+"""History of a device as text for the terminal, with tables, sparklines and events.
 
-A sparkline shows bucket means as characters of eight heights, and a dot where the device sent no data. The extremes are
-printed beside the sparkline. The only side effect is printing on the given console.
+A sparkline shows bucket means as characters of eight heights. A dot marks an interval in which the device sent no data.
 """
 
 import math
@@ -40,7 +39,7 @@ MAX_EVENTS: Final = 20
 
 
 def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str, ...], console: Console) -> None:
-    """Print a summary with one line for each axis and coefficient, then the status and the events.
+    """Print a summary of the history with one line for each axis and coefficient, the status and the events.
 
     Parameters
     ----------
@@ -64,7 +63,7 @@ def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str,
 
 
 def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], console: Console) -> None:
-    """Print one axis over time, with one line for each bucket and the extremes of each coefficient.
+    """Print the history of one axis with one line for each time bucket.
 
     Parameters
     ----------
@@ -97,7 +96,6 @@ def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], 
 
 
 def _print_events(past: HistoryTable, console: Console) -> None:
-    """Print the newest MAX_EVENTS events."""
     if not past.events:
         return
     shown = past.events[-MAX_EVENTS:]
@@ -111,7 +109,7 @@ def _print_events(past: HistoryTable, console: Console) -> None:
 
 
 def summary_line(past: HistoryTable) -> str:
-    """Return one line with device, time range, number of rows and number of samples."""
+    """Return one line with the device, the time range, the number of rows and the number of samples."""
     samples = int(past.counts[:, COUNTS.index("received")].sum())
     if not len(past):
         return f"{past.device}: no rows between {format_utc(past.span.start_s)} and {format_utc(past.span.end_s)} UTC"
@@ -126,7 +124,6 @@ def summary_line(past: HistoryTable) -> str:
 
 
 def _temperature_and_loss_lines(past: HistoryTable) -> list[str]:
-    """Return lines with temperature range, lost samples, and the time during which the device was not running."""
     lines = []
     temperature = past.column("temperature")
     if temperature.n.any():
@@ -144,7 +141,7 @@ def _temperature_and_loss_lines(past: HistoryTable) -> list[str]:
 
 
 def sparkline(values: Floats, t_s: Floats, range_s: tuple[float, float], width: int = SPARKLINE_WIDTH) -> str:
-    """Return values between two times as text. Each character shows the mean of a time interval.
+    """Return values between two times as text, with one character for the mean of each time interval.
 
     >>> steps = np.arange(8.0)
     >>> sparkline(steps, 60.0 * steps, (0.0, 480.0), 8)
@@ -174,7 +171,6 @@ def sparkline(values: Floats, t_s: Floats, range_s: tuple[float, float], width: 
 
 
 def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str, ...]) -> Table:
-    """Return a table with first, last, lowest and highest value and a sparkline for each axis and coefficient."""
     table = plain_table(KIND_NAMES[kind])
     for name in ("first", "last", "lowest", "highest"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -195,7 +191,6 @@ def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str
 
 
 def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
-    """Return the cells of a coefficient without estimates: the last upper bound and two dashes."""
     bound, unit = past.column(f"{axis}.{symbol}.bound"), unit_of(symbol, axis)
     there = bound.last[np.isfinite(bound.last)]
     if not there.size:
@@ -204,7 +199,6 @@ def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
 
 
 def _cell(past: HistoryTable, axis: str, symbol: str, p: int) -> str:
-    """Format a coefficient in one bucket: the last value with the extremes if they differ, or the upper bound."""
     column, unit = past.column(f"{axis}.{symbol}"), unit_of(symbol, axis)
     low, high, last = (float(part[p]) * unit.factor for part in (column.low, column.high, column.last))
     if math.isfinite(last):
@@ -215,5 +209,4 @@ def _cell(past: HistoryTable, axis: str, symbol: str, p: int) -> str:
 
 
 def _extremes(column: ColumnStatistics) -> tuple[float, float]:
-    """Return the minimum and maximum over all buckets."""
     return float(np.nanmin(column.low)), float(np.nanmax(column.high))

@@ -1,12 +1,11 @@
-"""Text output to a terminal, a pipe or a file by a separate thread, so that no other thread waits for the reader.
+"""Text output to a terminal, a pipe or a file in a separate thread, so that a blocked output delays no other thread.
 
-A write blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) and while no program reads a pipe. A write
-fails while a disk is full. ``QueuedWriter`` accepts lines on a bounded queue that drops its oldest lines, and can
-redraw a frame (a table) periodically. Lost lines and frames are counted and reported in ``state``.
-``QueuedWriter.close`` returns after a deadline.
+A write blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) or no program reads a pipe.
+``QueuedWriter`` queues lines, drops the oldest lines of a full queue, and can redraw a table periodically. ``state``
+reports the number of lost lines and frames.
 
-The thread writes to the file descriptor and not to the Python stream. A blocked write to ``sys.stdout`` would hold the
-lock of the stream, and the interpreter aborts at exit if it cannot take this lock.
+The thread writes to the file descriptor, because a blocked write to ``sys.stdout`` holds the lock of the stream. The
+interpreter aborts at exit if this lock is held.
 """
 
 import contextlib
@@ -39,7 +38,7 @@ Render = Callable[[Sequence[str], bool], str]
 
 
 class QueuedWriter:
-    """Thread that writes text to a stream which may block.
+    """Thread that writes text to a stream without blocking the caller.
 
     Parameters
     ----------
@@ -119,21 +118,20 @@ class QueuedWriter:
         self._queue.push(text, len(text))
 
     def request_redraw(self) -> None:
-        """Call ``render`` soon, without waiting for the end of the period."""
+        """Request a call of ``render`` before the end of the period."""
         self._queue.wake()
 
     def wait_until_written(self, stop: threading.Event) -> None:
-        """Write all queued text. Wait until the text is written or ``stop`` is set."""
+        """End the thread, and wait until all queued text is written or ``stop`` is set."""
         self._begin_closing()
         while self._thread.is_alive() and not stop.is_set():
             self._thread.join(0.1)
 
     def close(self, timeout_s: float = CLOSE_S) -> bool:
-        """Write all queued text and end the thread.
+        """Write all queued text and end the thread. Return False if the destination is still blocked after
+        ``timeout_s``.
 
-        If the destination is still blocked after the deadline, its descriptor is replaced with the null device, so that
-        the interpreter cannot block on it at exit. Return False if the destination was still blocked after
-        ``timeout_s`` seconds.
+        A blocked descriptor is replaced with the null device, so that the interpreter cannot block at exit.
         """
         self._begin_closing()
         if self._thread.is_alive() and not self._given_up:
@@ -146,7 +144,6 @@ class QueuedWriter:
     # --- methods of the thread
 
     def _run(self) -> None:
-        """Write queued lines and frames until the writer is closed."""
         while True:
             closing = self._closing.is_set()  # read before the queue, so that lines queued before close() are written
             lines = self._queue.take(0.0 if closing else self._period_s or IDLE_WAIT_S)
@@ -160,7 +157,6 @@ class QueuedWriter:
                 return
 
     def _process_batch(self, lines: list[str], last: bool) -> None:
-        """Render and write one batch of lines."""
         if not lines and not last and self._period_s is None:
             return
         dropped = self._dropped_lines()
@@ -179,7 +175,6 @@ class QueuedWriter:
             self._write_since_s = None
 
     def _rendered(self, lines: list[str], last: bool) -> tuple[str, Exception | None]:
-        """Return the rendered text, or the plain lines and the error of the rendering."""
         try:
             return self._render(lines, last), None
         except Exception as error:  # noqa: BLE001 - a frame that cannot be drawn must not end the log; shown in state
@@ -187,7 +182,6 @@ class QueuedWriter:
             return "".join(lines), error
 
     def _write(self, text: str) -> None:
-        """Write the text in chunks, and count the frames that are lost while the destination is blocked."""
         if self._stream is None or not text:
             return
         self._write_since_s = time.monotonic()
@@ -208,7 +202,7 @@ class QueuedWriter:
             self._write_since_s = time.monotonic()
 
     def _tell_dropped(self, dropped: int) -> None:
-        """Report dropped lines. The queue has space for the report, because it has just been emptied."""
+        """Report dropped lines. The queue was just emptied and has space for the report."""
         count = dropped - self._told_lines
         if count and self._tell is not None:
             self._told_lines = dropped
@@ -220,27 +214,24 @@ class QueuedWriter:
     # --- counting
 
     def _blocked_s(self) -> float:
-        """Return the duration of a blocked write call [s], or 0 if no call is blocked."""
+        """Return the duration of the blocked write call [s], or 0 if no call is blocked."""
         since_s = self._write_since_s
         blocked_s = 0.0 if since_s is None else time.monotonic() - since_s
         return blocked_s if blocked_s >= BLOCKED_S else 0.0
 
     def _frames_in(self, blocked_s: float) -> int:
-        """Return the number of frames that are lost in this time."""
         return 0 if self._period_s is None else int(blocked_s / self._period_s)
 
     def _dropped_lines(self) -> int:
-        """Return the number of lines that were dropped or could not be written."""
         return self._queue.dropped + self._lost_lines
 
     def _begin_closing(self) -> None:
-        """Make the thread write the remaining lines and end."""
         self._closing.set()
         self._queue.push("", 0)  # unlike wake(), an entry is not lost if the thread does not wait yet
 
 
 class QueuedLines(io.TextIOBase):
-    """Text stream that passes whole lines to a ``QueuedWriter``. It replaces ``sys.stderr``."""
+    """Text stream that passes whole lines to a ``QueuedWriter`` and replaces ``sys.stderr``."""
 
     def __init__(self, writer: QueuedWriter, terminal: bool) -> None:
         self._writer = writer
@@ -249,7 +240,7 @@ class QueuedLines(io.TextIOBase):
         self._lock = threading.RLock()  # a warning during garbage collection may call write() again
 
     def write(self, text: str) -> int:
-        """Queue the complete lines and return at once."""
+        """Queue complete lines and return at once."""
         with self._lock:
             *lines, self._partial = (self._partial + text).split("\n")
             if len(self._partial) > MAX_QUEUED_CHARACTERS:
@@ -264,7 +255,7 @@ class QueuedLines(io.TextIOBase):
 
 
 def descriptor_of(stream: TextIO | None) -> int | None:
-    """Return the file descriptor of a stream, or None for a stream without descriptor."""
+    """Return the file descriptor of a stream, or None if the stream has no descriptor."""
     try:
         descriptor = -1 if stream is None else stream.fileno()
     except (OSError, ValueError):
@@ -273,7 +264,7 @@ def descriptor_of(stream: TextIO | None) -> int | None:
 
 
 def redirect_to_null_device(stream: TextIO | None) -> None:
-    """Redirect the descriptor of a stream to the null device, so that no later write can block."""
+    """Redirect the file descriptor of a stream to the null device, so that later writes cannot block."""
     descriptor = descriptor_of(stream)
     if descriptor is not None:
         with (
@@ -301,7 +292,6 @@ def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
 
 
 def _reason(error: Exception) -> str:
-    """Return the text of an error for a message."""
     if isinstance(error, OSError):
         return error.strerror or errno.errorcode.get(error.errno or 0, str(error))
     return f"{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""Helpers for tables in the terminal."""
+"""Functions and classes for tables in the terminal."""
 
 from collections.abc import Iterable, Sequence
 
@@ -37,7 +37,7 @@ def print_notes(notes: Iterable[str], console: Console) -> None:
 
 
 def unwrapped_table_width(table: Table, console: Console, options: ConsoleOptions) -> int:
-    """Return the width that a table needs without wrapping.
+    """Return the width that a table needs without wrapped lines.
 
     Parameters
     ----------
@@ -50,12 +50,11 @@ def unwrapped_table_width(table: Table, console: Console, options: ConsoleOption
 
 
 class WidthDependentTable:
-    """Pair of tables. The wide table is shown if it fits the terminal, and the narrow table otherwise."""
+    """Pair of tables, of which the wide table is shown if the wide table fits the terminal."""
 
     def __init__(self, wide: Table, narrow: Table) -> None:
         self._wide = wide
         self._narrow = narrow
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield one of the two tables."""
         yield self._wide if unwrapped_table_width(self._wide, console, options) <= options.max_width else self._narrow

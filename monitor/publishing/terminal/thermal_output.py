@@ -53,7 +53,7 @@ def print_thermal_fit(report: ThermalFitReport, console: Console) -> None:
 
 
 def print_thermal_prediction(report: ThermalPredictionReport, console: Console) -> None:
-    """Print the predictions of thermal models for a recording, and their errors.
+    """Print the predictions of thermal models for a recording and the prediction errors.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def print_thermal_prediction(report: ThermalPredictionReport, console: Console) 
 
 
 def temperature_notes(removal: TemperatureRemoval) -> list[str]:
-    """Return a sentence for each axis on which temperature explains most of the slow variance, or much of K or R."""
+    """Return a note for each axis on which temperature explains much of the slow variance, or of K or R."""
     notes = []
     for axis, one in removal.dependences.items():
         fallen = [
@@ -105,7 +105,7 @@ def temperature_notes(removal: TemperatureRemoval) -> list[str]:
 
 
 def notes_on_hysteresis(report: ThermalFitReport) -> list[str]:
-    """Return a sentence for each axis on which the bias differs significantly between heating and cooling."""
+    """Return a note for each axis on which the bias differs significantly between heating and cooling."""
     return [
         f"{axis}: at one temperature the bias differs between heating and cooling by up to "
         f"{format_rate(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
@@ -143,13 +143,12 @@ def encode_thermal_fit(report: ThermalFitReport) -> bytes:
 
 
 def encode_thermal_prediction(report: ThermalPredictionReport) -> bytes:
-    """Encode predictions and measured means as JSON, in SI units."""
+    """Encode thermal predictions and measured interval means as JSON, in SI units."""
     axes = {axis: _prediction_of_axis(report.means[axis], one) for axis, one in report.judged.items()}
     return _json(PREDICT_SCHEMA, report.recording, report.interval_s, axes, report.refused, report.notes)
 
 
 def _prediction_of_axis(means: IntervalMeans, one: ComparisonWithMeans) -> dict[str, Any]:
-    """Return the prediction errors and the predicted and measured bias of one axis."""
     return {
         "rms": one.rms,
         "rms_offset_out": one.rms_without_offset,
@@ -167,7 +166,6 @@ def _prediction_of_axis(means: IntervalMeans, one: ComparisonWithMeans) -> dict[
 def _json(
     schema: str, recording: str, interval_s: float, axes: dict[str, Any], refused: Any, notes: tuple[str, ...]
 ) -> bytes:
-    """Encode the common keys and the results of the axes."""
     whole = {
         "schema": schema,
         "recording": recording,
@@ -180,7 +178,6 @@ def _json(
 
 
 def _summary_line(recording: str, interval_s: float, means: Any) -> str:
-    """Return one line with the recording, the number and length of the intervals, and the temperature range."""
     first: IntervalMeans = next(iter(means.values()))
     count = first.bias.size
     warmth = first.temperature_c
@@ -189,7 +186,6 @@ def _summary_line(recording: str, interval_s: float, means: Any) -> str:
 
 
 def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
-    """Return the cells of one fitted axis."""
     model, best = one.model, one.candidates[0]
     cubic = next((each.validated for each in one.candidates if each.shape == ThermalModelForm(3, ())), None)
     return (
@@ -204,12 +200,10 @@ def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
 
 
 def _format_deviation(axis: str, si: float) -> str:
-    """Format a rate or an acceleration in the unit of the axis."""
     return DEVIATION_UNITS[sensor_kind(axis)].text(si)
 
 
 def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:
-    """Print the reasons for axes without a model, and the notes."""
     for axis, reason in refused.items():
         console.print(f"{axis}: {reason}", highlight=False, soft_wrap=True)
     print_notes(notes, console)

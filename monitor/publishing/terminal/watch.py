@@ -1,4 +1,4 @@
-"""``imu-monitor watch``: the table of all devices that daemons publish over zenoh."""
+"""Command ``imu-monitor watch``, which shows a table of all devices that daemons publish over zenoh."""
 
 import contextlib
 import threading
@@ -30,9 +30,9 @@ def watch(
     once_s: float | None = None,
     file: Path | None = None,
 ) -> None:
-    """Show the table until ``stop`` is set or Ctrl-C is pressed.
+    """Show the table of devices until ``stop`` is set or Ctrl-C is pressed.
 
-    The table is written by a separate thread. A blocked terminal or pipe delays neither messages nor the exit.
+    A separate thread writes the table, so that a blocked terminal or pipe delays neither messages nor the exit.
 
     Parameters
     ----------
@@ -83,7 +83,6 @@ def watch(
 
 
 def _receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None:
-    """Process all received messages, and update the note about the connection."""
     for message in subscriber.take(0.0):
         if message.payload is None:
             states.set_liveliness_token(message.key, message.token_exists)
@@ -93,7 +92,7 @@ def _receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None
 
 
 def connection_note(states: DeviceStates, subscriber: ZenohSubscriber) -> str:
-    """Return a description of the problems of the connection to the daemons, or "" if there are none.
+    """Describe the problems of the connection to the daemons. Return an empty string if there are none.
 
     Parameters
     ----------

@@ -1,15 +1,12 @@
-"""Subscriber to the results of other daemons over zenoh, as used by ``watch``.
+"""Subscriber to the results of other daemons over zenoh, for ``watch`` and ``view``.
 
-Each endpoint has a separate session in client mode, which neither listens nor scouts. Client mode is needed because a
-router does not forward data between two peers, and daemons are peers. Each endpoint needs a separate session because a
-client stays connected to the first endpoint that answers. A zenoh file may supply certificates, user and password. Raw
-samples and Allan deviations are most of the data. They are subscribed to only for devices that are shown in detail.
+Each endpoint has a separate session in client mode. Client mode is needed because a router does not forward data
+between two peers, and daemons are peers. A separate session is needed because a client stays connected to the first
+endpoint that answers. Samples and Allan deviations are received only for devices shown in detail.
 
-A late subscriber receives the last values and last events that daemons keep for this purpose. After a lost connection,
-the subscriber also receives the events that it missed. Each subscription has a ring buffer of zenoh that drops its
-oldest entries. A thread moves the entries to one common queue. ``take`` returns the messages of a topic in order of
-arrival and does not decode them. Memory is bounded: zenoh rejects messages above ``MAX_MESSAGE_BYTES``, and the queue
-drops its oldest entries.
+A late subscriber receives the last values and events that daemons keep. After a lost connection, the subscriber also
+receives missed events. Memory is bounded, because zenoh rejects messages above ``MAX_MESSAGE_BYTES`` and the queue
+drops the oldest messages.
 """
 
 import threading
@@ -56,7 +53,7 @@ MAX_REMEMBERED_MESSAGES: Final = 20_000
 
 @dataclass(frozen=True, slots=True)
 class ReceivedMessage:
-    """Received message, or the appearance or disappearance of a liveliness token."""
+    """Received message, or a change of a liveliness token."""
 
     key: str
     payload: bytes | None  # None for a liveliness token
@@ -100,7 +97,7 @@ class ZenohSubscriber:
 
     @property
     def dropped(self) -> int:
-        """Number of messages dropped because ``take`` was not called in time."""
+        """Number of messages that were dropped because ``take`` was not called in time."""
         return self._backlog.dropped
 
     @property
@@ -118,7 +115,7 @@ class ZenohSubscriber:
 
     @property
     def all_connected_duration_s(self) -> float:
-        """Duration for which all endpoints have been connected [s]; 0 if any endpoint is not connected."""
+        """Time [s] since all endpoints have been connected, or 0 if any endpoint is not connected."""
         return min(session.connected_duration_s for session in self._sessions)
 
     def start(self) -> None:
@@ -127,7 +124,7 @@ class ZenohSubscriber:
             session.start()
 
     def take(self, timeout_s: float) -> list[ReceivedMessage]:
-        """Return the messages received since the last call. Wait up to ``timeout_s`` seconds for the first one."""
+        """Return all messages since the last call. Wait up to ``timeout_s`` seconds for the first message."""
         return self._backlog.take(timeout_s)
 
     def close(self) -> None:
@@ -139,20 +136,19 @@ class ZenohSubscriber:
         self._backlog.wake()
 
     def _push(self, message: ReceivedMessage, stamp: str) -> None:
-        """Add a message to the queue unless the message is a duplicate."""
         if self._duplicate_filter is None or self._duplicate_filter.is_unseen(message.key, stamp):
             self._backlog.push(message, 100 + len(message.payload or b""))
 
 
 class _DuplicateFilter:
-    """Filter for messages that arrive over several endpoints, which have the same key and zenoh timestamp."""
+    """Filter for messages that several endpoints deliver, identified by key and zenoh timestamp."""
 
     def __init__(self) -> None:
         self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._lock = threading.Lock()
 
     def is_unseen(self, key: str, stamp: str) -> bool:
-        """Return True if the message has not been seen before or has no timestamp."""
+        """Return True if the message is new or has no timestamp."""
         if not stamp:
             return True
         with self._lock:
@@ -165,7 +161,7 @@ class _DuplicateFilter:
 
 
 class _EndpointSession(RetriedSession):
-    """Session with one endpoint, which passes all received messages and changes of liveliness tokens to a function."""
+    """Client session with one endpoint, which passes messages and token changes to a function."""
 
     close_timeout_s = 5.0
 
@@ -185,18 +181,16 @@ class _EndpointSession(RetriedSession):
 
     @property
     def is_connected(self) -> bool:
-        """True if the session is open and connected."""
         session = self._session
         return session is not None and not is_unconnected(session)
 
     @property
     def connected_duration_s(self) -> float:
-        """Duration of the current connection [s]; 0 if the endpoint is not connected."""
+        """Duration of the current connection [s], or 0 without a connection."""
         since_s = self._since_s
         return 0.0 if since_s is None else time.monotonic() - since_s
 
     def _open_session(self) -> None:
-        """Open the session and subscribe to all keys."""
         import zenoh
 
         session = self._session = zenoh.open(self._config)
@@ -206,11 +200,10 @@ class _EndpointSession(RetriedSession):
                 self._start_receiving(key, _declare_subscriber(session, topic, key), process)
 
     def _report_failure(self, _error: Exception) -> None:
-        """Find the reason why the endpoint refuses the connection."""
         self.refusal = explain_refusal(self._endpoint, self._config)
 
     def _monitor_connection(self) -> None:
-        """Report lost tokens: zenoh reconnects by itself, but does not report the tokens of a lost endpoint."""
+        """Report lost liveliness tokens, which zenoh does not report for a lost endpoint."""
         checked_s = -REFUSAL_CHECK_S
         while not self.closing.wait(CONNECTION_CHECK_S):
             if self.is_connected:
@@ -224,12 +217,10 @@ class _EndpointSession(RetriedSession):
                 checked_s = time.monotonic()
 
     def _process_message(self, sample: Any) -> None:
-        """Pass on a message with its timestamp."""
         stamp = "" if sample.timestamp is None else str(sample.timestamp)
         self._push(ReceivedMessage(str(sample.key_expr), bytes(sample.payload)), stamp)
 
     def _process_token(self, sample: Any) -> None:
-        """Pass on the change of a liveliness token."""
         import zenoh
 
         key, exists = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
@@ -241,7 +232,7 @@ class _EndpointSession(RetriedSession):
 
 
 def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
-    """Return the key expressions of the messages of one topic that a key expression selects.
+    """Return the key expressions for the messages of one topic.
 
     A key expression that selects a device selects all topics of the device.
 
@@ -267,7 +258,7 @@ def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
 
 
 def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Config"]:
-    """Return the zenoh configuration of a client session for each endpoint (see ``ZenohSubscriber``).
+    """Return the zenoh configuration of a client session for each endpoint.
 
     Parameters
     ----------
@@ -304,7 +295,7 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
 
 
 def _declare_subscriber(session: "zenoh.Session", topic: topics.Topic, key: str) -> Any:
-    """Subscribe to a key. The subscriber first receives the last messages that daemons keep."""
+    """Subscribe to a key and request the last messages that daemons keep."""
     import zenoh
     from zenoh import ext
 
@@ -318,7 +309,7 @@ def _declare_subscriber(session: "zenoh.Session", topic: topics.Topic, key: str)
 
 
 def _check_keys(keyexpr: str, keys: list[str]) -> None:
-    """Raise ConfigError if a key expression is not valid, or if no topic matches it."""
+    """Raise ConfigError if a key expression is invalid or matches no topic."""
     import zenoh
 
     try:
