@@ -27,27 +27,26 @@ from monitor.publishing.messages.results import (
 )
 
 NORMAL_OUTPUT_STATES: Final = ("ok", "off")
-"""States of an output that are not shown."""
+"""Output states that are not reported as problems."""
 GONE_TIMEOUT_S: Final = 1.5
-"""Age of the newest message [s] above which a device without liveliness token is gone. The status is published at 1 Hz,
-so a killed daemon is reported within two seconds."""
+"""Largest age of the newest message [s] of a device without liveliness token before the device is gone."""
 SILENCE_TIMEOUT_S: Final = 5.0
-"""Age of the newest message [s] above which a device with a liveliness token, or without known token, is silent."""
+"""Largest age of the newest message [s] before a device is silent."""
 MAX_NAMED_LIMITS: Final = 6
-"""Largest number of exceeded limits that are listed by name."""
+"""Largest number of exceeded limits that a message lists by name."""
 MAX_DEVICES: Final = 20_000
-"""Largest number of devices. A further device replaces one that has been silent for FORGET_AFTER_S, or is ignored."""
+"""Largest number of devices. A new device replaces a device that has been silent for FORGET_AFTER_S."""
 FORGET_AFTER_S: Final = 600.0
 MAX_KEY_LENGTH: Final = 200
 MAX_EVENTS: Final = 5
-"""Number of events that are kept."""
+"""Number of newest events to keep."""
 DECODERS: Final[dict[topics.Topic, Callable[[bytes], Message]]] = {
     topics.STATUS: StatusMessage.decode,
     topics.EVENT: EventMessage.decode,
     topics.COEFFICIENTS: partial(decode_message, CoefficientsMessage),
     topics.GAP: partial(decode_message, ModelGapMessage),
 }
-"""Decoder of each topic that tables of devices show."""
+"""Decoder of each topic that device tables show."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +55,7 @@ class DeviceCoefficients:
 
     coefficients: Coefficients
     axes: tuple[str, ...]  # measured axes
-    k_or_r: frozenset[str]  # axes on which either K or R is present and the data do not show which
+    k_or_r: frozenset[str]  # axes on which the data cannot distinguish K from R
     filled_s: float | None = None  # filled part of the window [s]
 
     @classmethod
@@ -88,8 +87,8 @@ class RemoteDevice:
     last_message_s: float  # time of the newest message of any topic
     status: StatusMessage | None = None
     coefficients: DeviceCoefficients | None = None
-    disagreements: tuple[str, ...] = ()  # one text for each axis that disagrees with its model
-    token_exists: bool | None = None  # True if the liveliness token of the device exists; None if unknown
+    disagreements: tuple[str, ...] = ()  # one text for each axis that disagrees with the noise model
+    token_exists: bool | None = None  # True if the liveliness token exists; None if unknown
 
     def state(self, now_s: float) -> str:
         """Return the state that the daemon reports, or gone, silent or present without a current status."""
@@ -136,7 +135,7 @@ class RemoteDevice:
         Raises
         ------
         ValueError
-            If a coefficient has an unknown status. The state is not changed.
+            If a coefficient has an unknown status. The state of the device remains unchanged.
         """
         match message:
             case StatusMessage():
@@ -153,7 +152,7 @@ class DeviceStates:
     Parameters
     ----------
     clock
-        Clock for the age of messages [s]; callers pass times of the same clock.
+        Clock for the age of messages [s]. Callers must pass times of the same clock.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:

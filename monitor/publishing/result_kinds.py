@@ -28,14 +28,14 @@ from monitor.publishing.messages.results import (
 )
 
 POINT_INTERVAL_S: Final = 1.0
-"""Interval between two points of a time series of estimates, in the time of the samples."""
+"""Shortest interval between two points of a time series of estimates [s]."""
 SMALL_RESULT_BYTES: Final = 1000
 """Approximate size of a result without large arrays."""
 
 TimedResult = tuple[float, Any]
 """Unix time of a result [s], and the result."""
 Merge = Callable[[list[TimedResult], TimedResult], None]
-"""Function that adds a new result to the results that wait to be drawn."""
+"""Function that merges a new result into the results that wait to be drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ def keep_all(waiting: list[TimedResult], new: TimedResult) -> None:
     Parameters
     ----------
     waiting
-        Results that wait to be drawn. The list is changed.
+        Results that wait to be drawn, modified in place.
     new
         The new result.
     """
@@ -104,7 +104,7 @@ class DrawingRule:
     period_s: float = 0.0
     """Shortest interval between two drawings of a device [s]."""
     shares_rate: bool = False
-    """True if all devices share a limited drawing rate, so that the period grows with the number of devices."""
+    """True if all devices share a drawing rate, so that the period increases with the number of devices."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,7 +139,7 @@ RESULT_KINDS: Final = (
     ResultKind(DriftUpdate, drawings=(DrawingRule("DriftPanel"),)),
     ResultKind(TotalAndHadamardCurves, (TotalAndHadamardMessage,)),
     ResultKind(
-        ModelGap,  # before the estimate, because the Allan plot also shows the deviations of the model
+        ModelGap,  # precedes the estimate, because the Allan plot also shows the model
         (ModelGapMessage,),
         (DrawingRule("GapPanel", keep_newest_and_spaced, period_s=1.0),),
         size_bytes=lambda one: 6 * 4 * int(one.tau_s.nbytes),

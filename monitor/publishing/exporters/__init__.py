@@ -52,9 +52,9 @@ def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, *
     Raises
     ------
     ConfigError
-        If the format is unknown, the inflation is below 1, or the model lacks a coefficient that the format needs.
+        If the format is unknown, the inflation factor is below 1, or the noise model lacks a required coefficient.
     NotReady
-        If the analysed recording does not determine a coefficient that the format needs.
+        If the recording is too short to determine a required coefficient.
     """
     if format_name not in FORMATS:
         raise ConfigError(f'unknown format "{format_name}"; possible are {", ".join(FORMATS)}')

@@ -26,7 +26,7 @@ COEFFICIENT_EFFECTS: Final[dict[str, type[Source]]] = {
     "K": RateRandomWalk,
     "R": RateRamp,
 }
-"""Noise effect with the same coefficient as parameter."""
+"""Noise effect that each coefficient describes."""
 
 
 def ascii_unit(letter: str, kind: Kind) -> str:
@@ -60,10 +60,10 @@ class NoiseCoefficients:
 
     axes: Mapping[str, Mapping[str, ExportedCoefficient]]
     sample_rate_hz: float | None
-    source: str  # origin of the numbers, for the header of the file
+    source: str  # source of the coefficients, for the header of the file
     left_out: tuple[str, ...] = ()  # other effects, such as "gz.sinusoidal"
     measured: bool = False  # True if the coefficients come from a recording
-    warnings: tuple[str, ...] = ()  # ASCII sentences for the header of the file
+    warnings: tuple[str, ...] = ()  # ASCII warnings for the header of the file
 
     def coefficient_by_axis(self, kind: Kind, letter: str) -> dict[str, ExportedCoefficient]:
         """Return one noise coefficient for each axis on which the coefficient is known.
@@ -73,7 +73,7 @@ class NoiseCoefficients:
         kind
             Kind of sensor: gyro or accel.
         letter
-            Coefficient.
+            Symbol of the coefficient: Q, N, B, K or R.
         """
         return {axis: self.axes[axis][letter] for axis in axes_of(kind) if letter in self.axes.get(axis, {})}
 
@@ -90,7 +90,7 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
     model
         Noise model.
     source
-        Origin of the numbers, for the header of the file.
+        Source of the coefficients, for the header of the file.
     """
     letters = {effect.name: letter for letter, effect in COEFFICIENT_EFFECTS.items()}
     axes: dict[str, dict[str, ExportedCoefficient]] = {}
@@ -139,12 +139,12 @@ def from_analysis_json(json_text: bytes | str, source: str = "analysis of a reco
     json_text
         JSON text.
     source
-        Origin of the numbers, for the header of the file.
+        Source of the coefficients, for the header of the file.
 
     Raises
     ------
     ConfigError
-        If the text is not the JSON of an analysis, or if the rate is outside the supported range.
+        If the text is not an analysis in JSON, or if the sample rate is outside the supported range.
     """
     try:
         found = msgspec.json.decode(json_text, type=_Analysis)
@@ -196,7 +196,7 @@ def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: st
     inflation
         Factor on N, B and K.
     comment_sign
-        Comment mark of the format.
+        Characters that begin a comment in the file.
     """
     source = noise.source.encode("ascii", "replace").decode()
     done = "none" if inflation == 1.0 else f"N, B and K are {inflation:g} times the values of the source"
@@ -217,9 +217,9 @@ def comment_on_omitted_terms(
     noise
         Coefficients.
     represented_letters
-        Letters that the format represents.
+        Symbols of the coefficients that the export format represents.
     comment_sign
-        Comment mark of the format.
+        Characters that begin a comment in the file.
     """
     letters = {letter for terms in noise.axes.values() for letter, term in terms.items() if not term.bound}
     unused = [letter for letter in COEFFICIENT_EFFECTS if letter in letters and letter not in represented_letters]

@@ -31,7 +31,7 @@ def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
     Parameters
     ----------
     noise
-        Coefficients of each axis, SI.
+        Noise coefficients of each axis, in SI units.
     inflation
         Factor on N, B and K.
     """

@@ -34,7 +34,7 @@ def export_kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: st
     Parameters
     ----------
     noise
-        Coefficients of each axis, SI.
+        Noise coefficients of each axis, in SI units.
     inflation
         Factor on the densities.
     rostopic
@@ -43,9 +43,9 @@ def export_kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: st
     Raises
     ------
     ConfigError
-        If the model has no sample rate or lacks N or K on one kind of sensor.
+        If the noise model has no sample rate, or lacks N or K for one kind of sensor.
     NotReady
-        If the analysed recording does not determine N or K on one kind of sensor.
+        If the recording is too short to determine N or K.
     """
     if noise.sample_rate_hz is None:
         raise ConfigError("kalibr needs an update_rate, and the model has no sample_rate")

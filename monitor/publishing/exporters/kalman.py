@@ -62,7 +62,7 @@ def export_kalman(
     Parameters
     ----------
     noise
-        Coefficients of each axis, SI.
+        Noise coefficients of each axis, in SI units.
     inflation
         Factor on N, B and K.
     dt_s

@@ -29,7 +29,7 @@ from monitor.publishing.messages.message import (
 )
 
 MAX_BUCKETS: Final = 1_000_000
-"""Largest number of buckets accepted in a message."""
+"""Largest accepted number of time buckets in a message."""
 MAX_HISTORY_BYTES: Final = 1 << 30
 STATUS_COLUMNS: Final = (*HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
 _STATUS_NAMES: Final = {status.value: status.name.lower() for status in Status}
@@ -263,7 +263,7 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
         Raises
         ------
         ValueError
-            If the lists have different lengths, or if there are more than MAX_BUCKETS buckets.
+            If the lists have different lengths, or if the number of buckets exceeds MAX_BUCKETS.
         """
         buckets = self.start.size
         if self.width.shape != (buckets,) or buckets > MAX_BUCKETS:

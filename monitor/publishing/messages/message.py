@@ -41,7 +41,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="sc
         t
             Unix time of the result [s].
         samples
-            Number of samples of the device since the start. A result that contains this number overrides it.
+            Number of samples of the device since the start, used if the result does not contain the number.
         result
             Result of the daemon.
         """
@@ -76,7 +76,7 @@ def decode_message(message_type: type[M], payload: bytes, max_bytes: int = MAX_P
     Raises
     ------
     ValueError
-        If the payload is too large or is not a message of this class.
+        If the payload is too large or does not contain a message of the given class.
     """
     if len(payload) > max_bytes:
         raise ValueError(f"the payload has {len(payload)} bytes; at most {max_bytes} are read")

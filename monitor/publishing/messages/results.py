@@ -32,7 +32,7 @@ from monitor.publishing.messages.message import (
 MAX_AVERAGING_TIMES: Final = 1000
 """Largest accepted number of averaging times."""
 MAX_TEXT_LENGTH: Final = 400
-"""Length to which received texts are cut, because a device must not exhaust the memory of the receiver."""
+"""Largest length of received texts, which limits the memory use of the receiver."""
 MAX_OUTPUTS: Final = 16
 STATUSES: Final = {status.name.lower(): status for status in Status}
 
@@ -66,7 +66,7 @@ class CoefficientValue(msgspec.Struct, frozen=True):
     hi: float | None = None
     status: str = ""
     other: str | UnsetType | None = msgspec.field(name="or", default=UNSET)
-    """K for R, and R for K, if the data do not show which of the two is present."""
+    """Alternative coefficient, K or R, if the data cannot distinguish K from R."""
 
 
 class WindowResultMessage(
@@ -111,12 +111,13 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
         coefficients
             Coefficients of the device, from which the fitted curve is computed.
         k_or_r
-            Axes on which either K or R is present and the data do not show which.
+            Axes on which the data cannot distinguish K from R.
 
         Raises
         ------
         ValueError
-            If the averaging times are not positive and increasing, or if a list has another length.
+            If the averaging times are not positive and increasing, or if the numbers of deviations and averaging times
+            differ.
         """
         tau_s, m = self.tau_s, self.tau_s.size
         rate_hz, window_s, filled_s = self.rate_hz or 0.0, self.window_s or 0.0, self.filled_s or 0.0
@@ -188,7 +189,7 @@ class AxisModelGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     """Comparison of the measured Allan deviation of one axis with the noise model."""
 
     agrees: bool | None = None
-    """Decision with hysteresis. It changes later than ``gap`` crosses ``threshold``. None before the first decision."""
+    """True if the axis agrees with the noise model, decided with hysteresis. None before the first decision."""
     gap: float
     where: TauRange
     ratio: float | None = None
@@ -314,7 +315,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
         Raises
         ------
         ValueError
-            If the payload is not an event, or has no time.
+            If the payload is not an event message, or if the event has no time.
         """
         found = decode_message(cls, payload)
         if found.t is None:
@@ -382,7 +383,7 @@ class StatusMessage(
         Raises
         ------
         ValueError
-            If the payload is not a status.
+            If the payload is not a status message.
         """
         found = decode_message(cls, payload)
         outputs = {_clean(name): _clean(state) for name, state in list(found.outputs.items())[:MAX_OUTPUTS]}
@@ -442,7 +443,7 @@ def coefficient_values(
     axis
         Column of the axis.
     k_r_ambiguous
-        True if either K or R is present and the data do not show which.
+        True if the data cannot distinguish K from R.
     """
     other = {"K": "R", "R": "K"} if k_r_ambiguous else {}
     return {

@@ -33,18 +33,18 @@ READING_TAU_S: Final = {
     "N": 1.0,
     "K": 3.0,
     "R": 2.0**0.5,
-}  # τ at which the deviation of the term equals the coefficient
-LINE_TAU_S: Final = np.array([1e-6, 1e9])  # ends of the line of a term, beyond any plot
-TAU0_S: Final = 1e-9  # sample interval for the line of a term, so short that sampling has no effect
+}  # averaging time at which the deviation of the noise term equals the coefficient
+LINE_TAU_S: Final = np.array([1e-6, 1e9])  # ends of the line of a noise term, outside every plot
+TAU0_S: Final = 1e-9  # sample interval that is too short to affect the line of a noise term
 LEGEND_TEXT: Final = (
     "○ a coefficient, read on its own line: Q at √3 s, N at 1 s, K at 3 s, R at √2 s; 0.664 B where the curve is lowest"
 )
 OTHER_LINE_STYLES: Final = ("-", ":", "-.")
 TERM_LINE_ALPHA: Final = 0.4
-MAX_DEPTH_RATIO: Final = 300.0  # a ring further below the lowest point is omitted
+MAX_DEPTH_RATIO: Final = 300.0  # largest ratio between the lowest point and a ring; lower rings are omitted
 MAX_BAND_RATIO: Final = 3.0  # a band extends the plot by at most this factor beyond the points
 MARGIN_FACTOR: Final = 1.6
-MIN_LETTER_DISTANCE: Final = 0.045  # rings closer than this share of the height of the plot share a label
+MIN_LETTER_DISTANCE: Final = 0.045  # smallest distance between two labels, as a share of the height of the plot
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +56,7 @@ class AdditionalDeviation:
     deviation: Floats  # [k, 6] SI unit of the axis
     lo: Floats  # [k, 6] ends of the 95 % interval; NaN if unknown
     hi: Floats
-    only_beyond: bool = False  # True to draw only τ longer than the longest τ of the Allan deviation
+    only_beyond: bool = False  # True to draw only averaging times beyond the Allan deviation
 
     def drawn_points_mask(self, axis: int, longest_allan_tau_s: float) -> NDArray[np.bool_]:
         """Return a mask of the points of one axis that the plot shows, shape [k].
@@ -157,7 +157,7 @@ def _draw_other(
     longest_allan_tau_s: float, line_style: str,
 ) -> Floats:  # fmt: skip
     """Draw an additional deviation of one axis, and return the drawn values."""
-    # The line begins at the last point of the Allan deviation, so that its origin is visible.
+    # The line begins at the last point of the Allan deviation to show the connection.
     line = points | (other.tau_s == longest_allan_tau_s) if other.only_beyond else points
     y, colour = other.deviation[:, i] * factor, COLOURS[number]
     panel.plot(other.tau_s[line], y[line], line_style, color=colour, linewidth=0.9, alpha=0.8, zorder=2)

@@ -56,14 +56,14 @@ def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "")
     plot_data
         Analysis of the recording.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
     title
         Title of the figure.
 
     Raises
     ------
     ConfigError
-        If matplotlib is missing or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     """
     estimate, dynamic = plot_data.analysis.estimate, plot_data.dynamic
     with figure_style():

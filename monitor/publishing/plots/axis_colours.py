@@ -20,7 +20,7 @@ BACKGROUND: Final[Colour] = (13, 16, 17)
 FRAME: Final[Colour] = (92, 98, 104)
 MAJOR: Final[Colour] = (48, 53, 57)
 MINOR: Final[Colour] = (23, 27, 29)
-TEXT: Final[Colour] = (236, 239, 242)  # legible on the label boxes of the dark and the light theme
+TEXT: Final[Colour] = (236, 239, 242)  # legible on label boxes in the dark and light themes
 TEMPERATURE: Final[Colour] = (236, 180, 72)
 
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 ROW_INCHES: Final = (11.0, 2.6)
 UNIT: Final = DEVIATION_UNITS["gyro"]
-MAX_LINE_POINTS: Final = 400  # a line with more points would cover its band and the measured means
+MAX_LINE_POINTS: Final = 400  # more points would hide the band and the measured means
 MEANS_ALPHA: Final = 0.6
 
 
@@ -32,12 +32,12 @@ def save_compensation_plot(result: CompensationResult, path: Path) -> None:
     result
         Results of the compensation.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
 
     Raises
     ------
     ConfigError
-        If matplotlib is missing or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     """
     with style.figure_style():
         figure = style.create_figure(ROW_INCHES[0], 0.7 + ROW_INCHES[1] * len(result.axes))

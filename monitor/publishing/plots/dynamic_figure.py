@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 HEAT_MAP_INCHES: Final = 1.35
 COEFFICIENT_INCHES: Final = 1.6
 SPARE_INCHES: Final = 1.2  # height of title, colour bar and time axis
-MIN_ESTIMATED_SHARE: Final = 0.05  # smallest share of time steps with an estimate for a coefficient to have a panel
+MIN_ESTIMATED_SHARE: Final = 0.05  # smallest share of estimated time steps of a coefficient with a panel
 PALE_ALPHA: Final = 0.3
 MIN_LABEL_DISTANCE: Final = 0.13  # smallest distance between two labels, as a share of the width
 COLOUR_SCALE_RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # possible upper ends of the colour scale
@@ -95,7 +95,7 @@ def draw_dynamic_panels(
     kind
         Kind of sensor.
     marks
-        Changes of all axes. Only changes of this kind of sensor are drawn.
+        Changes to draw. Changes of the other kind of sensor are ignored.
     """
     axes, letters = _shown_axes(dynamic, kind), _shown_coefficients(dynamic, kind)
     ratios = [HEAT_MAP_INCHES] * len(axes) + [COEFFICIENT_INCHES] * len(letters)
@@ -143,7 +143,7 @@ def _group_times(times: Sequence[float], distance: float) -> list[list[float]]:
     groups: list[list[float]] = []
     for time in sorted(times):
         groups.append([time])
-        # Joining two groups moves their mean, so that the previous group may be too close as well.
+        # The mean of a merged group may be too close to the previous group.
         while len(groups) > 1 and float(np.mean(groups[-1]) - np.mean(groups[-2])) < distance:
             groups[-2:] = [groups[-2] + groups[-1]]
     return groups
@@ -171,7 +171,7 @@ def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Float
 def _draw_colour_bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "list[Axes]", ratio: float) -> None:
     from matplotlib.cm import ScalarMappable
 
-    # A separate mappable is used, because the colour bar of the mesh would be as pale as its cells.
+    # The colour bar needs a separate mappable, because the cells of the mesh are translucent.
     bar = figure.colorbar(ScalarMappable(mesh.norm, mesh.cmap), ax=panels, aspect=30, pad=0.015, fraction=0.05)
     ticks = np.log(ratio) * np.linspace(-1.0, 1.0, 5)
     bar.set_ticks(ticks.tolist(), labels=[f"× {np.exp(tick):.2g}" for tick in ticks])
@@ -190,7 +190,7 @@ def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: 
             np.where(estimated, part[:, row, i] * unit.factor, np.nan)
             for part in (dynamic.value, dynamic.value_lo, dynamic.value_hi)
         )
-        style.draw_band(panel, t, lo, hi, colour, rasterized=True)  # hundreds of corners would make a report larger
+        style.draw_band(panel, t, lo, hi, colour, rasterized=True)  # a large vector image otherwise
         panel.plot(t, value, color=colour, label=axis)
         alone = _isolated(estimated)
         panel.plot(t[alone], value[alone], ".", color=colour, markersize=3.5)
@@ -216,7 +216,7 @@ def _isolated(estimated: NDArray[np.bool_]) -> NDArray[np.bool_]:
 def _median(dynamic: DynamicAllan) -> Floats:
     """Return the median deviation over time, shape [1, m, 6], with NaN for a missing or zero median."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # raised for an axis that is not measured
+        warnings.simplefilter("ignore", RuntimeWarning)  # an axis that is not measured raises this warning
         median = np.nanmedian(dynamic.deviation, axis=0, keepdims=True)
     return np.asarray(np.where(median > 0.0, median, np.nan))
 

@@ -40,8 +40,8 @@ EVENT_LABELS: Final = {
     "temperature_unexplained": "temperature",
     "drift_unexplained": "drift",
 }
-"""Label of each kind of event that is drawn. Lost samples have a separate panel."""
-MAX_EVENTS: Final = 40  # largest number of events that are drawn; the most significant events are selected
+"""Label of each drawn kind of event."""
+MAX_EVENTS: Final = 40  # largest number of drawn events; the most significant events are selected
 MIN_LABEL_DISTANCE: Final = 0.055  # smallest distance between two labels, as a share of the width
 PRIORITY_KINDS: Final = ("noise_changed", "bias_stepped", "limit_crossed", "model_disagrees")
 
@@ -54,14 +54,14 @@ def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES
     past
         The history.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
     axes
         Axes to draw.
 
     Raises
     ------
     ConfigError
-        If matplotlib is missing or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     NotReady
         If the history has no rows.
     """

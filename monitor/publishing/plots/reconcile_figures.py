@@ -174,7 +174,7 @@ def to_displayed_units(title: str, view: PlotData, axis: str, where: Location | 
     axis
         Name of the axis.
     where
-        Range to mark. A range of another quantity than the x axis is omitted.
+        Range to mark. The range is ignored if the x axis shows another quantity.
     """
     x_unit, y_unit = (
         displayed_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)))
@@ -210,7 +210,7 @@ def common_y_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
     if curves.size == 0:
         return (0.1, 10.0) if log else (-1.0, 1.0)
     low, high = float(curves.min()), float(curves.max())
-    if log:  # an almost empty bin of a spectrum lies decades below the other bins
+    if log:  # an almost empty bin of a spectrum is decades below the other bins
         low = float(min(np.quantile(curves, LOWEST_SHARE), *_finite([plot.expected for plot in plots], log), high))
     reach = MAX_BAND_SHARE * (high - low)
     bands = _finite([line for plot in plots for line in (plot.lo, plot.hi)], log).clip(low - reach, high + reach)
@@ -232,7 +232,7 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[
     scale = "log" if plot.log else "linear"
     panel.set(xscale=scale, yscale=scale, xlim=(left, right), ylim=limits, xlabel=plot.x_label)
     panel.autoscale(False)
-    # A lower end of zero has no logarithm. It is drawn below the panel.
+    # A lower end of zero is drawn below the panel, because zero has no logarithm.
     lo, hi = (np.fmax(line, 0.1 * limits[0]) if plot.log else line for line in (plot.lo, plot.hi))
     panel.fill_between(plot.x, lo, hi, where=np.isfinite(plot.hi).tolist(), color=BAND_COLOUR, linewidth=0)
     few = plot.x.size <= MAX_MARKERS
@@ -240,7 +240,7 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[
     panel.plot(plot.x, plot.expected, "--", color=style.DARK, linewidth=1.0)
     if plot.mark is not None:
         ends = np.clip(plot.mark, left, right).tolist()
-        # The edge of the area keeps a very narrow range visible.
+        # The outline keeps a very narrow range visible.
         panel.axvspan(*ends, facecolor=style.ORANGE, edgecolor=style.ORANGE, alpha=0.35, linewidth=3)
         panel.set_title(plot.mark_label, loc="right", fontsize=9, color=RANGE_TEXT_COLOUR, fontweight="bold")
     else:

@@ -63,12 +63,12 @@ STYLE: Final[dict[Any, Any]] = {
     "svg.hashsalt": "imu-monitor",
 }
 UNDATED: Final[dict[str, dict[str, Any]]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-"""Metadata that keep the date out of a file, by suffix."""
+"""Metadata settings that omit the date from a file, by suffix."""
 RASTER_DPI: Final = 80  # resolution of heat maps and dense bands, which are images inside an SVG
-FEW_DECADES_RATIO: Final = 60.0  # an axis with a smaller ratio of its ends has labels between the powers of ten
+FEW_DECADES_RATIO: Final = 60.0  # below this ratio of the limits, an axis has labels between powers of ten
 MAX_LABELS: Final = 7  # largest number of powers of ten with a label
 LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
-MAX_INTERVAL_RATIO: Final = 1.5  # ratio between value and end of an interval above which the interval is not drawn
+MAX_INTERVAL_RATIO: Final = 1.5  # largest drawn ratio between the end of an interval and the value
 SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 LABEL_BOX: Final[dict[str, Any]] = {
     "boxstyle": "square,pad=0.15",
@@ -76,7 +76,7 @@ LABEL_BOX: Final[dict[str, Any]] = {
     "edgecolor": "none",
     "alpha": 0.8,
 }
-"""Box behind a label inside a panel, so that curves do not cross the text."""
+"""Box behind a label inside a panel, which keeps the text legible over curves."""
 TIME_UNITS: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
 """Name of each time unit, its length [s], and the duration [s] below which the unit is used."""
 
@@ -112,7 +112,7 @@ def create_figure(width: float, height: float, layout: Literal["constrained"] | 
     width, height
         Size [inches].
     layout
-        By default, panels are arranged so that no labels overlap. None keeps the given positions.
+        By default, matplotlib arranges panels without overlapping labels. None keeps the given positions.
     """
     from matplotlib.figure import Figure
 
@@ -127,7 +127,7 @@ def save_figure(figure: "Figure", path: Path) -> None:
     figure
         Figure to write.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
 
     Raises
     ------
@@ -148,7 +148,7 @@ def to_svg_element(figure: "Figure", description: str) -> str:
     figure
         Figure to convert.
     description
-        Short description for readers who cannot see the figure.
+        Text alternative for readers who cannot see the figure.
     """
     text = io.StringIO()
     figure.savefig(text, format="svg", dpi=RASTER_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
@@ -158,7 +158,7 @@ def to_svg_element(figure: "Figure", description: str) -> str:
     element = re.sub(r'<g id="[^"]*"', "<g", element)  # nothing refers to these identifiers
     element = re.sub(r"<[^>]*>", lambda tag: re.sub(r"\d+\.\d{3,}", _shorten, tag[0]), element)
     element = re.sub(r"\n(?:L )?\s*", " ", element)  # without a letter, a path continues with lines
-    prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # figures on one page must have different identifiers
+    prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # figures on a page need different identifiers
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}", element)
 
 

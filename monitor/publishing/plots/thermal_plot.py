@@ -22,12 +22,12 @@ def save_thermal_fit_plot(report: ThermalFitReport, path: Path) -> None:
     report
         The fitted models.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
 
     Raises
     ------
     ConfigError
-        If matplotlib is missing or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     """
     rows = [
         (
@@ -49,12 +49,12 @@ def save_thermal_prediction_plot(report: ThermalPredictionReport, path: Path) ->
     report
         The predictions.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
 
     Raises
     ------
     ConfigError
-        If matplotlib is missing or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     """
     rows = []
     for axis, one in report.judged.items():

@@ -43,7 +43,7 @@ def write_html_report(plot_data: AnalysisPlotData, path: Path, title: str = "") 
     Raises
     ------
     ConfigError
-        If matplotlib or Jinja2 is missing, or if the file cannot be written.
+        If matplotlib or Jinja2 is not installed, or if the file cannot be written.
     """
     page = render_page(plot_data, title)
     try:

@@ -14,7 +14,7 @@ ABSENCE_TEXTS: Final = {
     "unnamed": "unnamed there",
     "may_differ": "may differ",
 }
-"""Text for each reason why an effect is absent from a recording."""
+"""Text for each reason for the absence of an effect in a recording."""
 
 
 def summarize(c: Comparison) -> str:

@@ -20,7 +20,7 @@ def render_template(name: str, **values: Any) -> str:
     Raises
     ------
     ConfigError
-        If matplotlib or Jinja2 is missing.
+        If matplotlib or Jinja2 is not installed.
     """
     try:
         import matplotlib.figure as _  # noqa: F401

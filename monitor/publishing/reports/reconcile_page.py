@@ -38,7 +38,7 @@ def render_page(r: Reconciliation, title: str = "") -> str:
     Raises
     ------
     ConfigError
-        If matplotlib or Jinja2 is missing.
+        If matplotlib or Jinja2 is not installed.
     """
     return render_template(
         "reconcile.html.j2",

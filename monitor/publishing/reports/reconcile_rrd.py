@@ -29,7 +29,7 @@ from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliat
 
 APPLICATION: Final = "imu-monitor"
 TIMELINE: Final = "step"
-MAX_PLOTTED_DIAGNOSTICS: Final = 2  # number of diagnostics drawn per axis; the first ones are used
+MAX_PLOTTED_DIAGNOSTICS: Final = 2  # largest number of drawn diagnostics per axis
 BAND_COLOUR: Final = colours.blend_colours(colours.FRAME, 0.55)
 LEGEND_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
 RANGE_COLOUR: Final = colours.TEMPERATURE  # orange, as on the HTML page
@@ -200,7 +200,7 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
 def _log_curves(
     stream: rr.RecordingStream, path: str, scale: ChartScale, plot: DiagnosticPlot, axis: str, static: bool
 ) -> None:
-    # A lower end of zero has no logarithm. It is drawn below the box.
+    # A lower end of zero is drawn below the box, because zero has no logarithm.
     low, high = (scale.to_chart_positions(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
     log = partial(stream.log, static=static)
     log(f"{path}/band", fill_band(low, high, BAND_COLOUR))

@@ -42,12 +42,12 @@ RESULT_TEXTS: Final = {
     "partly_explained": "partly explained",
     "unexplained": "unexplained",
 }
-"""Text for each result of an axis or a recording."""
+"""Text for each possible result of an axis or a recording."""
 DIAGNOSTIC_NAMES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
-"""Displayed names of the diagnostics whose identifier is no plain word."""
+"""Displayed names of diagnostics with an abbreviated identifier."""
 SAMPLE_SI_UNITS: Final[dict[Kind, str]] = {"gyro": "rad/s", "accel": "m/s²"}
 GRAVITY: Final = 9.80665  # m/s², standard (CGPM 1901)
-SMALL_UNIT_BELOW: Final = 0.1  # °/s or m/s²; below it, a rate or an acceleration is shown in °/h or µg
+SMALL_UNIT_BELOW: Final = 0.1  # in °/s or m/s²; smaller values are displayed in °/h or µg
 _DEGREES_PER_HOUR: Final = DEVIATION_UNITS["gyro"].factor  # °/h per rad/s
 _SI_OF_COEFFICIENTS: Final = {
     si: COEFFICIENT_UNITS[kind][letter]
@@ -69,7 +69,7 @@ FIELD_UNITS: Final = {
     "m/s²/√Hz": Unit(MICRO_G, "µg/√Hz"),
     **dict.fromkeys(("(m/s²)²", "m²/s⁴"), Unit(MICRO_G**2, "µg²")),
 }
-"""Displayed unit for each SI unit. Units that are absent, such as Hz, s and °C, are displayed unchanged."""
+"""Displayed unit for each SI unit. Other units, such as Hz, s and °C, are displayed unchanged."""
 UNITS_BY_NAME: Final = {"phase": Unit(DEGREE, "°"), "fraction": Unit(100.0, "%")}
 """Displayed units of the parameters whose SI unit does not determine the displayed unit."""
 RANGE_FORMATS: Final = {
@@ -79,8 +79,8 @@ RANGE_FORMATS: Final = {
     "temperature": ("", Unit(1.0, "°C")),
 }
 """Prefix and unit for each kind of range."""
-MIN_RANGE_SHARE: Final = 1e-3  # a range narrower than this share of its position is written as one number
-SYMMETRY_TOLERANCE: Final = 0.1  # sides of an interval that differ by less than this share are written as ±
+MIN_RANGE_SHARE: Final = 1e-3  # a relatively narrower range is written as one number
+SYMMETRY_TOLERANCE: Final = 0.1  # largest relative difference of the interval sides that are written as ±
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +149,7 @@ def format_range(where: Location, axis: str) -> str:
     where
         The range.
     axis
-        Name of the axis, which selects the units.
+        Name of the axis, which determines the units.
     """
     texts = []
     for name, ends in where.resolved_dimensions().items():
@@ -174,7 +174,7 @@ def describe_gap(gap: DiagnosticGap, axis: str) -> str:
     gap
         Gap of a diagnostic.
     axis
-        Name of the axis, which selects the units.
+        Name of the axis, which determines the units.
     """
     sizes = f"gap {format_gap(gap.gap)}, threshold {format_gap(gap.threshold)}"
     return f"{diagnostic_name(gap.lens)}, {format_range(gap.where, axis)}: {sizes}"
@@ -192,7 +192,7 @@ def format_gap(gap: float) -> str:
 
 
 def gap_to_threshold_ratio(gap: DiagnosticGap) -> float:
-    """Return the gap of a diagnostic divided by the threshold. An infinite ratio becomes 0."""
+    """Return the gap of a diagnostic divided by the threshold, or 0 if the ratio is not finite."""
     share = gap.gap / gap.threshold if gap.threshold > 0.0 else 0.0
     return share if isfinite(share) else 0.0
 

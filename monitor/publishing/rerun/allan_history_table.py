@@ -11,7 +11,7 @@ from drivers.data_types import AXES, Floats, Ints
 from monitor.estimation.estimate import Estimate
 
 COLUMNS = 300
-"""Largest number of columns. The number must be even, because columns are merged in pairs."""
+"""Largest number of columns, which must be even because columns are merged in pairs."""
 INITIAL_COLUMN_S = 2.0
 """Initial duration of a column [s], in the time of the samples."""
 
@@ -30,7 +30,7 @@ class AllanHistory:
     def _reset(self, tau_s: Floats, wall_s: float) -> None:
         self.column_s = self._first_s
         self.tau_s = tau_s  # [m]
-        self.ends_s: list[float] = []  # Unix time of the newest estimate in each column
+        self.ends_s: list[float] = []  # Unix time [s] of the newest estimate in each column
         self._columns: list[Floats] = []  # [m, 6] natural logarithm of the deviation
         self._begin_column(wall_s)
 
@@ -51,7 +51,7 @@ class AllanHistory:
         """
         if wall_s < self._newest_s or not np.array_equal(self.tau_s, estimate.curve.tau_s):
             self._reset(estimate.curve.tau_s, wall_s)
-        # The recent deviations use a short time for each τ, so that a change appears at once and at the correct time.
+        # The recent deviations use only the newest samples, so that a change appears without delay.
         avar = (estimate.display_curve or estimate.curve).avar
         there = np.isfinite(avar) & (avar > 0.0)
         self._sums[there] += 0.5 * np.log(avar[there])

@@ -27,7 +27,7 @@ from monitor.publishing.rerun.viewer_settings import DeviceInfo
 NOW_COEFFICIENTS: Final = ("N", "B")
 DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")
 TYPICAL_TAU_COUNT: Final = 17
-"""Number of averaging times of one hour at 100 Hz. A heat map with another number has a slightly different height."""
+"""Number of averaging times of a one-hour window at 100 Hz."""
 MAX_DEVICES_WITH_ACCEL: Final = 4
 """Largest number of devices for which the overview also shows accelerometers."""
 MAX_GRID_COLUMNS: Final = 4
@@ -42,7 +42,7 @@ def blueprint(devices: Sequence[DeviceInfo], fleet: bool = False) -> rrb.Bluepri
     devices
         The devices.
     fleet
-        True if the overview is a table of further devices.
+        True if the overview is a table that also contains devices without detail.
     """
     pages, names = [_device(one) for one in devices], [one.name for one in devices]
     if fleet:

@@ -11,8 +11,8 @@ import numpy as np
 from drivers.data_types import Floats, Ints
 
 ROWS_PER_S: Final = 200.0
-BUCKETS_PER_S: Final = 95.0  # two rows per bucket, and some rows for the buckets that a flush divides
-ROWS_PER_FLUSH: Final = 4000  # limits the rows of a replay at full speed, which delivers hours at once
+BUCKETS_PER_S: Final = 95.0  # a bucket gives two rows, and a divided bucket gives more rows
+ROWS_PER_FLUSH: Final = 4000  # limits the rows of a fast replay, which delivers hours of samples at once
 
 
 def decimate_extremes(wall_s: Floats, values: Floats) -> tuple[Floats, Floats]:
@@ -56,7 +56,7 @@ def average_buckets(wall_s: Floats, values: Floats, per_s: float) -> tuple[Float
     if values.size == 0:
         return wall_s, values
     _, inverse, count = np.unique(np.floor(wall_s * per_s), return_inverse=True, return_counts=True)
-    origin = wall_s[0]  # sums of absolute Unix times would lose microseconds
+    origin = wall_s[0]  # sums of absolute Unix times would be rounded by microseconds
     t = origin + np.bincount(inverse, wall_s - origin) / count
     return t, np.bincount(inverse, values) / count
 

@@ -24,7 +24,7 @@ from monitor.publishing.zenoh.subscriber import ReceivedMessage, ZenohSubscriber
 RECEIVE_TIMEOUT_S: Final = 0.1
 TABLE_PERIOD_S: Final = 1.0
 MAX_ROWS: Final = 40
-"""Largest number of rows of the table, about one screen. Devices with the fewest problems are omitted."""
+"""Largest number of rows of the device table, about one screen."""
 
 
 def full_device_key(device: str, keyexpr: str) -> str:
@@ -77,9 +77,9 @@ class FleetView:
         stop
             Event that ends the method.
         report
-            Function that is called with the address of the page and a description of problems when one of them changes.
+            Function that receives the address of the page and the problems after each change.
         duration_s
-            Longest duration [s]; None: no limit.
+            Longest duration [s], or None for no limit.
         """
         end_s = None if duration_s is None else time.monotonic() + duration_s
         table_s, reported = 0.0, ""

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
     from monitor.publishing.rerun.sinks import RerunOutput, ViewerProcess
     from monitor.publishing.rerun.viewer_content import Scene
 
-BACKLOG_BYTES: Final = 16_000_000  # about 25 s of 16 devices at 1 kHz with six axes
+BACKLOG_BYTES: Final = 16_000_000  # holds about 25 s of samples of 16 six-axis devices at 1 kHz
 CONFIRM_PERIOD_S: Final = 1.0  # interval between checks that drawn data have reached the viewer
-PATIENCE_S: Final = 1.0  # timeout of this check
-STALL_TIMEOUT_S: Final = 2.0  # a viewer is stalled if one Rerun call takes longer
+PATIENCE_S: Final = 1.0  # timeout of a check for delivery
+STALL_TIMEOUT_S: Final = 2.0  # longest duration of a Rerun call before the viewer is stalled
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
-PLOTS_PER_S: Final = 8.0  # rate of Allan plots, shared by all devices; at most one per second and device
-MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes sooner does not work on this host
+PLOTS_PER_S: Final = 8.0  # total rate of Allan plots of all devices
+MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window with a shorter lifetime does not work on this host
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
 HistorySource = Callable[[str], HistoryTable | None]
@@ -51,7 +51,7 @@ class RerunView:
     history_source
         Function that returns the stored history of a device. The thread of the viewer calls this function.
     fleet
-        True if further devices are shown only in a ``DeviceTableText``.
+        True if the device table also contains devices that are not shown in detail.
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class RerunView:
         thread.join(0.75 * timeout_s)
         child = self._child
         if thread.is_alive() and child is not None:
-            child.kill()  # ends the wait of the thread for a viewer that does not respond
+            child.kill()  # unblocks the thread if the viewer does not respond
         thread.join(0.25 * timeout_s)
         self._phase = "closed"
 
@@ -140,7 +140,7 @@ class RerunView:
                 self._phase = str(trouble)
             except ImportError as missing:
                 self._phase = MISSING if missing.name in ("rerun", "rerun_cli", "rerun_bindings") else str(missing)
-            except Exception as error:  # noqa: BLE001 - reported in state; a drawing error must not end the view
+            except Exception as error:  # noqa: BLE001 - the state reports the error, and the view continues
                 self._phase = f"{type(error).__name__}: {error}"
             settings, attempt = self._wait_and_select_mode(settings, started, attempt)
 
@@ -195,7 +195,7 @@ class RerunView:
             closing = self._closing.is_set()
             waiting.add_results(
                 self._backlog.take(0.0)
-            )  # before the devices are read, so that the device of each result is known
+            )  # taken before the devices are read, so that the device of each result is known
             self._inside_since = time.monotonic()
             if self._devices is not shown:
                 shown = self._devices

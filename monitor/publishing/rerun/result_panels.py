@@ -46,8 +46,7 @@ if TYPE_CHECKING:
 
 TEMPERATURES_PER_S: Final = 5.0
 MAX_INTERMEDIATE_POINTS: Final = 20
-"""Number of points between two estimates if the estimator provides coefficients for every sample. More points could not
-be distinguished and would overload the viewer."""
+"""Largest number of points between two estimates. More points would overload the viewer."""
 MAX_PAST_EVENTS: Final = 200
 """Largest number of stored events that are shown."""
 WARNING_EVENTS: Final = frozenset({
@@ -354,7 +353,7 @@ class EventsPanel(Panel):
         """Log events and mark changed coefficients."""
         for at_s, event in zip(unix_s.tolist(), results, strict=True):
             level = "ERROR" if event.kind == "link_lost" else "WARN" if event.kind in WARNING_EVENTS else "INFO"
-            clock_time = format_utc(at_s)[-8:]  # the date column of the viewer is too narrow for the time
+            clock_time = format_utc(at_s)[-8:]  # the time column of the viewer is too narrow for the time of day
             self.scene.set_log_time(at_s)
             if self.scene.fleet or len(self.scene.devices) > 1:
                 line = rr.TextLog(f"{clock_time}  {self.device}: {event.text}", level=level)
@@ -366,7 +365,7 @@ class EventsPanel(Panel):
     def draw_history(self, history: HistoryTable) -> None:
         """Log the stored events."""
         for one in history.events[-MAX_PAST_EVENTS:]:
-            text = f"{format_utc(one.t_s)[:10]}: {one.text}"  # a log line otherwise shows only the time of day
+            text = f"{format_utc(one.t_s)[:10]}: {one.text}"  # a log line shows only the time of day
             self.draw(np.array([one.t_s]), [Event(one.kind, round(one.t_s * 1e9), text, one.axis, one.what)])
 
     def _mark_changes(self, unix_s: float, event: Event) -> None:
@@ -380,7 +379,7 @@ class EventsPanel(Panel):
 
 
 class HealthPanel(Panel):
-    """Health of the device as text."""
+    """Health of the device. The panel also updates the table of all devices."""
 
     def draw(self, unix_s: Floats, results: Sequence[Health]) -> None:
         """Draw the newest health of the device."""

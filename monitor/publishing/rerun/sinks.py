@@ -36,11 +36,11 @@ from monitor.publishing.rerun.viewer_settings import ViewerClosed, ViewerError, 
 
 LOOPBACK: Final = "127.0.0.1"
 APPLICATION: Final = "imu-monitor"
-START_TIMEOUT_S: Final = 20.0  # a 300 MB program may start from a slow disk
+START_TIMEOUT_S: Final = 20.0  # the program of 300 MB may start from a slow disk
 PORTS_TRIED: Final = 20
 CLOSED: Final = "viewer was closed: start `rerun` to open it again"
-PROGRAM_MIB: Final = 256  # memory of the program itself; an empty viewer window uses 125 to 170 MB
-LIVE_FLUSH_PERIOD_S: Final = 0.2  # appears continuous; each chunk costs about 1 kB in addition to the data
+PROGRAM_MIB: Final = 256  # memory of the viewer without data; an empty window uses 125 to 170 MB
+LIVE_FLUSH_PERIOD_S: Final = 0.2  # each chunk costs about 1 kB in addition to the data
 PROBE_METHOD: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
 
 
@@ -277,7 +277,7 @@ def _open_file(path: Path, recording_id: str) -> RerunOutput:
             raise ViewerError(f"cannot lock {path}: {error.strerror}") from error
     try:
         stream = _stream(recording_id)
-        # A footer would keep an entry for every chunk in memory while the daemon runs.
+        # A footer would need memory for every chunk while the daemon runs.
         stream.set_sinks(rr.FileSink(path, write_footer=False))
     except BaseException:
         lock.close()

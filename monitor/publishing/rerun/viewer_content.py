@@ -34,7 +34,7 @@ class Scene:
     stream
         Stream of the viewer.
     fleet
-        True if further devices have only a row in the table of all devices.
+        True if the device table also contains devices that are not shown in detail.
     """
 
     def __init__(self, stream: rr.RecordingStream, fleet: bool = False) -> None:

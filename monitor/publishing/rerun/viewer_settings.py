@@ -15,10 +15,10 @@ class ViewerClosed(ViewerError):
 class ViewerSettings:
     """Settings of the viewer."""
 
-    mode: str = "auto"  # auto, native, web, none, a path that ends in .rrd, or join to use only an open viewer
+    mode: str = "auto"  # auto, native, web, none, join (use an open viewer) or a path with the suffix .rrd
     port: int = 9876  # port of the Rerun server on the loopback interface
     web_port: int = 9090  # port of the web page on the loopback interface
-    memory: str = "256MiB"  # memory for past data in the viewer; the oldest data are dropped first
+    memory: str = "256MiB"  # memory limit for data in the viewer, which drops the oldest data first
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from monitor.publishing.remote_devices import DeviceCoefficients
 from monitor.publishing.terminal.tables import WidthDependentTable, plain_table
 
 K_OR_R: Final = "K or R"
-"""Text for K and R if the data do not show which of the two is present."""
+"""Text for K and R if the data cannot distinguish K from R."""
 
 
 def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()) -> RenderableType:

@@ -29,7 +29,7 @@ from monitor.history.history_table import ColumnStatistics, HistoryTable
 from monitor.publishing.terminal.tables import plain_table
 
 LETTERS: Final = ("N", "B", "K")
-"""Coefficients that are shown for all axes. For a single axis, all five are shown."""
+"""Coefficients that the table of all axes shows. The table of a single axis shows all five coefficients."""
 SPARKLINE_HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 GAP: Final = "·"
 SPARKLINE_WIDTH: Final = 32

@@ -36,7 +36,7 @@ from monitor.publishing.terminal.tables import plain_table, unwrapped_table_widt
 
 MAX_PROBLEM_LINES: Final = 6
 HEADER_LINES: Final = 6
-"""Number of lines for the summary, the note, the head of the table and blank lines."""
+"""Number of lines for the summary, the note, the table header and blank lines."""
 MIN_ROWS: Final = 3
 TABLE_COEFFICIENTS: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
 STATES: Final = {
@@ -58,7 +58,7 @@ class DeviceTableLayout:
 
     digits: int
     full_counts: bool
-    stacked: bool  # True if each axis has a line of its own
+    stacked: bool  # True if each axis has a separate line
     gap: int  # number of blanks between columns
 
 

@@ -25,16 +25,16 @@ from monitor.publishing.bounded_queue import BoundedQueue
 MAX_QUEUED_CHARACTERS: Final = 256 * 1024
 """Maximum length of the queued text, about 2000 log lines."""
 CHUNK_BYTES: Final = 1024
-"""Length of one write call. It is small, so that a slow terminal can be distinguished from a blocked terminal."""
+"""Length of one write call, which is short to distinguish a slow terminal from a blocked terminal."""
 BLOCKED_S: Final = 2.0
-"""Duration above which a write is considered blocked."""
+"""Longest duration of a write call that is not considered blocked [s]."""
 FRAME_DELAY_S: Final = 0.05
-"""Delay before a frame is drawn, so that results published together appear in one frame."""
+"""Delay before a frame is drawn, which combines simultaneous results in one frame [s]."""
 IDLE_WAIT_S: Final = 1.0
 CLOSE_S: Final = 2.0
 
 Render = Callable[[Sequence[str], bool], str]
-"""Function that returns the text to write, given the queued lines and True for the last call."""
+"""Function that converts queued lines to text. The second argument is True for the last call."""
 
 
 class QueuedWriter:
@@ -43,18 +43,17 @@ class QueuedWriter:
     Parameters
     ----------
     stream : TextIO or None
-        Destination. Text for a stream without a file descriptor is written directly. None discards the text.
+        Destination. Text for a stream without a file descriptor is written by the caller. None discards the text.
     place : str
         Name of the destination in messages, such as "standard error".
     render : callable, optional
-        Converts the queued lines to the text that is written. It runs in the thread. By default, lines are joined.
+        Function that converts queued lines to text in the thread. By default, lines are joined.
     period_s : float, optional
-        Interval in seconds at which ``render`` is called without queued lines. By default, ``render`` is called only
-        for lines.
+        Interval [s] between calls of ``render`` without queued lines. By default, ``render`` is called only for lines.
     limit : int
         Number of queued characters above which the oldest entries are dropped. The newest entry is always kept.
     tell : callable, optional
-        Function that receives a sentence about dropped lines as soon as text can be written again.
+        Function that receives a report of dropped lines when the destination accepts text again.
     """
 
     def __init__(
@@ -77,10 +76,10 @@ class QueuedWriter:
         self._lost_lines = 0  # number of lines taken from the queue but not written
         self._told_lines = 0  # number of dropped lines that were reported through tell
         self._lost_frames = 0
-        self._reason = ""  # why the newest lines were lost
+        self._reason = ""  # reason for the loss of the newest lines
         self._write_since_s: float | None = None  # monotonic time at which the current write call began
         self._closing = threading.Event()
-        self._given_up = False  # True if the thread did not end in time
+        self._given_up = False  # True if the thread did not end before the timeout
         self._thread = threading.Thread(target=self._run, name=f"writer of {place}", daemon=True)
 
     def __enter__(self) -> "QueuedWriter":
@@ -121,7 +120,7 @@ class QueuedWriter:
         """Request a call of ``render`` before the end of the period."""
         self._queue.wake()
 
-    def wait_until_written(self, stop: threading.Event) -> None:
+    def finish_writing(self, stop: threading.Event) -> None:
         """End the thread, and wait until all queued text is written or ``stop`` is set."""
         self._begin_closing()
         while self._thread.is_alive() and not stop.is_set():
@@ -145,7 +144,7 @@ class QueuedWriter:
 
     def _run(self) -> None:
         while True:
-            closing = self._closing.is_set()  # read before the queue, so that lines queued before close() are written
+            closing = self._closing.is_set()  # read before the queue, so that lines before close() are written
             lines = self._queue.take(0.0 if closing else self._period_s or IDLE_WAIT_S)
             if self._period_s is not None and not closing:
                 self._closing.wait(FRAME_DELAY_S)
@@ -177,7 +176,7 @@ class QueuedWriter:
     def _rendered(self, lines: list[str], last: bool) -> tuple[str, Exception | None]:
         try:
             return self._render(lines, last), None
-        except Exception as error:  # noqa: BLE001 - a frame that cannot be drawn must not end the log; shown in state
+        except Exception as error:  # noqa: BLE001 - the state reports the error, and the log continues
             self._lost_frames += 1
             return "".join(lines), error
 
@@ -227,7 +226,7 @@ class QueuedWriter:
 
     def _begin_closing(self) -> None:
         self._closing.set()
-        self._queue.push("", 0)  # unlike wake(), an entry is not lost if the thread does not wait yet
+        self._queue.push("", 0)  # unlike wake(), an entry also reaches a thread that does not wait yet
 
 
 class QueuedLines(io.TextIOBase):

@@ -18,7 +18,7 @@ REFRESH_PERIOD_S: Final = 0.5
 PLAIN_PERIOD_S: Final = 1.0
 """Interval between two tables if the output is not a terminal."""
 SILENCE_NOTE_S: Final = 5.0
-"""Time without any message after which a note is shown, because access control refuses silently."""
+"""Time without messages before a note is shown [s], because access control gives no error."""
 STDOUT: Final = "standard output"
 
 
@@ -45,14 +45,14 @@ def watch(
     console
         Console that formats the table.
     once_s
-        Time to collect messages [s], after which the table is printed once. By default, the table is updated.
+        Time to collect messages [s] before the table is printed once. By default, the table is updated.
     file
         Configuration file of zenoh.
 
     Raises
     ------
     ConfigError
-        If zenoh rejects the key expression, an endpoint or the file with certificates and passwords.
+        If zenoh rejects the key expression, an endpoint or the configuration file.
     OSError
         If standard output cannot be written.
     """
@@ -67,7 +67,7 @@ def watch(
             stop.wait(once_s)
             _receive_messages(states, subscriber)
             with QueuedWriter(stream, STDOUT, LiveTable(console, states).render) as writer:
-                writer.wait_until_written(stop)
+                writer.finish_writing(stop)
         elif console.is_terminal:
             with QueuedWriter(stream, STDOUT, LiveTable(console, states).render, REFRESH_PERIOD_S) as writer:
                 while not stop.wait(REFRESH_PERIOD_S) and writer.error is None:

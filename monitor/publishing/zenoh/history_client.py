@@ -32,7 +32,7 @@ def query_histories(
     Parameters
     ----------
     endpoint
-        Endpoint of a daemon or router. By default, the first endpoint in the file, or else the default endpoint.
+        Endpoint of a daemon or router. By default, the first endpoint in the file is used, or the default endpoint.
     device
         Name of the device; ``*`` for all devices.
     parameters
@@ -45,9 +45,9 @@ def query_histories(
     Raises
     ------
     ConfigError
-        If the endpoint, the file or the query is not valid.
+        If the endpoint, the configuration file or the query is invalid.
     LinkUnavailable
-        If no daemon is reachable, accepts the connection or replies.
+        If no daemon can be reached, or if no daemon accepts the connection or replies.
     NotReady
         If the time range contains no results.
     """

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 MAX_QUEUED_QUERIES: Final = 64
 """Capacity of the queue of commands and of each channel of queries."""
 DUPLICATE_REPORT_S: Final = 10.0
-"""Another program that publishes under the same key is reported for this time after its last message [s]."""
+"""Time for which another program with the same key is reported after its last message [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +57,8 @@ class Command:
 
 
 HistoryFunction = Callable[[str, str], bytes]
-"""Function that returns the payload with the history of a device, given the name of the device and the parameters of a
-selector. The function raises ImuError if there is no history."""
+"""Function that returns the encoded history, given a device name and selector parameters. Without a history, the
+function raises ImuError."""
 
 
 class ZenohPublisher(RetriedSession):
@@ -71,7 +71,7 @@ class ZenohPublisher(RetriedSession):
     devices
         Names of the devices.
     read_history
-        Function that answers queries of ``history``; None if no history is stored.
+        Function that answers history queries, or None if no history is stored.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class ZenohPublisher(RetriedSession):
         self.commands: queue.Queue[Command] = queue.Queue(MAX_QUEUED_QUERIES)
         self._devices = tuple(devices)
         self._alive: dict[str, bool] = dict.fromkeys(devices, False)
-        self._refusal = ""  # reason why the connection is refused, from the newest check
+        self._refusal = ""  # reason why the endpoints refuse the connection
         self._connect: tuple[str, ...] = settings.connect
         self._publishers: dict[str, zenoh.Publisher | AdvancedPublisher] = {}
         self._tokens: dict[str, Any] = {}
@@ -93,7 +93,7 @@ class ZenohPublisher(RetriedSession):
         self._duplicates = _DuplicatePublishers(settings.prefix)
         # The thread that opens the session declares all devices. The main loop adds and removes devices.
         self._declaring = threading.Lock()
-        self._token_lock = threading.Lock()  # both threads declare liveliness tokens
+        self._token_lock = threading.Lock()  # the opening thread and the main loop declare liveliness tokens
 
     @property
     def state(self) -> str:
@@ -112,7 +112,7 @@ class ZenohPublisher(RetriedSession):
         """Open the session in a separate thread, unless the mode is ``none``."""
         if self.settings.mode == "none":
             return
-        # A thread that still receives from zenoh while the interpreter exits would abort the process.
+        # A thread that receives from zenoh at exit would abort the process.
         atexit.register(self.close)
         super().start()
 
@@ -280,7 +280,7 @@ class ZenohPublisher(RetriedSession):
         from zenoh import ext
 
         encoding, drop = zenoh.Encoding(topic.encoding), zenoh.CongestionControl.DROP
-        express = topic.when != "batches"  # results are sent at once; batches of samples may share a packet
+        express = topic.when != "batches"  # results are sent immediately; batches of samples may share a packet
         if not topic.kept:
             return session.declare_publisher(key, encoding=encoding, congestion_control=drop, express=express)
         return ext.declare_advanced_publisher(
@@ -300,7 +300,7 @@ class ZenohPublisher(RetriedSession):
         if session is None:
             return
         key = topics.ALIVE.key(self.settings.prefix, device)
-        # An error here means that the session is closing, which removes the token.
+        # An error means that the session is closing, which also removes the token.
         with self._token_lock, contextlib.suppress(*zenoh_errors()):
             if self._alive[device] and device not in self._tokens:
                 self._tokens[device] = session.liveliness().declare_token(key)
@@ -328,7 +328,7 @@ class ZenohPublisher(RetriedSession):
 
     def _queue_command(self, device: str, query: Any) -> None:
         verb = str(query.key_expr).rsplit("/", 1)[-1]
-        key = f"{self.settings.prefix}/{device}/command/{verb}"  # the query itself may select several devices
+        key = f"{self.settings.prefix}/{device}/command/{verb}"  # the key of the query may select several devices
         command = Command(device, verb, *_reply_functions(query, key))
         try:
             self.commands.put_nowait(command)

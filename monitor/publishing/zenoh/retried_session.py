@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     import zenoh
 
 REFUSAL_CHECK_S: Final = 3.0
-"""Interval between two checks of why an endpoint refuses the connection."""
+"""Interval between two checks of a refused connection [s]."""
 RETRY_S: Final = 1.0
 JOIN_TIMEOUT_S: Final = 2.0
 
@@ -22,7 +22,7 @@ class RetriedSession:
     """Base class of zenoh sessions that repeat failed attempts to connect."""
 
     close_timeout_s = 2.0
-    """Longest time that ``close`` waits for a session that is being opened [s]."""
+    """Longest time [s] that ``close`` waits for the opening of a session."""
 
     def __init__(self, name: str) -> None:
         self.closing = threading.Event()
@@ -66,7 +66,7 @@ class RetriedSession:
             else:
                 break
         self._monitor_connection()
-        if self.closing.is_set():  # close() may have stopped waiting before the session was open
+        if self.closing.is_set():  # close() may have returned before the session was open
             self._close_session()
 
     def _close_session(self) -> None:
@@ -84,7 +84,7 @@ class RetriedSession:
         self._receivers = [*(one for one in self._receivers if one.is_alive()), thread]
 
     def _receive(self, source: Any, process: Callable[[Any], None]) -> None:
-        handler = source.handler  # while a thread waits on the source itself, the source cannot be undeclared
+        handler = source.handler  # a source with a waiting thread could not be undeclared
         while not self.closing.is_set():
             try:
                 received = handler.recv()

@@ -42,13 +42,13 @@ DETAIL_TOPICS: Final = (topics.SAMPLES, topics.ALLAN, topics.GAP)
 RING_MESSAGES: Final = 4096
 BACKLOG_BYTES: Final = 16_000_000
 MAX_MESSAGE_BYTES: Final = 4_000_000
-"""Longest accepted message. The longest messages are sample batches of a fast replay; others have a few kilobytes."""
+"""Longest accepted message. The longest messages are sample batches of a fast replay."""
 CONNECTION_CHECK_S: Final = 0.25
 """Interval between two checks that an endpoint is still connected."""
 MAX_TOKENS: Final = 20_000
-"""Largest number of liveliness tokens that are remembered per endpoint."""
+"""Largest number of stored liveliness tokens for each endpoint."""
 MAX_REMEMBERED_MESSAGES: Final = 20_000
-"""Number of messages that are remembered to find duplicates; enough for two seconds of 1000 devices at 10 Hz."""
+"""Number of stored messages for the detection of duplicates, for two seconds of 1000 devices at 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,16 +68,16 @@ class ZenohSubscriber:
     keyexpr
         Key expression that selects devices or topics, e.g. ``imu/**``, ``imu/bench-1``, ``*/*/status``.
     connect
-        Endpoints of daemons or routers. If empty, the endpoints of the file are used, or else the default endpoint.
+        Endpoints of daemons or routers. By default, the endpoints in the file or the default endpoint.
     file
-        Configuration file of zenoh for all other settings (TLS, user and password).
+        Configuration file of zenoh with TLS, user and password.
     detail
-        Keys of devices whose samples and curves are also received, e.g. ``imu/bench-1``.
+        Keys of devices with samples and Allan deviations, such as ``imu/bench-1``.
 
     Raises
     ------
     ConfigError
-        If zenoh rejects the key expression, an endpoint or the file, or other users may modify the file.
+        If zenoh rejects the key expression, an endpoint or the file, or if other users may modify the file.
     """
 
     def __init__(
@@ -174,7 +174,7 @@ class _EndpointSession(RetriedSession):
     ) -> None:
         self.endpoint = mask_secrets(endpoint)
         super().__init__(self.endpoint)
-        self.refusal = ""  # reason why the connection is refused, from the newest check; "" if no program listens there
+        self.refusal = ""  # reason why the endpoint refuses the connection; empty if no program listens
         self._endpoint, self._config, self._keys, self._push = endpoint, config, keys, push
         self._tokens: set[str] = set()  # keys of existing liveliness tokens
         self._since_s: float | None = None  # monotonic time at which the connection was established [s]
@@ -263,14 +263,14 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
     Parameters
     ----------
     connect
-        Endpoints. If empty, the endpoints of the file are used, or else the default endpoint of a daemon.
+        Endpoints of daemons or routers. By default, the endpoints in the file or the default endpoint.
     file
         Configuration file of zenoh.
 
     Raises
     ------
     ConfigError
-        If an endpoint or the file is not valid, or other users may modify the file.
+        If an endpoint or the file is invalid, or if other users may modify the file.
     """
     import zenoh
 
