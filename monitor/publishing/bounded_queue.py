@@ -8,7 +8,7 @@ T = TypeVar("T")
 
 
 class BoundedQueue(Generic[T]):
-    """Thread-safe queue that limits the total weight of the queued items, for example their size in bytes.
+    """Thread-safe queue that limits the total weight of the queued items, such as their size in bytes.
 
     >>> backlog = BoundedQueue[str](limit=2)
     >>> for word in ("a", "b", "c"):

@@ -63,7 +63,7 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
 
     @classmethod
     def coefficient_from_history(cls, past: HistoryTable, value_column: str) -> Self:
-        """Build the history of a coefficient from the column of its values, such as gz.N."""
+        """Build the history of a coefficient from the value column, such as gz.N."""
         value, bound = past.column(value_column), past.column(f"{value_column}.bound")
         lo, hi = (past.column(f"{value_column}.{end}") for end in ("lo", "hi"))
         estimated, bounded = value.n > 0, bound.n > 0

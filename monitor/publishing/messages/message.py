@@ -81,7 +81,7 @@ def decode_message(message_type: type[M], payload: bytes, max_bytes: int = MAX_P
     if len(payload) > max_bytes:
         raise ValueError(f"the payload has {len(payload)} bytes; at most {max_bytes} are read")
     try:
-        found = _decoder(message_type).decode(payload)  # its errors are ValueErrors
+        found = _decoder(message_type).decode(payload)  # decoding errors are ValueErrors
     except RecursionError as error:
         raise ValueError(str(error)) from error
     if not isinstance(found, message_type):

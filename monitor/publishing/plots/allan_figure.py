@@ -82,9 +82,9 @@ def additional_deviations(
     Parameters
     ----------
     total
-        Total variance; None to omit it.
+        Total variance, or None.
     hadamard
-        Hadamard variance; None to omit it.
+        Hadamard variance, or None.
     """
     found = []
     if total is not None:

@@ -31,8 +31,8 @@ from monitor.publishing.plots.style import COLOURS, GREY, create_figure, figure_
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-INCHES: Final = (7.2, 7.6)  # size of one Allan plot and the table below it
-COLUMNS: Final = (0.0, 0.46, 0.65, 0.84)  # left edges of the table's columns, as shares of its width
+INCHES: Final = (7.2, 7.6)  # size of one Allan plot with table
+COLUMNS: Final = (0.0, 0.46, 0.65, 0.84)  # left edges of the columns, as shares of the table width
 TABLE_LEGEND: Final = (
     "small print: 95 % interval;  ≤ one-sided 95 % bound;  — too few data;  K or R: the data do not show which"
 )

@@ -155,7 +155,7 @@ def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Float
         colour = np.log(divide_by_time_median(dynamic)[:, :, i].T)
     median = _median(dynamic)[:, :, i]
     usual = (dynamic.lo[:, :, i] <= median) & (median <= dynamic.hi[:, :, i])
-    alpha: Any = np.where(usual.T, PALE_ALPHA, 1.0)  # matplotlib accepts an array, but its type hints do not
+    alpha: Any = np.where(usual.T, PALE_ALPHA, 1.0)  # matplotlib accepts an array, but the type hints do not
     mesh = panel.pcolormesh(
         edges, _tau_edges(dynamic.tau_s), colour,
         cmap="RdBu_r", vmin=-np.log(ratio), vmax=np.log(ratio), alpha=alpha, rasterized=True, linewidth=0,

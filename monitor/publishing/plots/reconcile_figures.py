@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MARGINS_INCHES: Final = (0.58, 0.15, 0.30, 0.44)  # left, right, top and bottom of a panel, for its labels
+MARGINS_INCHES: Final = (0.58, 0.15, 0.30, 0.44)  # left, right, top and bottom margins for the labels of a panel
 BAND_COLOUR: Final = "#cfd5dd"
 RANGE_TEXT_COLOUR: Final = "#8a5a00"
 ABOVE_THRESHOLD_COLOUR: Final = "#b3261e"
 BELOW_THRESHOLD_COLOUR: Final = "#1b7f4d"
 MAX_MARKERS: Final = 60  # largest number of points that are drawn with markers
-MARGIN_SHARE: Final = 0.06  # margin above and below the curves, as a share of their height
+MARGIN_SHARE: Final = 0.06  # margin above and below the curves, as a share of the height of the curves
 MAX_BAND_SHARE: Final = 0.35  # a band extends a panel by at most this share of the height of the curves
 LOWEST_SHARE: Final = 0.02  # share of the points that may lie below a logarithmic panel
 MIN_RANGE_SHARE: Final = 0.08  # a range narrower than this share of the width has a detail plot

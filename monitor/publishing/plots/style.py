@@ -78,7 +78,7 @@ LABEL_BOX: Final[dict[str, Any]] = {
 }
 """Box behind a label inside a panel, which keeps the text legible over curves."""
 TIME_UNITS: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
-"""Name of each time unit, its length [s], and the duration [s] below which the unit is used."""
+"""Name and length [s] of each time unit, and the duration [s] below which the unit is used."""
 
 
 def axis_colour(axis: str) -> str:
@@ -155,7 +155,7 @@ def to_svg_element(figure: "Figure", description: str) -> str:
     element = text.getvalue()[text.getvalue().index("<svg") :]
     element = re.sub(r' (?:width|height)="[\d.]+pt"', "", element, count=2)
     element = element.replace("<svg", f'<svg role="img" aria-label="{html.escape(description)}"', 1)
-    element = re.sub(r'<g id="[^"]*"', "<g", element)  # nothing refers to these identifiers
+    element = re.sub(r'<g id="[^"]*"', "<g", element)  # the identifiers are not used
     element = re.sub(r"<[^>]*>", lambda tag: re.sub(r"\d+\.\d{3,}", _shorten, tag[0]), element)
     element = re.sub(r"\n(?:L )?\s*", " ", element)  # without a letter, a path continues with lines
     prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # figures on a page need different identifiers
@@ -264,7 +264,7 @@ def omit_wide_intervals(value: Floats, lo: Floats, hi: Floats) -> tuple[Floats, 
     Parameters
     ----------
     value, lo, hi
-        Values and ends of their intervals, of one shape.
+        Values and interval ends, of equal shape.
     """
     near = (lo * MAX_INTERVAL_RATIO > value) & (hi < value * MAX_INTERVAL_RATIO)
     return np.where(near, lo, np.nan), np.where(near, hi, np.nan)

@@ -18,8 +18,8 @@ from monitor.publishing.reports import reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
 from monitor.reconcile.result import AxisResult, DiagnosticGap, DiagnosticSnapshot, PlotData, Reconciliation
 
-RANGE_INCHES: Final = (8.0, 3.3)  # plot of a range in its diagnostic, without a detail plot
-RANGE_WITH_DETAIL_INCHES: Final = (4.9, 3.3)  # the same plot next to a detail plot
+RANGE_INCHES: Final = (8.0, 3.3)  # size of a plot without a detail plot
+RANGE_WITH_DETAIL_INCHES: Final = (4.9, 3.3)  # size of a plot next to a detail plot
 DETAIL_INCHES: Final = (3.33, 3.3)
 PAIR_INCHES: Final = (6.8, 2.35)
 SINGLE_INCHES: Final = (3.4, 2.05)

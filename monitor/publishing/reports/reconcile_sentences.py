@@ -1,6 +1,6 @@
 """Sentences and formatted values for the results of ``reconcile``.
 
-The HTML report, the viewer and the terminal share these texts. Values in SI units are converted to displayed units. For
+The HTML report, the viewer and the terminal share the texts. Values in SI units are converted to displayed units. For
 example, a small angular rate is displayed in °/h and a large rate in °/s. The 95 % interval of a value determines the
 number of digits.
 """
@@ -90,7 +90,7 @@ class FormattedParameter:
     name: str
     value: str  # "30.94", "ax"
     interval: str  # "30.4 … 31.5", the 95 % interval
-    short: str  # "30.94 ± 0.55 °/h", with its unit
+    short: str  # "30.94 ± 0.55 °/h", with the unit
     unit: str  # "°/h"
     given: str  # value in the model under test, if the model has the effect exactly once
 

@@ -118,7 +118,7 @@ def band_strokes(low: Floats, high: Floats) -> Floats:
 
 
 def interval_strokes(low: Floats, high: Floats) -> Floats:
-    """Return one vertical stroke per point from the lower to the upper end of its interval, shape [n, 2, 2].
+    """Return one vertical stroke per point from the lower to the upper end of the interval, shape [n, 2, 2].
 
     Parameters
     ----------
@@ -142,7 +142,7 @@ class ChartGrid:
 
 
 def chart_grid(scale: ChartScale) -> ChartGrid:
-    """Return grid lines at powers of ten and at their multiples, and tick labels outside the box."""
+    """Return grid lines at powers of ten and at multiples, and tick labels outside the box."""
     x_at, x_minor = _line_positions(scale.x, WIDTH)
     y_at, y_minor = _line_positions(scale.y, HEIGHT)
     flip = HEIGHT

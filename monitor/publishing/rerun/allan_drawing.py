@@ -31,7 +31,7 @@ from monitor.publishing.rerun.allan_chart import (
 )
 
 Log = Callable[..., Any]
-"""Function that logs an entity, given its path and its components."""
+"""Function that logs an entity, given the path and the components."""
 
 
 class AllanPlot:

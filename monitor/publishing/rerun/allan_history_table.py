@@ -1,7 +1,7 @@
 """History of the Allan deviations of a device, in a table of limited size for the live view.
 
 Each column is the mean logarithmic deviation of all estimates in a time interval. When the table has COLUMNS columns,
-neighbouring columns are averaged in pairs, and the time interval of a column doubles. The table therefore covers the
+neighbouring columns are averaged in pairs, and the time interval of a column doubles. The table covers the
 whole history with constant memory.
 """
 

@@ -57,7 +57,7 @@ class FleetView:
     subscriber
         Subscriber, including the topics of devices shown in detail.
     viewer
-        Viewer of the devices shown in detail, which are named by their keys.
+        Viewer of the devices shown in detail.
     detail
         Keys of the devices shown in detail.
     """

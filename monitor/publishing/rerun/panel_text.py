@@ -87,7 +87,7 @@ def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: s
     Parameters
     ----------
     devices
-        Devices in the order of their rows.
+        Devices in the order of the rows.
     now_s
         Current time on the clock of the messages [s].
     rows

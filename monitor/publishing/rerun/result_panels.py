@@ -133,7 +133,7 @@ class SamplesPanel(Panel):
     """Time series of temperature and decimated samples."""
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         self._style_samples("samples", AXES)
         self._style_lines("temperature", [("temperature, °C", colours.TEMPERATURE, 1.5)])
 
@@ -157,7 +157,7 @@ class CompensatedPanel(Panel):
     """Time series of the angular rates after drift removal, decimated for display."""
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         self._style_samples("compensated", axes_of("gyro"))
 
     def draw(self, unix_s: Floats, results: "Sequence[CompensatedRows]") -> None:
@@ -169,7 +169,7 @@ class DriftPanel(Panel):
     """Time series of the gyroscope drift, with a table of the drift models."""
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         unit = DEVIATION_UNITS["gyro"].name
         for axis in axes_of("gyro"):
             colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
@@ -215,7 +215,7 @@ class ThermalPanel(Panel):
     """Mean bias of each axis, and the one-step prediction with the interval that triggers events."""
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         for axis in AXES:
             colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
             unit = DEVIATION_UNITS[sensor_kind(axis)].name
@@ -259,7 +259,7 @@ class GapPanel(Panel):
     newest: ModelGap | None = None
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         for axis in AXES:
             self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", colours.AXIS_COLOURS[axis], 1.5)])
         self._style_lines("gap/threshold", [("threshold", colours.blend_colours(colours.TEXT, 0.6), 1.0)])
@@ -296,7 +296,7 @@ class CoefficientsPanel(Panel):
     """Time series of the noise coefficients with intervals."""
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         for axis in AXES:
             colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
             for symbol in SYMBOLS:
@@ -338,7 +338,7 @@ class CoefficientsPanel(Panel):
         unix_s
             Unix times [s], shape [n].
         values
-            Values, shape [n], or values with the ends of their intervals, shape [n, 3]; SI.
+            Values, shape [n], or values with interval ends, shape [n, 3], in SI units.
         name
             End of the name of the entity.
         """

@@ -5,7 +5,7 @@ daemon. The viewer program is started directly, because the Python wrapper would
 The program listens only on the loopback interface and sends no usage statistics.
 
 Rerun raises no error for a port in use, so ports are checked first. A window joins a Rerun server that already listens
-on the port. The web page uses the next free port. Importing this module imports Rerun.
+on the port. If the port of the web page is in use, the next free port is used. Importing this module imports Rerun.
 """
 
 import contextlib
@@ -109,7 +109,7 @@ class RerunOutput:
     url: str = ""  # address of the page or of the Rerun server
     child: ViewerProcess | None = None
     port: int | None = None  # port of the Rerun server; None for a file
-    note: str = ""  # configured ports that were in use, and their replacements
+    note: str = ""  # configured ports that were in use, and the replacement ports
     lock: IO[bytes] | None = None  # lock against other processes that write the file
 
     def check_viewer(self) -> None:

@@ -77,7 +77,7 @@ class Scene:
         panel
             Name of the class of the panel.
         results
-            At least one result with its Unix time [s], in order of time.
+            At least one result with Unix time [s], in order of time.
         """
         kind: type[Panel] = getattr(panels, panel)
         self.get_or_create_panel(device, kind).draw(

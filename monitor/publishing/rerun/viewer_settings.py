@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 
 class ViewerError(Exception):
-    """Error of a viewer that cannot be opened or has ended. The message is one line for the user."""
+    """Error of a viewer that cannot be opened or has ended."""
 
 
 class ViewerClosed(ViewerError):
@@ -28,5 +28,5 @@ class DeviceInfo:
     name: str
     about: str = ""  # short description: decoder, link, port
     has_model: bool = False  # True if the device is compared with a noise model
-    has_thermal: bool = False  # True if the bias of the device is predicted from its temperature
+    has_thermal: bool = False  # True if the bias of the device is predicted from temperature
     compensated: bool = False  # True if the gyroscope drift of the device is compensated

@@ -31,7 +31,7 @@ def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()
     estimate
         The estimate.
     axes_of_temperature
-        Axes to mark because temperature explains most of their slow variance.
+        Axes to mark, on which temperature explains most of the slow variance.
     """
     return Group(*coefficient_tables(DeviceCoefficients.from_estimate(estimate), axes_of_temperature))
 
@@ -46,7 +46,7 @@ def coefficient_tables(
     coefficients
         Coefficients of the device.
     axes_of_temperature
-        Axes to mark because temperature explains most of their slow variance.
+        Axes to mark, on which temperature explains most of the slow variance.
     """
     time_text = "" if coefficients.filled_s is None else f"last {format_duration(coefficients.filled_s)}; "
     marks = f"; {K_OR_R}: one of them" if coefficients.k_or_r else ""

@@ -14,9 +14,9 @@ def plain_table(*headers: str, wrapped_headers: Sequence[str] = (), gap: int = 2
     Parameters
     ----------
     *headers
-        Headers of the first columns. Their cells are not wrapped.
+        Headers of the first columns, without line wrapping.
     wrapped_headers
-        Headers of the next columns. Their cells may be wrapped.
+        Headers of the next columns, with line wrapping.
     gap
         Number of blanks between columns.
     show_header

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 MAX_QUEUED_QUERIES: Final = 64
 """Capacity of the queue of commands and of each channel of queries."""
 DUPLICATE_REPORT_S: Final = 10.0
-"""Time for which another program with the same key is reported after its last message [s]."""
+"""Time for which another program with the same key is reported after the last message [s]."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,7 +91,7 @@ class ZenohPublisher(RetriedSession):
         self._tokens: dict[str, Any] = {}
         self._queryables: dict[str, list[Any]] = {}
         self._duplicates = _DuplicatePublishers(settings.prefix)
-        # The thread that opens the session declares all devices. The main loop adds and removes devices.
+        # The opening thread and the main loop both declare devices.
         self._declaring = threading.Lock()
         self._token_lock = threading.Lock()  # the opening thread and the main loop declare liveliness tokens
 
@@ -176,7 +176,7 @@ class ZenohPublisher(RetriedSession):
             self._update_token(device)
 
     def add_device(self, device: str) -> None:
-        """Add a device and declare its keys."""
+        """Add a device and declare the zenoh keys of the device."""
         with self._declaring:
             self._devices += (device,)
             self._alive[device] = False
@@ -185,7 +185,7 @@ class ZenohPublisher(RetriedSession):
                     self._declare(self._session, device)
 
     def remove_device(self, device: str) -> None:
-        """Remove a device and undeclare its keys."""
+        """Remove a device and undeclare the zenoh keys of the device."""
         self.set_alive(device, False)
         with self._declaring, contextlib.suppress(*zenoh_errors()):  # the session may be closing
             self._devices = tuple(one for one in self._devices if one != device)
