@@ -48,7 +48,7 @@ def analyze(
             output.write_bytes("--json", json, FailedAnalysisMessage(error.samples, [str(error)]).encode() + b"\n")
         raise
     if json is not None:
-        message = AnalysisMessage.of(
+        message = AnalysisMessage.from_analysis(
             results.analysis, results.total, results.hadamard, results.dynamic, results.without_temperature
         )
         output.write_bytes("--json", json, message.encode() + b"\n")

@@ -94,7 +94,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
 
     if json is not None:
         newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
-        message = HistoryMessage.reply(past, asked, newest_s, int(past.counts[:, 0].sum()))
+        message = HistoryMessage.build_reply(past, asked, newest_s, int(past.counts[:, 0].sum()))
         output.write_bytes("--json", json, message.encode() + b"\n")
     if out is not None:
         history_file.save_history(past, out)

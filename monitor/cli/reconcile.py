@@ -57,7 +57,7 @@ def reconcile(
                 one = reconciling.run_reconciliation(
                     reconciling.Request(recordings[0], tested, out, seed, rate, last_s=last_s), tell
                 )
-                data, show = report.encode_report(one), partial(text.print_report, one)
+                data, show = report.encode_report(one), partial(text.print_reconciliation, one)
     except NotReady:
         if json is not None:
             output.write_bytes("--json", json, (out / reconciling.REPORT).read_bytes() + b"\n")

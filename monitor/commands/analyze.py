@@ -27,7 +27,7 @@ from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
 from monitor.estimation.allan.total import TotalCurve, total_curve
 from monitor.estimation.analysis import Analysis, analyze, detect_events
 from monitor.estimation.regular_grid import resample_with_temperature
-from monitor.publishing.plots.allan_figure import other_deviations
+from monitor.publishing.plots.allan_figure import additional_deviations
 from monitor.publishing.plots.dynamic_figure import ChangeMark
 from monitor.publishing.terminal.thermal_output import temperature_notes
 
@@ -154,7 +154,7 @@ def draw_plots(results: Results, path: Path, title: str) -> None:
 
     result = results.analysis
     marks = [ChangeMark(change.since / result.estimate.rate_hz, AXES[change.axis]) for change in result.changes]
-    drawn = AnalysisPlotData(result, other_deviations(results.total, results.hadamard), results.dynamic, marks)
+    drawn = AnalysisPlotData(result, additional_deviations(results.total, results.hadamard), results.dynamic, marks)
     if path.suffix == ".html":
         from monitor.publishing.reports.analysis_report import write_html_report
 

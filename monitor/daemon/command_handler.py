@@ -52,7 +52,9 @@ class CommandHandler:
             case "reset":
                 worker.empty_window()
                 now_s, received = worker.timeline.now_unix_s(), worker.driver.counts.received
-                command.reply_result(ResetReply.of(worker.name, now_s, received, "the window is empty").encode())
+                command.reply_result(
+                    ResetReply.from_result(worker.name, now_s, received, "the window is empty").encode()
+                )
                 _log.info("reset", device=worker.name)
             case "reconcile":
                 self._reconcile(command, worker)

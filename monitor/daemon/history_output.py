@@ -117,4 +117,4 @@ class HistoryOutput(Output):
         with open_history(self.writer.path) as reader:
             table = read_history(reader, device, query.span, query.selects, query.step_s)
             newest_s = reader.newest_s(device)
-        return HistoryMessage.reply(table, query, newest_s, self._received.get(device, 0)).encode()
+        return HistoryMessage.build_reply(table, query, newest_s, self._received.get(device, 0)).encode()

@@ -20,7 +20,7 @@ from monitor.publishing.messages.message import Message
 from monitor.publishing.messages.results import (
     CoefficientsMessage,
     EventMessage,
-    GapMessage,
+    ModelGapMessage,
     StatusMessage,
 )
 from monitor.publishing.remote_devices import DeviceStates
@@ -67,7 +67,7 @@ class ZenohOutput(Output):
     def _publish_messages(self, device: str, unix_s: float | None, received: int, result: Any) -> None:
         """Publish the messages that belong to the kind of a result."""
         for message in kind_of(result).messages:
-            self._zenoh.put(message.topic, device, message.of(device, unix_s, received, result).encode())
+            self._zenoh.put(message.topic, device, message.from_result(device, unix_s, received, result).encode())
 
 
 class ViewerOutput(Output):
@@ -132,13 +132,13 @@ class TableOutput(Output):
     ----------
     states : DeviceStates
         Content of the table.
-    redraw : callable, optional
+    request_redraw : callable, optional
         Asks another thread to draw the table. Called once a second for each device.
     """
 
-    def __init__(self, states: DeviceStates, redraw: Callable[[], None] | None = None) -> None:
+    def __init__(self, states: DeviceStates, request_redraw: Callable[[], None] | None = None) -> None:
         self.states = states
-        self._redraw = redraw
+        self._redraw = request_redraw
         self._newest: dict[str, dict[type[Message], tuple[float, int, Any]]] = {}  # results since the last status
 
     def set_viewer_url(self, url: str) -> None:
@@ -148,25 +148,25 @@ class TableOutput(Output):
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         """Keep the newest estimate and the newest comparison with the noise model until the next status."""
         if isinstance(result, Estimate | ModelGap):
-            message: type[Message] = CoefficientsMessage if isinstance(result, Estimate) else GapMessage
+            message: type[Message] = CoefficientsMessage if isinstance(result, Estimate) else ModelGapMessage
             self._newest.setdefault(device, {})[message] = (unix_s, received, result)
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:
         """Add an event to the lines below the table."""
-        self._process(EventMessage.of(device, unix_s, received, event))
+        self._process(EventMessage.from_result(device, unix_s, received, event))
 
     def publish_health(self, device: str, unix_s: float | None, health: Health) -> None:
         """Update the row of a device in the table."""
-        self._process(StatusMessage.of(device, unix_s, health.received, health))
+        self._process(StatusMessage.from_result(device, unix_s, health.received, health))
         for message, newest in self._newest.pop(device, {}).items():
-            self._process(message.of(device, *newest))
+            self._process(message.from_result(device, *newest))
         if self._redraw is not None:
             self._redraw()
 
     def remove_device(self, device: str) -> None:
         """Remove the row of a device from the table."""
         self._newest.pop(device, None)
-        self.states.remove(topics.STATUS.key(PREFIX, device))
+        self.states.remove_device(topics.STATUS.key(PREFIX, device))
 
     def _process(self, message: Message) -> None:
         """Pass a message to the table."""

@@ -22,7 +22,7 @@ from monitor.drift.compensation.live_compensation import LiveCompensation
 from monitor.estimation.detection.model_agreement_monitor import ModelAgreement
 from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.publishing.messages.results import SlowStatistics
+from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings.loading import Device
 
 MAX_BATCH_S: Final = 0.1
@@ -121,7 +121,7 @@ class ResultPublisher:
         used_s = time.perf_counter() - begun_s
         self.schedule.postpone("total", max(TOTAL_INTERVAL_S, used_s / TOTAL_CPU_SHARE))
         if deviations is not None:
-            self._result(self.pipeline.newest_ns, SlowStatistics(*deviations))
+            self._result(self.pipeline.newest_ns, TotalAndHadamardCurves(*deviations))
 
     def publish_thermal_intervals(self) -> None:
         """Publish the thermal intervals that were completed since the last call."""

@@ -110,7 +110,7 @@ class Service:
         self._commands = CommandHandler(self.zenoh, reconciler or Reconciler())
         self.viewer = _build_view(config, self._read_viewer_history)
         self._viewer_url = ""  # address of the viewer's web page that was announced last
-        self.hooks = Hooks(config.hooks, self.zenoh.put_key)
+        self.hooks = Hooks(config.hooks, self.zenoh.publish_json_return_error)
         self.metrics = _build_metrics_output(config)
         self.outputs += [ZenohOutput(self.zenoh), self.hooks, *more]
         if self.metrics is not None:

@@ -1,1 +1,1 @@
-"""Output of results: zenoh, the Rerun viewer, the terminal, plots, reports and parameter files."""
+"""Output of results over zenoh, in Rerun and in the terminal, and as plots, reports and parameter files."""

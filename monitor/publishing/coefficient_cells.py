@@ -1,4 +1,4 @@
-"""Formatting of coefficients for tables, in the units of data sheets such as °/√h."""
+"""Text of noise coefficients in the units of data sheets, such as °/√h, for tables."""
 
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ TEMPERATURE_MEANS: Final = "slow variance due to temperature"
 
 @dataclass(frozen=True, slots=True)
 class CoefficientText:
-    """Value, interval and unit of one coefficient of one axis as text."""
+    """Value, confidence interval and unit of one noise coefficient as text."""
 
     value: str  # "0.516"; "≤ 2.10" for an upper bound; "—" if there is no estimate
     interval: str  # "0.512 … 0.520"; "" if there is no interval
@@ -22,7 +22,7 @@ class CoefficientText:
 
 
 def format_coefficient(coefficients: Coefficients, symbol: str, axis: str, digits: int = 3) -> CoefficientText:
-    """Format one coefficient in the unit of data sheets.
+    """Format one noise coefficient in the unit of data sheets.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def format_coefficient(coefficients: Coefficients, symbol: str, axis: str, digit
 
 
 def mark_temperature_axis(axis: str, axes_of_temperature: Collection[str]) -> str:
-    """Return the name of an axis, with TEMPERATURE_MARK if temperature explains most of its slow variance.
+    """Append TEMPERATURE_MARK to the name of an axis if temperature explains most of the slow variance.
 
     >>> mark_temperature_axis("gy", ("gy", "gz")), mark_temperature_axis("gx", ("gy", "gz"))
     ('gy †', 'gx')

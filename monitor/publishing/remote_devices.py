@@ -1,7 +1,7 @@
-"""State of all devices that daemons publish, from their messages.
+"""State of all devices on the network, updated from zenoh messages.
 
-``watch``, ``view`` and the table of ``run`` show these states. The messages may be sent by any program on the network.
-Malformed messages are counted, and the memory for devices and texts is limited. The module does no I/O.
+Malformed messages are counted. The memory for devices and texts is limited, because any program on the network may send
+messages.
 """
 
 import copy
@@ -21,54 +21,53 @@ from monitor.publishing.messages.message import Message, decode_message
 from monitor.publishing.messages.results import (
     CoefficientsMessage,
     EventMessage,
-    GapMessage,
+    ModelGapMessage,
     StatusMessage,
     measured_axes,
 )
 
 NORMAL_OUTPUT_STATES: Final = ("ok", "off")
-"""States of an output that are not shown."""
+"""Output states that are not reported as problems."""
 GONE_TIMEOUT_S: Final = 1.5
-"""Age of the newest message [s] above which a device without liveliness token is gone. The status is published at 1 Hz,
-so a killed daemon is reported within two seconds."""
+"""Largest age of the newest message [s] of a device without liveliness token before the device is gone."""
 SILENCE_TIMEOUT_S: Final = 5.0
-"""Age of the newest message [s] above which a device with a liveliness token, or without known token, is silent."""
+"""Largest age of the newest message [s] before a device is silent."""
 MAX_NAMED_LIMITS: Final = 6
-"""Largest number of exceeded limits that are listed by name."""
+"""Largest number of exceeded limits that a message lists by name."""
 MAX_DEVICES: Final = 20_000
-"""Largest number of devices. A further device replaces one that has been silent for FORGET_AFTER_S, or is ignored."""
+"""Largest number of devices. A new device replaces a device that has been silent for FORGET_AFTER_S."""
 FORGET_AFTER_S: Final = 600.0
 MAX_KEY_LENGTH: Final = 200
 MAX_EVENTS: Final = 5
-"""Number of events that are kept."""
+"""Number of newest events to keep."""
 DECODERS: Final[dict[topics.Topic, Callable[[bytes], Message]]] = {
     topics.STATUS: StatusMessage.decode,
     topics.EVENT: EventMessage.decode,
     topics.COEFFICIENTS: partial(decode_message, CoefficientsMessage),
-    topics.GAP: partial(decode_message, GapMessage),
+    topics.GAP: partial(decode_message, ModelGapMessage),
 }
-"""Decoder of each topic that tables of devices show."""
+"""Decoder of each topic that device tables show."""
 
 
 @dataclass(frozen=True, slots=True)
 class DeviceCoefficients:
-    """Newest coefficients of a device."""
+    """Newest noise coefficients of a device."""
 
     coefficients: Coefficients
     axes: tuple[str, ...]  # measured axes
-    k_or_r: frozenset[str]  # axes on which either K or R is present and the data do not show which
+    k_or_r: frozenset[str]  # axes on which the data cannot distinguish K from R
     filled_s: float | None = None  # filled part of the window [s]
 
     @classmethod
     def from_estimate(cls, estimate: Estimate) -> "DeviceCoefficients":
-        """Return the coefficients of an estimate."""
+        """Build the coefficients of a device from an estimate."""
         measured = measured_axes(estimate.curve)
         k_or_r = frozenset(axis for i, axis in measured if estimate.k_or_r[i])
         return cls(estimate.coefficients, tuple(axis for _, axis in measured), k_or_r)
 
     @classmethod
     def from_message(cls, message: CoefficientsMessage) -> "DeviceCoefficients":
-        """Return the coefficients of a message.
+        """Build the coefficients of a device from a message.
 
         Raises
         ------
@@ -82,17 +81,17 @@ class DeviceCoefficients:
 
 @dataclass(slots=True)
 class RemoteDevice:
-    """State of a remote device. All times are measured with the monotonic clock of the receiver."""
+    """State of a remote device. All times refer to the monotonic clock of the receiver."""
 
     key: str  # key of the device, without the topic
     last_message_s: float  # time of the newest message of any topic
     status: StatusMessage | None = None
     coefficients: DeviceCoefficients | None = None
-    disagreements: tuple[str, ...] = ()  # one text for each axis that disagrees with its model
-    token_exists: bool | None = None  # True if the liveliness token of the device exists; None if unknown
+    disagreements: tuple[str, ...] = ()  # one text for each axis that disagrees with the noise model
+    token_exists: bool | None = None  # True if the liveliness token exists; None if unknown
 
     def state(self, now_s: float) -> str:
-        """Return the state that the daemon reports. Return gone, silent or present if there is no current status."""
+        """Return the state that the daemon reports, or gone, silent or present without a current status."""
         age_s = now_s - self.last_message_s
         ended = self.status is not None and self.status.state == "ended"
         if age_s > GONE_TIMEOUT_S and self.token_exists is False and not ended:
@@ -101,8 +100,8 @@ class RemoteDevice:
             return "silent"
         return "present" if self.status is None else self.status.state
 
-    def rank(self, now_s: float) -> int:
-        """Return the rank in tables: 0 no data, 1 a problem or not ready, 2 running, 3 ended."""
+    def display_rank(self, now_s: float) -> int:
+        """Return the sort rank in device tables: 0 without data, 1 with a problem, 2 running, 3 ended."""
         state, status = self.state(now_s), self.status
         if state in ("lost", "gone", "silent"):
             return 0
@@ -114,8 +113,8 @@ class RemoteDevice:
         troubled = status.text or status.overflowed or status.crossed or self.disagreements
         return 2 if outputs_work and not troubled else 1
 
-    def problems(self) -> str:
-        """Return a description of all problems, or "" if there are none."""
+    def describe_problems(self) -> str:
+        """Describe all problems of the device. Return an empty string if there are none."""
         if self.status is None:
             return ""
         found = [self.status.text] if self.status.text else []
@@ -130,30 +129,30 @@ class RemoteDevice:
             found.append(f"limits exceeded: {', '.join(crossed[:MAX_NAMED_LIMITS])}{more}")
         return "; ".join([*found, *self.disagreements])
 
-    def update(self, message: Message) -> None:
-        """Update the state from a message.
+    def update_from_message(self, message: Message) -> None:
+        """Update the state of the device from a message.
 
         Raises
         ------
         ValueError
-            If a coefficient has an unknown status. The state is not changed.
+            If a coefficient has an unknown status. The state of the device remains unchanged.
         """
         match message:
             case StatusMessage():
                 self.status = message
             case CoefficientsMessage():
                 self.coefficients = DeviceCoefficients.from_message(message)
-            case GapMessage():
+            case ModelGapMessage():
                 self.disagreements = tuple(_describe_disagreements(message))
 
 
 class DeviceStates:
-    """State of all devices, updated from the messages of ``monitor.common.topics``; thread-safe.
+    """Thread-safe collection of the states of all remote devices.
 
     Parameters
     ----------
     clock
-        Clock for the age of messages [s]; callers pass times of the same clock.
+        Clock for the age of messages [s]. Callers must pass times of the same clock.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -166,7 +165,9 @@ class DeviceStates:
         self._lock = threading.Lock()
 
     def process_message(self, key: str, payload: bytes) -> Message | None:
-        """Process a message and return it. Return None if the topic is not shown in tables or the message is malformed.
+        """Update the state of a device from a message, and return the decoded message.
+
+        Return None if the message is malformed or the topic is not used.
 
         Parameters
         ----------
@@ -175,14 +176,14 @@ class DeviceStates:
         payload
             Encoded message.
         """
-        device, topic = split_key(key) or ("", topics.ALIVE)
+        device, topic = split_device_and_topic(key) or ("", topics.ALIVE)
         with self._lock:
             try:
                 if topic not in DECODERS:
                     return None
                 message = DECODERS[topic](payload)
                 known = self._devices.get(device) or RemoteDevice(device, 0.0)
-                known.update(message)
+                known.update_from_message(message)
             except ValueError:
                 self.malformed += 1
                 return None
@@ -193,8 +194,8 @@ class DeviceStates:
                     self._events.append((device, message))
         return message
 
-    def set_token(self, key: str, exists: bool) -> None:
-        """Process the change of a liveliness token.
+    def set_liveliness_token(self, key: str, exists: bool) -> None:
+        """Record that the liveliness token of a device has appeared or disappeared.
 
         Parameters
         ----------
@@ -203,7 +204,7 @@ class DeviceStates:
         exists
             True if the token exists.
         """
-        device, topic = split_key(key) or ("", None)
+        device, topic = split_device_and_topic(key) or ("", None)
         if topic is not topics.ALIVE:
             return
         with self._lock:
@@ -211,33 +212,33 @@ class DeviceStates:
             if self._add(known):
                 known.token_exists = exists
 
-    def remove(self, key: str) -> None:
-        """Remove the state and the events of the device to which a key belongs."""
-        device, _ = split_key(key) or ("", None)
+    def remove_device(self, key: str) -> None:
+        """Remove the state and the events of the device that owns a key."""
+        device, _ = split_device_and_topic(key) or ("", None)
         with self._lock:
             self._devices.pop(device, None)
             for one in [one for one in self._events if one[0] == device]:
                 self._events.remove(one)
 
-    def devices(self, now_s: float) -> list[RemoteDevice]:
-        """Return copies of the states of all devices. Devices with problems at time ``now_s`` [s] come first."""
+    def sorted_devices(self, now_s: float) -> list[RemoteDevice]:
+        """Return copies of all device states. Devices with problems at time ``now_s`` [s] precede the others."""
         with self._lock:
             found = [copy.copy(one) for one in self._devices.values()]
-        return sorted(found, key=lambda one: (one.rank(now_s), one.key))
+        return sorted(found, key=lambda one: (one.display_rank(now_s), one.key))
 
-    def coefficients(self, device: str) -> DeviceCoefficients | None:
-        """Return the newest coefficients of a device, or None if there are none."""
+    def device_coefficients(self, device: str) -> DeviceCoefficients | None:
+        """Return the newest noise coefficients of a device, or None if there are none."""
         with self._lock:
             known = self._devices.get(device)
         return None if known is None else known.coefficients
 
     def newest_events(self) -> list[tuple[str, EventMessage]]:
-        """Return the newest events with the keys of their devices, oldest first."""
+        """Return the newest events with device keys, oldest event first."""
         with self._lock:
             return list(self._events)
 
     def _add(self, device: RemoteDevice) -> bool:
-        """Add a device if it is new. Return False if there are too many devices."""
+        """Add a new device. Return False if the limit MAX_DEVICES is reached."""
         if device.key in self._devices:
             return True
         full = len(self._devices) >= MAX_DEVICES
@@ -251,12 +252,12 @@ class DeviceStates:
         return True
 
 
-def split_key(key: str) -> tuple[str, topics.Topic] | None:
-    """Split a key into the key of the device and the topic. Return None if the topic is unknown.
+def split_device_and_topic(key: str) -> tuple[str, topics.Topic] | None:
+    """Split a zenoh key into device key and topic. Return None if the topic is unknown.
 
-    >>> split_key("imu/bench-1/status")
+    >>> split_device_and_topic("imu/bench-1/status")
     ('imu/bench-1', Topic(name='status', encoding='application/json', when='1 Hz', kept=1))
-    >>> split_key("imu/bench-1/mood")
+    >>> split_device_and_topic("imu/bench-1/mood")
     """
     for topic in topics.TOPICS:
         device = key.removesuffix(f"/{topic.name}")
@@ -265,8 +266,7 @@ def split_key(key: str) -> tuple[str, topics.Topic] | None:
     return None
 
 
-def _describe_disagreements(message: GapMessage) -> list[str]:
-    """Return a text for each axis that disagrees with its model."""
+def _describe_disagreements(message: ModelGapMessage) -> list[str]:
     found = [(axis, message.axes[axis]) for axis in AXES if axis in message.axes]
     return [
         f"{axis} disagrees with its model: {one.gap:.3g} σ at τ {one.where.tau[0]:.3g} to {one.where.tau[1]:.3g} s"

@@ -1,10 +1,8 @@
-"""Table of the kinds of results that leave the pipeline of a device.
+"""Table of the kinds of results that a device produces.
 
-A row of ``RESULT_KINDS`` lists the messages that are published and the viewer panels that draw the result. It also
-states how often the panels draw, and how results are merged while they wait for a slow viewer. A new kind of result
-needs a row here, a message in ``monitor.publishing.messages.results``, a panel in
-``monitor.publishing.rerun.result_panels`` and the code that produces the result. The module does no I/O and does not
-import Rerun.
+``RESULT_KINDS`` lists the messages that are published and the viewer panels that draw each kind of result. To add a
+kind of result, add an entry here, a message in ``monitor.publishing.messages.results`` and a panel in
+``monitor.publishing.rerun.result_panels``. This module does not import Rerun.
 """
 
 from collections.abc import Callable
@@ -22,22 +20,22 @@ from monitor.publishing.messages.results import (
     AllanMessage,
     CoefficientsMessage,
     EventMessage,
-    GapMessage,
-    SlowStatistics,
+    ModelGapMessage,
     StatusMessage,
     ThermalMessage,
-    TotalMessage,
+    TotalAndHadamardCurves,
+    TotalAndHadamardMessage,
 )
 
 POINT_INTERVAL_S: Final = 1.0
-"""Interval between two points of a time series of estimates, in the time of the samples."""
+"""Shortest interval between two points of a time series of estimates [s]."""
 SMALL_RESULT_BYTES: Final = 1000
 """Approximate size of a result without large arrays."""
 
 TimedResult = tuple[float, Any]
 """Unix time of a result [s], and the result."""
 Merge = Callable[[list[TimedResult], TimedResult], None]
-"""Function that adds a new result to the results that wait to be drawn."""
+"""Function that merges a new result into the results that wait to be drawn."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +49,7 @@ class SampleRows:
 
 @dataclass(frozen=True, slots=True)
 class CompensatedRows:
-    """Batch of angular rates without drift."""
+    """Batch of angular rates after drift removal."""
 
     unix_s: Floats  # [n]
     values: Floats  # [n, 3] rad/s
@@ -59,7 +57,7 @@ class CompensatedRows:
 
 @dataclass(frozen=True, slots=True)
 class DeviceTableText:
-    """Table of all devices as Markdown. It is passed on with an empty device name."""
+    """Table of all devices as Markdown, which belongs to no device."""
 
     text: str
 
@@ -70,7 +68,7 @@ def keep_all(waiting: list[TimedResult], new: TimedResult) -> None:
     Parameters
     ----------
     waiting
-        Results that wait to be drawn. The list is changed.
+        Results that wait to be drawn, modified in place.
     new
         The new result.
     """
@@ -82,10 +80,10 @@ def keep_newest(waiting: list[TimedResult], new: TimedResult) -> None:
     waiting[:] = [new]
 
 
-def keep_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
-    """Add the new result, and drop the previous result if it follows the result before it too closely.
+def keep_newest_and_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
+    """Append the new result, and replace the previous result if the interval between results is too short.
 
-    The coefficients for each sample of a dropped estimate are kept. The parameters are those of ``keep_all``.
+    The coefficient history of a replaced estimate is kept. The parameters are those of ``keep_all``.
     """
     if len(waiting) > 1 and new[0] - waiting[-2][0] < POINT_INTERVAL_S:
         _, previous = waiting.pop()
@@ -97,7 +95,7 @@ def keep_spaced(waiting: list[TimedResult], new: TimedResult) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Drawing:
+class DrawingRule:
     """Rule for drawing one kind of result in one panel of the viewer."""
 
     panel: str
@@ -106,17 +104,17 @@ class Drawing:
     period_s: float = 0.0
     """Shortest interval between two drawings of a device [s]."""
     shares_rate: bool = False
-    """True if all devices share a limited drawing rate, so that the period grows with the number of devices."""
+    """True if all devices share a drawing rate, so that the period increases with the number of devices."""
 
 
 @dataclass(frozen=True, slots=True)
 class ResultKind:
-    """Row of the table."""
+    """Messages, drawing rules and size of one kind of result."""
 
     result: type
     """Class of the results."""
     messages: tuple[type[Message], ...] = ()
-    drawings: tuple[Drawing, ...] = ()
+    drawings: tuple[DrawingRule, ...] = ()
     size_bytes: Callable[[Any], int] = lambda _result: SMALL_RESULT_BYTES
     """Approximate size of a result, for the limit of the viewer's queue."""
 
@@ -124,34 +122,34 @@ class ResultKind:
 RESULT_KINDS: Final = (
     ResultKind(
         SampleRows,
-        drawings=(Drawing("SamplesPanel"),),
+        drawings=(DrawingRule("SamplesPanel"),),
         size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes + one.temperature_c.nbytes,
     ),
-    ResultKind(Event, (EventMessage,), (Drawing("EventsPanel"),)),
-    ResultKind(Health, (StatusMessage,), (Drawing("HealthPanel", keep_newest),)),
+    ResultKind(Event, (EventMessage,), (DrawingRule("EventsPanel"),)),
+    ResultKind(Health, (StatusMessage,), (DrawingRule("HealthPanel", keep_newest),)),
     ResultKind(
-        DeviceTableText, drawings=(Drawing("DeviceTablePanel", keep_newest),), size_bytes=lambda one: len(one.text)
+        DeviceTableText, drawings=(DrawingRule("DeviceTablePanel", keep_newest),), size_bytes=lambda one: len(one.text)
     ),
     ResultKind(
         CompensatedRows,
-        drawings=(Drawing("CompensatedPanel"),),
+        drawings=(DrawingRule("CompensatedPanel"),),
         size_bytes=lambda one: one.unix_s.nbytes + one.values.nbytes,
     ),
-    ResultKind(ThermalIntervalResult, (ThermalMessage,), (Drawing("ThermalPanel"),)),
-    ResultKind(DriftUpdate, drawings=(Drawing("DriftPanel"),)),
-    ResultKind(SlowStatistics, (TotalMessage,)),
+    ResultKind(ThermalIntervalResult, (ThermalMessage,), (DrawingRule("ThermalPanel"),)),
+    ResultKind(DriftUpdate, drawings=(DrawingRule("DriftPanel"),)),
+    ResultKind(TotalAndHadamardCurves, (TotalAndHadamardMessage,)),
     ResultKind(
-        ModelGap,  # before the estimate, because the Allan plot also shows the deviations of the model
-        (GapMessage,),
-        (Drawing("GapPanel", keep_spaced, period_s=1.0),),
+        ModelGap,  # precedes the estimate, because the Allan plot also shows the model
+        (ModelGapMessage,),
+        (DrawingRule("GapPanel", keep_newest_and_spaced, period_s=1.0),),
         size_bytes=lambda one: 6 * 4 * int(one.tau_s.nbytes),
     ),
     ResultKind(
         Estimate,
         (AllanMessage, CoefficientsMessage),
         (
-            Drawing("AllanPanel", keep_newest, period_s=1.0, shares_rate=True),
-            Drawing("CoefficientsPanel", keep_spaced, period_s=5.0),
+            DrawingRule("AllanPanel", keep_newest, period_s=1.0, shares_rate=True),
+            DrawingRule("CoefficientsPanel", keep_newest_and_spaced, period_s=5.0),
         ),
         size_bytes=lambda one: 8 * int(one.curve.avar.nbytes),
     ),
@@ -161,5 +159,5 @@ _BY_TYPE: Final = {kind.result: kind for kind in RESULT_KINDS}
 
 
 def kind_of(result: Any) -> ResultKind:
-    """Return the row of a result."""
+    """Return the entry of RESULT_KINDS for a result."""
     return _BY_TYPE[type(result)]

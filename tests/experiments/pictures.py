@@ -43,7 +43,7 @@ from monitor.history.sqlite_store import FILE_NAME, HistoryStore
 from monitor.history.stored_events import StoredEvent
 from monitor.noise.model import NoiseModel
 from monitor.noise.model_loading import read_model
-from monitor.publishing.plots.reconcile_figures import compared_diagnostic_svg
+from monitor.publishing.plots.reconcile_figures import diagnostic_comparison_svg
 from monitor.publishing.rerun import sinks
 from monitor.publishing.rerun.fleet import FleetView
 from monitor.publishing.rerun.queued_view import RerunView
@@ -446,7 +446,9 @@ def reconcile_hidden_effects(folder: Path) -> AxisResult:
 def save_diagnostic_picture(result: AxisResult, when: str, path: Path) -> Path:
     """Draw spectrum, Allan deviation and tails of one axis with one model, as in the report."""
     views = {view.lens: view for view in getattr(result, when).plots}
-    drawn = [compared_diagnostic_svg([("", views[lens])], result.axis, 5.2, 3.3) for lens in ("psd", "allan", "tails")]
+    drawn = [
+        diagnostic_comparison_svg([("", views[lens])], result.axis, 5.2, 3.3) for lens in ("psd", "allan", "tails")
+    ]
     page = path.with_suffix(".html")
     style = "body{margin:8px;display:flex;font-family:sans-serif;background:white}svg{width:520px;height:330px}"
     page.write_text(f"<meta charset=utf-8><style>{style}</style>{''.join(drawn)}")
@@ -562,7 +564,7 @@ def window() -> Iterator[tuple[int, Callable[[Path], None]]]:
         wait_until(lambda: sinks.is_listening(port), 30.0)
         yield port, lambda path: ViewerClient(sinks.server_url(port)).save_screenshot(str(path))
     finally:
-        child.end()
+        child.terminate()
 
 
 @contextmanager
@@ -576,7 +578,7 @@ def page_server() -> Iterator[tuple[int, str]]:
         wait_until(lambda: sinks.is_listening(port) and sinks.is_listening(web_port), 30.0)
         yield port, f"http://127.0.0.1:{web_port}/?url={quote(sinks.server_url(port), safe='')}"
     finally:
-        child.end()
+        child.terminate()
 
 
 def wait_until(true: Callable[[], bool], seconds: float) -> None:

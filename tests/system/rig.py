@@ -20,7 +20,7 @@ from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
-from monitor.publishing.messages.results import SlowStatistics
+from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings import loading
 from tests.support.waiting import PATIENCE_S
 
@@ -31,7 +31,7 @@ class Caught(Output):
     def __init__(self) -> None:
         self.blocks: dict[str, list[SampleBlock]] = {}
         self.estimates: dict[str, Estimate] = {}
-        self.totals: dict[str, SlowStatistics] = {}
+        self.totals: dict[str, TotalAndHadamardCurves] = {}
         self.gaps: dict[str, ModelGap] = {}
         self.thermals: dict[str, list[ThermalIntervalResult]] = {}
         self.rates: dict[str, list[SampleBlock]] = {}
@@ -52,7 +52,7 @@ class Caught(Output):
                 self.thermals.setdefault(device, []).append(result)
             case DriftUpdate():
                 self.drifts.setdefault(device, []).append(result)
-            case SlowStatistics():
+            case TotalAndHadamardCurves():
                 self.totals[device] = result
 
     def publish_compensated_samples(self, device: str, received: int, samples: SampleBlock, offset_ns: int) -> None:

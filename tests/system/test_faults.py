@@ -174,7 +174,7 @@ def test_a_window_waits_for_its_port_and_takes_a_viewer_that_comes(tmp_path: Pat
                 output_says(run, "viewer", lambda text: text == "ok")
             finally:
                 child.kill()
-                child.end()
+                child.terminate()
 
 
 @needs_rerun

@@ -189,12 +189,12 @@ def read_noise_coefficients(source: Path) -> "NoiseCoefficients":
     """
     from drivers import file_access
     from monitor.noise.model import NoiseModel
-    from monitor.publishing.exporters import from_analysis, from_model
+    from monitor.publishing.exporters import from_analysis_json, from_model
 
     try:
         text = sys.stdin.buffer.read() if source == Path("-") else file_access.read_small_file(source, pipe=True)
         if text.lstrip().startswith(b"{"):
-            return from_analysis(text, source.name)
+            return from_analysis_json(text, source.name)
         return from_model(NoiseModel.from_toml(text.decode()), source.name)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{source}: cannot be read: {getattr(error, 'strerror', None) or error}") from error

@@ -75,7 +75,7 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
         if not shared:
             screen.start()
         try:
-            outputs = [TableOutput(board, screen.redraw)] if terminal else [TableOutput(board), LogOutput()]
+            outputs = [TableOutput(board, screen.request_redraw)] if terminal else [TableOutput(board), LogOutput()]
             service = Service(config, outputs, unit=unit, writers=writers)
 
             def stop() -> None:

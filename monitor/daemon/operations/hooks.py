@@ -106,7 +106,7 @@ class Hooks(Output):
         wanted = [one for one in self.hooks if _matches(one, device, event.kind)]
         if not wanted:
             return
-        payload = EventMessage.of(device, unix_s, received, event).encode()
+        payload = EventMessage.from_result(device, unix_s, received, event).encode()
         named = {"IMU_MONITOR_DEVICE": device, "IMU_MONITOR_KIND": event.kind, "IMU_MONITOR_AXIS": event.axis or ""}
         for hook in wanted:
             if not self._may_run(hook, event.kind, device):

@@ -1,14 +1,12 @@
-"""Export of noise parameters for other tools: Kalibr, MATLAB (gyroparams and accelparams) and Kalman filters.
+"""Export of noise coefficients as parameter files for Kalibr, MATLAB and Kalman filters.
 
-The input is a ``NoiseCoefficients`` object, from a model file or from ``analyze --json``. The output is the text of a
-file that states units, the source of the numbers and the inflation factor. No other factor is applied. N of IEEE Std
-952 in rad/√s equals the two-sided density of white noise in rad/s/√Hz. K in rad/s/√s equals the density of the white
-noise that drives the bias, in rad/s²/√Hz.
+Each exporter returns the text of a file with units, the source of the coefficients and the inflation factor. N of IEEE
+Std 952 in rad/√s equals the two-sided density of white noise in rad/s/√Hz. K in rad/s/√s equals the density, in
+rad/s²/√Hz, of the white noise that drives the bias.
 
-The inflation factor multiplies N, B and K, because a sensor at rest at constant temperature has less noise than the
-same sensor on a vehicle. The formats for filters use an upper bound as if it were a value, with a comment. The format
-for simulation ignores upper bounds. Comments name the terms that a format cannot represent. All text is ASCII, because
-some of the target programs require it.
+The inflation factor multiplies N, B and K, because a sensor on a vehicle has more noise than a sensor at rest.
+Exporters for filters use an upper bound as the value and add a comment. The exporter for simulation ignores upper
+bounds. All text is ASCII, because some target programs require ASCII.
 """
 
 from collections.abc import Callable
@@ -17,29 +15,33 @@ from typing import Any, Final
 from drivers.errors import ConfigError
 from drivers.number_ranges import COEFFICIENT, INFLATION
 from monitor.publishing.exporters.exported_coefficients import (
+    ExportedCoefficient,
     NoiseCoefficients,
-    Term,
-    from_analysis,
+    from_analysis_json,
     from_model,
     missing_coefficient_error,
 )
-from monitor.publishing.exporters.gyroparams import gyroparams
-from monitor.publishing.exporters.kalibr import kalibr
-from monitor.publishing.exporters.kalman import kalman
+from monitor.publishing.exporters.gyroparams import export_gyroparams
+from monitor.publishing.exporters.kalibr import export_kalibr
+from monitor.publishing.exporters.kalman import export_kalman
 
-__all__ = ["FORMATS", "NoiseCoefficients", "Term", "export", "from_analysis", "from_model"]
+__all__ = ["FORMATS", "ExportedCoefficient", "NoiseCoefficients", "export", "from_analysis_json", "from_model"]
 
-FORMATS: Final[dict[str, Callable[..., str]]] = {"kalibr": kalibr, "gyroparams": gyroparams, "kalman": kalman}
+FORMATS: Final[dict[str, Callable[..., str]]] = {
+    "kalibr": export_kalibr,
+    "gyroparams": export_gyroparams,
+    "kalman": export_kalman,
+}
 """Export function of each format."""
 
 
 def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, **options: Any) -> str:
-    """Return the text of a parameter file.
+    """Export noise coefficients as the text of a parameter file.
 
     Parameters
     ----------
     noise
-        Coefficients from ``from_model`` or ``from_analysis``.
+        Coefficients from ``from_model`` or ``from_analysis_json``.
     format_name
         Name of the format, a key of FORMATS.
     inflation
@@ -50,9 +52,9 @@ def export(noise: NoiseCoefficients, format_name: str, inflation: float = 1.0, *
     Raises
     ------
     ConfigError
-        If the format is unknown, the inflation is below 1, or the model lacks a coefficient that the format needs.
+        If the format is unknown, the inflation factor is below 1, or the noise model lacks a required coefficient.
     NotReady
-        If the analysed recording does not determine a coefficient that the format needs.
+        If the recording is too short to determine a required coefficient.
     """
     if format_name not in FORMATS:
         raise ConfigError(f'unknown format "{format_name}"; possible are {", ".join(FORMATS)}')

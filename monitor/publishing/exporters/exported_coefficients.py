@@ -1,9 +1,7 @@
-"""Noise coefficients to export, and the comments that are common to all formats.
+"""Noise coefficients to export, and comments that all export formats share.
 
-A ``NoiseCoefficients`` object holds Q, N, B, K and R of each axis in SI. All coefficients of a model file are values.
-In the output of ``analyze --json``, a coefficient with the status ``estimated`` is a value, and a coefficient with the
-status ``upper_bound`` is marked as a bound. Coefficients with another status are absent. Other effects, such as a
-spectral line or a bias, are kept only by name, so that a comment can list what the file omits.
+The coefficients are read from a noise model or from the output of ``analyze --json``. Noise effects that have no
+exported coefficient, such as a spectral line, are listed by name in a comment.
 """
 
 import math
@@ -28,11 +26,11 @@ COEFFICIENT_EFFECTS: Final[dict[str, type[Source]]] = {
     "K": RateRandomWalk,
     "R": RateRamp,
 }
-"""Noise effect with the same coefficient as parameter."""
+"""Noise effect that each coefficient describes."""
 
 
 def ascii_unit(letter: str, kind: Kind) -> str:
-    """Return the SI unit of a coefficient in ASCII.
+    """Return the SI unit of a noise coefficient in ASCII.
 
     >>> ascii_unit("K", "gyro"), ascii_unit("R", "accel")
     ('rad/s/sqrt(s)', 'm/s^3')
@@ -49,8 +47,8 @@ def ascii_unit(letter: str, kind: Kind) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
-    """Coefficient of one axis, SI."""
+class ExportedCoefficient:
+    """Noise coefficient of one axis in SI units, as a value or an upper bound."""
 
     value: float
     bound: bool = False  # True if the value is an upper bound
@@ -58,30 +56,30 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class NoiseCoefficients:
-    """Noise coefficients by axis and letter. Unknown axes and letters are absent."""
+    """Noise coefficients by axis and symbol. Unknown coefficients are absent."""
 
-    axes: Mapping[str, Mapping[str, Term]]
+    axes: Mapping[str, Mapping[str, ExportedCoefficient]]
     sample_rate_hz: float | None
-    source: str  # origin of the numbers, for the header of the file
+    source: str  # source of the coefficients, for the header of the file
     left_out: tuple[str, ...] = ()  # other effects, such as "gz.sinusoidal"
     measured: bool = False  # True if the coefficients come from a recording
-    warnings: tuple[str, ...] = ()  # ASCII sentences for the header of the file
+    warnings: tuple[str, ...] = ()  # ASCII warnings for the header of the file
 
-    def coefficients(self, kind: Kind, letter: str) -> dict[str, Term]:
-        """Return one coefficient of the axes that have it.
+    def coefficient_by_axis(self, kind: Kind, letter: str) -> dict[str, ExportedCoefficient]:
+        """Return one noise coefficient for each axis on which the coefficient is known.
 
         Parameters
         ----------
         kind
             Kind of sensor: gyro or accel.
         letter
-            Coefficient.
+            Symbol of the coefficient: Q, N, B, K or R.
         """
         return {axis: self.axes[axis][letter] for axis in axes_of(kind) if letter in self.axes.get(axis, {})}
 
 
 def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficients:
-    """Return the coefficients of a noise model. The variances of equal effects on one axis are added.
+    """Return the coefficients of a noise model, adding the variances of equal effects on one axis.
 
     >>> model = NoiseModel.from_toml('sample_rate = 100.0\\n["g*".angle_random_walk]\\nN = 1.5e-4')
     >>> from_model(model).axes["gz"]["N"].value
@@ -92,10 +90,10 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
     model
         Noise model.
     source
-        Origin of the numbers, for the header of the file.
+        Source of the coefficients, for the header of the file.
     """
     letters = {effect.name: letter for letter, effect in COEFFICIENT_EFFECTS.items()}
-    axes: dict[str, dict[str, Term]] = {}
+    axes: dict[str, dict[str, ExportedCoefficient]] = {}
     left_out = []
     for axis, effects in model.effects.items():
         sizes: dict[str, float] = {}
@@ -105,57 +103,51 @@ def from_model(model: NoiseModel, source: str = "noise model") -> NoiseCoefficie
                 left_out.append(f"{axis}.{one.name}")
             else:
                 sizes[letter] = math.hypot(sizes.get(letter, 0.0), getattr(one, letter))
-        axes[axis] = {letter: Term(size) for letter, size in sizes.items() if size > 0.0}
+        axes[axis] = {letter: ExportedCoefficient(size) for letter, size in sizes.items() if size > 0.0}
     known = {axis: axes[axis] for axis in AXES if axes.get(axis)}
     return NoiseCoefficients(known, model.sample_rate_hz, source, tuple(left_out))
 
 
 class _Coefficient(msgspec.Struct):
-    """One coefficient in the JSON of an analysis."""
-
     value: float | None
     hi: float | None
     status: str
 
 
 class _Temperature(msgspec.Struct):
-    """Key ``temperature`` of an axis in the JSON of an analysis."""
-
     share: float
 
 
 class _Axis(msgspec.Struct):
-    """One axis in the JSON of an analysis."""
-
     coefficients: dict[str, _Coefficient]
     temperature: _Temperature | None = None
 
 
 class _Analysis(msgspec.Struct):
-    """JSON of an analysis with only the keys that an export needs."""
+    """Keys of the analysis JSON that an export needs."""
 
     schema: str
     axes: dict[str, _Axis]
     rate: float | None = None
 
 
-def from_analysis(text: bytes | str, source: str = "analysis of a recording") -> NoiseCoefficients:
-    """Return the coefficients in the output of ``imu-monitor analyze --json``.
+def from_analysis_json(json_text: bytes | str, source: str = "analysis of a recording") -> NoiseCoefficients:
+    """Read noise coefficients from the output of ``imu-monitor analyze --json``.
 
     Parameters
     ----------
-    text
+    json_text
         JSON text.
     source
-        Origin of the numbers, for the header of the file.
+        Source of the coefficients, for the header of the file.
 
     Raises
     ------
     ConfigError
-        If the text is not the JSON of an analysis, or if the rate is outside the supported range.
+        If the text is not an analysis in JSON, or if the sample rate is outside the supported range.
     """
     try:
-        found = msgspec.json.decode(text, type=_Analysis)
+        found = msgspec.json.decode(json_text, type=_Analysis)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(f"not the JSON of an analysis: {error}") from error
     if not found.schema.startswith("imu-monitor/analyze/"):
@@ -165,13 +157,13 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
             RATE_HZ.check(found.rate)
     except ConfigError as error:
         raise ConfigError(f"rate: {error}") from None
-    axes: dict[str, dict[str, Term]] = {}
+    axes: dict[str, dict[str, ExportedCoefficient]] = {}
     for axis in (axis for axis in AXES if axis in found.axes):
         for letter, one in found.axes[axis].coefficients.items():
             if one.status == "estimated" and one.value is not None:
-                axes.setdefault(axis, {})[letter] = Term(one.value)
+                axes.setdefault(axis, {})[letter] = ExportedCoefficient(one.value)
             elif one.status == "upper_bound" and one.hi is not None:
-                axes.setdefault(axis, {})[letter] = Term(one.hi, bound=True)
+                axes.setdefault(axis, {})[letter] = ExportedCoefficient(one.hi, bound=True)
     warnings = tuple(
         f"{axis} follows its temperature, which explains {math.floor(100.0 * mark.share):d} % of its slow variance: "
         f"B and K of {axis} describe temperature as well as noise"
@@ -181,21 +173,21 @@ def from_analysis(text: bytes | str, source: str = "analysis of a recording") ->
     return NoiseCoefficients(axes, found.rate, source, measured=True, warnings=warnings)
 
 
-def missing_coefficient_error(noise: NoiseCoefficients, text: str) -> ImuError:
+def missing_coefficient_error(noise: NoiseCoefficients, message: str) -> ImuError:
     """Return the error for a missing coefficient: NotReady for a recording, ConfigError for a noise model.
 
     Parameters
     ----------
     noise
         Coefficients of the recording or the model.
-    text
+    message
         Message.
     """
-    return NotReady(f"{text}: a longer recording is needed") if noise.measured else ConfigError(text)
+    return NotReady(f"{message}: a longer recording is needed") if noise.measured else ConfigError(message)
 
 
-def header_comments(noise: NoiseCoefficients, inflation: float, mark: str) -> list[str]:
-    """Return comments on the origin of the numbers, the inflation factor and the warnings.
+def header_comments(noise: NoiseCoefficients, inflation: float, comment_sign: str) -> list[str]:
+    """Return comments with the source of the coefficients, the inflation factor and warnings.
 
     Parameters
     ----------
@@ -203,44 +195,50 @@ def header_comments(noise: NoiseCoefficients, inflation: float, mark: str) -> li
         Coefficients.
     inflation
         Factor on N, B and K.
-    mark
-        Comment mark of the format.
+    comment_sign
+        Characters that begin a comment in the file.
     """
     source = noise.source.encode("ascii", "replace").decode()
     done = "none" if inflation == 1.0 else f"N, B and K are {inflation:g} times the values of the source"
     return [
-        f"{mark} source: {source}",
-        f"{mark} inflation: {done}",
-        *(f"{mark} WARNING: {one}" for one in noise.warnings),
+        f"{comment_sign} source: {source}",
+        f"{comment_sign} inflation: {done}",
+        *(f"{comment_sign} WARNING: {one}" for one in noise.warnings),
     ]
 
 
-def omitted_comment(noise: NoiseCoefficients, used: Collection[str], mark: str) -> list[str]:
-    """Return a comment that lists the terms of the source that the format cannot represent.
+def comment_on_omitted_terms(
+    noise: NoiseCoefficients, represented_letters: Collection[str], comment_sign: str
+) -> list[str]:
+    """Return a comment that lists the noise terms that the export format cannot represent.
 
     Parameters
     ----------
     noise
         Coefficients.
-    used
-        Letters that the format represents.
-    mark
-        Comment mark of the format.
+    represented_letters
+        Symbols of the coefficients that the export format represents.
+    comment_sign
+        Characters that begin a comment in the file.
     """
     letters = {letter for terms in noise.axes.values() for letter, term in terms.items() if not term.bound}
-    unused = [letter for letter in COEFFICIENT_EFFECTS if letter in letters and letter not in used]
-    return [f"{mark} not in this file: {', '.join([*unused, *noise.left_out])}"] if unused or noise.left_out else []
+    unused = [letter for letter in COEFFICIENT_EFFECTS if letter in letters and letter not in represented_letters]
+    return (
+        [f"{comment_sign} not in this file: {', '.join([*unused, *noise.left_out])}"]
+        if unused or noise.left_out
+        else []
+    )
 
 
-def number(value: float) -> str:
-    """Format a number with seven digits so that YAML 1.1, TOML and MATLAB read it as a float.
+def format_float(value: float) -> str:
+    """Format a number with seven digits in a notation that YAML 1.1, TOML and MATLAB read as a float.
 
-    >>> number(1.5e-4)
+    >>> format_float(1.5e-4)
     '1.500000e-04'
     """
     return f"{value:.6e}"
 
 
 def join_lines(lines: Iterable[str]) -> str:
-    """Return the lines as the text of a file."""
+    """Join lines with newlines, and end the text with a newline."""
     return "\n".join(lines) + "\n"

@@ -1,13 +1,12 @@
-"""Export as a MATLAB script with ``gyroparams`` and ``accelparams`` for ``imuSensor``, one value per axis.
+"""Export of noise coefficients as a MATLAB script for the MathWorks model ``imuSensor``.
 
-Properties and units follow the reference pages of MathWorks. ``single-sided`` is the MathWorks term for white noise
-with σ = NoiseDensity·√rate per sample, where the density is N of IEEE Std 952. The default of MathWorks would be
-smaller by √2. ``BiasInstability`` is the σ of the white noise that drives a filter. With the filter ``fractalcoef``
-(Kasdin, Proc. IEEE 83(5), 1995), the bias has the spectrum B²/(2πf), where B is the bias instability of IEEE Std 952.
-The default filter has one pole at 0.5, and its output is not flicker noise.
+``NoiseDensity`` is N of IEEE Std 952 with the noise type ``single-sided``, for which σ = NoiseDensity·√rate per sample.
+The default noise type of MathWorks would give noise that is smaller by √2. ``BiasInstability`` is the σ of the white
+noise at the input of a filter. With the filter ``fractalcoef`` (Kasdin, Proc. IEEE 83(5), 1995), the bias has the
+spectrum B²/(2πf) of IEEE Std 952. The default filter of MathWorks has one pole at 0.5 and does not generate flicker
+noise.
 
-The script is meant for simulation. A coefficient with only an upper bound is therefore set to 0, and a comment states
-the bound.
+A coefficient with only an upper bound is set to 0, because the script is meant for simulation.
 """
 
 from typing import Final
@@ -16,23 +15,23 @@ from monitor.common.units import Kind, axes_of
 from monitor.publishing.exporters.exported_coefficients import (
     NoiseCoefficients,
     ascii_unit,
+    comment_on_omitted_terms,
+    format_float,
     header_comments,
     join_lines,
-    number,
-    omitted_comment,
 )
 
 N_POLES: Final = 500
 """Number of poles of the 1/f filter, as in the Allan variance example of MathWorks."""
 
 
-def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
-    """Return the text of the MATLAB script.
+def export_gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
+    """Export noise coefficients as a MATLAB script.
 
     Parameters
     ----------
     noise
-        Coefficients of each axis, SI.
+        Noise coefficients of each axis, in SI units.
     inflation
         Factor on N, B and K.
     """
@@ -63,15 +62,15 @@ def gyroparams(noise: NoiseCoefficients, inflation: float = 1.0) -> str:
         ]
     rate = "" if noise.sample_rate_hz is None else f", 'SampleRate', {noise.sample_rate_hz!r}"
     lines += ["", f"imu = imuSensor('accel-gyro'{rate}{''.join(made)});"]
-    return join_lines([*lines, *omitted_comment(noise, "NBK", "%")])
+    return join_lines([*lines, *comment_on_omitted_terms(noise, "NBK", "%")])
 
 
 def _property(noise: NoiseCoefficients, kind: Kind, letter: str, name: str, unit: str, inflation: float) -> str:
-    """Return one property of three axes. An unknown value is 0, and a comment names the axis."""
-    known, values, said = noise.coefficients(kind, letter), [], ""
+    """Write 0 for an unknown coefficient, and name the axis in a comment."""
+    known, values, said = noise.coefficient_by_axis(kind, letter), [], ""
     for axis in axes_of(kind):
         term = known.get(axis)
-        values.append("0" if term is None or term.bound else number(term.value * inflation))
+        values.append("0" if term is None or term.bound else format_float(term.value * inflation))
         if term is None:
             said += f"; {axis} unknown"
         elif term.bound:

@@ -1,10 +1,9 @@
-"""Export as ``imu.yaml`` of Kalibr, with continuous-time noise densities.
+"""Export of noise coefficients as ``imu.yaml`` of Kalibr, with continuous-time noise densities.
 
-The file has one value for each kind of sensor: the largest of the three axes. Keys and units follow the pages "YAML
-formats" and "IMU Noise Model" in the wiki of Kalibr. Kalibr multiplies the white-noise density by 1/√Δt to get the σ of
-a sample. The random-walk density is multiplied by √Δt to get a step of the bias. The densities are therefore N and K of
-IEEE Std 952. Kalibr rejects zero, so a term that no axis has is an error. If the axes have only upper bounds, the
-largest bound is used, and a comment in the file says that the value is a bound.
+The file contains one value for each kind of sensor, which is the largest of the three axes. Keys and units follow the
+pages "YAML formats" and "IMU Noise Model" in the Kalibr wiki. Kalibr multiplies the white-noise density by 1/√Δt and
+the random-walk density by √Δt, so the densities are N and K of IEEE Std 952. Kalibr rejects zero, so a missing
+coefficient is an error. If all axes have only upper bounds, the largest bound is exported with a comment.
 """
 
 from typing import Final
@@ -13,14 +12,14 @@ from drivers.errors import ConfigError
 from monitor.common.units import Kind
 from monitor.publishing.exporters.exported_coefficients import (
     COEFFICIENT_EFFECTS,
+    ExportedCoefficient,
     NoiseCoefficients,
-    Term,
     ascii_unit,
+    comment_on_omitted_terms,
+    format_float,
     header_comments,
     join_lines,
     missing_coefficient_error,
-    number,
-    omitted_comment,
 )
 
 INFLATION_COMMENT: Final = (
@@ -29,13 +28,13 @@ INFLATION_COMMENT: Final = (
 )
 
 
-def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
-    """Return the text of the file.
+def export_kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/imu0") -> str:
+    """Export noise coefficients as the text of ``imu.yaml``.
 
     Parameters
     ----------
     noise
-        Coefficients of each axis, SI.
+        Noise coefficients of each axis, in SI units.
     inflation
         Factor on the densities.
     rostopic
@@ -44,9 +43,9 @@ def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/i
     Raises
     ------
     ConfigError
-        If the model has no sample rate or lacks N or K on one kind of sensor.
+        If the noise model has no sample rate, or lacks N or K for one kind of sensor.
     NotReady
-        If the analysed recording does not determine N or K on one kind of sensor.
+        If the recording is too short to determine N or K.
     """
     if noise.sample_rate_hz is None:
         raise ConfigError("kalibr needs an update_rate, and the model has no sample_rate")
@@ -62,13 +61,13 @@ def kalibr(noise: NoiseCoefficients, inflation: float = 1.0, rostopic: str = "/i
         for letter, key, unit_of in (("N", "noise_density", "B"), ("K", "random_walk", "R")):
             largest, comment = _largest_term(noise, kind, letter)
             unit = f"{ascii_unit(unit_of, kind)}/sqrt(Hz)"  # a density has the unit of B (for N) or R (for K) per √Hz
-            lines += [f"# {letter}: {comment}", f"{name}_{key}: {number(largest.value * inflation)}  # {unit}"]
-    return join_lines([*lines, *omitted_comment(noise, "NK", "#")])
+            lines += [f"# {letter}: {comment}", f"{name}_{key}: {format_float(largest.value * inflation)}  # {unit}"]
+    return join_lines([*lines, *comment_on_omitted_terms(noise, "NK", "#")])
 
 
-def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[Term, str]:
-    """Return the largest estimate, or the largest bound if there is no estimate, and a comment on the choice."""
-    known = noise.coefficients(kind, letter)
+def _largest_term(noise: NoiseCoefficients, kind: Kind, letter: str) -> tuple[ExportedCoefficient, str]:
+    """Return the largest estimate of three axes, or the largest upper bound if there is no estimate."""
+    known = noise.coefficient_by_axis(kind, letter)
     if not known:
         raise missing_coefficient_error(
             noise, f"kalibr needs {letter} ({COEFFICIENT_EFFECTS[letter].name}) above 0 on the {kind} axes"

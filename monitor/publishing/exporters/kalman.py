@@ -1,4 +1,4 @@
-"""Export of the process noise of a Kalman filter as TOML: densities, and discrete F and Q of each axis.
+"""Export of the process noise of a Kalman filter as TOML, with the discrete matrices F and Q of each axis.
 
 The error model of one gyroscope has three states. For an accelerometer, velocity replaces the angle.
 
@@ -6,15 +6,14 @@ The error model of one gyroscope has three states. For an accelerometer, velocit
     walk' = white noise of density K²
     markov' = -markov/T + white noise of density 2σ²/T
 
-The white noise of the rate has the density N². Flicker noise has no finite-dimensional state model, so a first-order
-Gauss-Markov process approximates it. The Allan deviation of this process peaks at 0.618 σ and τ = 1.89 T (IEEE Std
-952). σ is chosen so that the peak equals the Allan deviation of flicker noise, 0.664 B. The correlation time T is
-chosen so that the peak lies in the middle (of log τ) of the range in which flicker noise dominates. This range extends
-from τ = N²/(0.664 B)² to 3 (0.664 B)²/K², so its middle is √3 N/K. Without N or K, the range is not bounded. The user
-must then give T. Otherwise the flicker noise B is omitted, and a comment in the file states the omission.
+The white noise of the rate has the density N². A first-order Gauss-Markov process approximates flicker noise, because
+flicker noise has no finite-dimensional state model. The Allan deviation of the Gauss-Markov process peaks at 0.618 σ
+and τ = 1.89 T (IEEE Std 952). σ is chosen so that the peak equals the Allan deviation of flicker noise, 0.664 B.
 
-An upper bound is used as if it were the value, because a larger process noise is the safer choice. A comment in the
-file names the coefficient.
+Flicker noise dominates from τ = N²/(0.664 B)² to τ = 3 (0.664 B)²/K². The correlation time T places the peak at the
+geometric mean of these limits, τ = √3 N/K. If N or K is unknown, the user must specify T. Without T, the file omits
+flicker noise and states the omission in a comment. An upper bound is used as the value, because a larger process noise
+is the safer choice.
 """
 
 import math
@@ -29,13 +28,13 @@ from drivers.number_ranges import DURATION_S
 from monitor.common.units import sensor_kind
 from monitor.noise.effects import BiasInstability
 from monitor.publishing.exporters.exported_coefficients import (
+    ExportedCoefficient,
     NoiseCoefficients,
-    Term,
     ascii_unit,
+    comment_on_omitted_terms,
+    format_float,
     header_comments,
     join_lines,
-    number,
-    omitted_comment,
 )
 
 FLICKER_TAU_S: Final = np.array([1000.0])  # any τ much longer than the sample interval gives the same deviation
@@ -55,15 +54,15 @@ HEADER_COMMENT: Final = (
 )
 
 
-def kalman(
+def export_kalman(
     noise: NoiseCoefficients, inflation: float = 1.0, dt_s: float | None = None, correlation_time_s: float | None = None
 ) -> str:
-    """Return the text of the file.
+    """Export the process noise of a Kalman filter as TOML.
 
     Parameters
     ----------
     noise
-        Coefficients of each axis, SI.
+        Noise coefficients of each axis, in SI units.
     inflation
         Factor on N, B and K.
     dt_s
@@ -95,11 +94,11 @@ def kalman(
     ]
     for axis, terms in noise.axes.items():
         lines += ["", f"[{axis}]", *_axis(axis, terms, inflation, step_s, correlation_time_s)]
-    return join_lines([*lines, *omitted_comment(noise, "NBK", "#")])
+    return join_lines([*lines, *comment_on_omitted_terms(noise, "NBK", "#")])
 
 
 def _markov_sigma(B: float) -> float:
-    """Return σ of the Gauss-Markov process whose peak Allan deviation equals the Allan deviation of flicker noise.
+    """Return σ of the Gauss-Markov process with the peak Allan deviation 0.664 B.
 
     >>> round(_markov_sigma(1.0), 3)
     1.075
@@ -108,7 +107,7 @@ def _markov_sigma(B: float) -> float:
 
 
 def _markov_time_s(N: float, K: float) -> float:
-    """Return the correlation time [s] of the process that peaks at τ = √3 N/K, the middle of the flicker range.
+    """Return the correlation time [s] of the Gauss-Markov process that peaks at τ = √3 N/K.
 
     >>> round(_markov_time_s(N=1.5e-4, K=1.5e-6), 1)
     91.6
@@ -116,22 +115,22 @@ def _markov_time_s(N: float, K: float) -> float:
     return math.sqrt(3.0) * N / K / MARKOV_PEAK_AT
 
 
-def bias_state_transition_matrix(dt_s: float, time_s: float) -> Floats:
-    """Return the transition matrix F [3, 3] of angle, random-walk bias and Gauss-Markov bias.
+def state_transition_matrix(dt_s: float, correlation_time_s: float) -> Floats:
+    """Return the transition matrix F, shape [3, 3], of angle, random-walk bias and Gauss-Markov bias.
 
     Parameters
     ----------
     dt_s
         Time step [s].
-    time_s
+    correlation_time_s
         Correlation time T [s].
     """
-    lost = -math.expm1(-dt_s / time_s)
-    return np.array([[1.0, dt_s, time_s * lost], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0 - lost]])
+    lost = -math.expm1(-dt_s / correlation_time_s)
+    return np.array([[1.0, dt_s, correlation_time_s * lost], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0 - lost]])
 
 
-def process_noise_matrix(dt_s: float, N: float, K: float, sigma: float, time_s: float) -> Floats:
-    """Return the covariance Q [3, 3] of the process noise of angle, random-walk bias and Gauss-Markov bias.
+def process_noise_matrix(dt_s: float, N: float, K: float, markov_sigma: float, correlation_time_s: float) -> Floats:
+    """Return the process noise covariance Q, shape [3, 3], of angle, random-walk bias and Gauss-Markov bias.
 
     Q is the integral of F(s) G F(s)ᵀ over 0 ≤ s ≤ dt, where F is the transition matrix and G = diag(N², K², 2σ²/T).
 
@@ -143,31 +142,30 @@ def process_noise_matrix(dt_s: float, N: float, K: float, sigma: float, time_s: 
         White noise, in rad/√s or m/s/√s.
     K
         Rate random walk, in rad/s/√s or m/s²/√s.
-    sigma
+    markov_sigma
         σ of the Gauss-Markov process, in rad/s or m/s².
-    time_s
+    correlation_time_s
         Correlation time T [s].
     """
-    x = dt_s / time_s
+    x = dt_s / correlation_time_s
     q = np.zeros((3, 3))
     q[:2, :2] = K**2 * np.array([[dt_s**3 / 3.0, dt_s**2 / 2.0], [dt_s**2 / 2.0, dt_s]])
-    q[0, 0] += N**2 * dt_s + 2.0 * (sigma * time_s) ** 2 * _integrated_markov_variance(x)
-    q[0, 2] = q[2, 0] = sigma**2 * time_s * math.expm1(-x) ** 2
-    q[2, 2] = -(sigma**2) * math.expm1(-2.0 * x)
+    q[0, 0] += N**2 * dt_s + 2.0 * (markov_sigma * correlation_time_s) ** 2 * _integrated_markov_variance(x)
+    q[0, 2] = q[2, 0] = markov_sigma**2 * correlation_time_s * math.expm1(-x) ** 2
+    q[2, 2] = -(markov_sigma**2) * math.expm1(-2.0 * x)
     return q
 
 
 def _integrated_markov_variance(x: float) -> float:
-    """Return x - 2(1 - e^-x) + (1 - e^-2x)/2. For small x, the power series from x³/3 on avoids cancellation."""
+    """Return x - 2(1 - e^-x) + (1 - e^-2x)/2, with a power series for small x to avoid cancellation."""
     if x > SERIES_BELOW:
         return x + 2.0 * math.expm1(-x) - 0.5 * math.expm1(-2.0 * x)
     return math.fsum((-x) ** k * (2.0 - 2.0 ** (k - 1)) / math.factorial(k) for k in range(3, 14))
 
 
 def _axis(
-    axis: str, terms: Mapping[str, Term], inflation: float, dt_s: float, correlation_time_s: float | None
+    axis: str, terms: Mapping[str, ExportedCoefficient], inflation: float, dt_s: float, correlation_time_s: float | None
 ) -> list[str]:
-    """Return the TOML table of one axis: comments, densities, F and Q."""
     kind = sensor_kind(axis)
     rate, drift = ascii_unit("B", kind), ascii_unit("R", kind)
     N, B, K = (terms[letter].value * inflation if letter in terms else 0.0 for letter in "NBK")
@@ -175,8 +173,8 @@ def _axis(
     lines = _remarks(terms)
     states = ["angle" if kind == "gyro" else "velocity", "bias_walk"]
     densities = [
-        f"psd_white = {number(N**2)}  # ({rate})^2/Hz, N^2",
-        f"psd_walk = {number(K**2)}  # ({drift})^2/Hz, K^2",
+        f"psd_white = {format_float(N**2)}  # ({rate})^2/Hz, N^2",
+        f"psd_walk = {format_float(K**2)}  # ({drift})^2/Hz, K^2",
     ]
     sigma = _markov_sigma(B)
     if B and time_s is None:
@@ -184,9 +182,9 @@ def _axis(
     elif B and time_s is not None:
         states.append("bias_markov")
         densities += [
-            f"psd_markov = {number(2.0 * sigma**2 / time_s)}  # ({drift})^2/Hz, 2 sigma^2/T",
-            f"sigma_markov = {number(sigma)}  # {rate}",
-            f"correlation_time = {number(time_s)}  # s, T",
+            f"psd_markov = {format_float(2.0 * sigma**2 / time_s)}  # ({drift})^2/Hz, 2 sigma^2/T",
+            f"sigma_markov = {format_float(sigma)}  # {rate}",
+            f"correlation_time = {format_float(time_s)}  # s, T",
         ]
     size = len(states)
     sigma, time_s = (sigma, time_s or 1.0) if size == 3 else (0.0, 1.0)  # without the third state, T has no effect
@@ -195,13 +193,12 @@ def _axis(
         *lines,
         f"states = [{listed}]",
         *densities,
-        f"F = {_matrix(bias_state_transition_matrix(dt_s, time_s)[:size, :size])}",
+        f"F = {_matrix(state_transition_matrix(dt_s, time_s)[:size, :size])}",
         f"Q = {_matrix(process_noise_matrix(dt_s, N, K, sigma, time_s)[:size, :size])}",
     ]
 
 
-def _remarks(terms: Mapping[str, Term]) -> list[str]:
-    """Return comments on the unknown coefficients and upper bounds of one axis."""
+def _remarks(terms: Mapping[str, ExportedCoefficient]) -> list[str]:
     unknown = [letter for letter in "NBK" if letter not in terms]
     bounds = [letter for letter in "NBK" if letter in terms and terms[letter].bound]
     lines = [f"# unknown, set to 0: {', '.join(unknown)}"] if unknown else []
@@ -209,5 +206,4 @@ def _remarks(terms: Mapping[str, Term]) -> list[str]:
 
 
 def _matrix(rows: Floats) -> str:
-    """Format a matrix as a TOML array."""
     return "[" + ", ".join("[" + ", ".join(f"{x:.9e}" for x in row) + "]" for row in rows.tolist()) + "]"

@@ -1,1 +1,1 @@
-"""Messages that are sent over zenoh and written by commands: one ``msgspec.Struct`` for each."""
+"""Messages published over zenoh, and JSON output of commands."""

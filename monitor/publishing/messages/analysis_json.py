@@ -1,4 +1,4 @@
-"""Output of ``analyze --json``: coefficients and deviations of a recording."""
+"""Output of ``analyze --json`` with the noise coefficients and Allan deviations of a recording."""
 
 from typing import Final, Self
 
@@ -16,7 +16,7 @@ from monitor.estimation.allan.total import TotalCurve
 from monitor.estimation.analysis import Analysis
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
-from monitor.publishing.messages.message import encode_json, shared_fields
+from monitor.publishing.messages.message import attributes_with_field_names, encode_json
 from monitor.publishing.messages.results import (
     CoefficientValue,
     coefficient_values,
@@ -28,7 +28,7 @@ SCHEMA: Final = "imu-monitor/analyze/1"
 
 
 class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
-    """Deviations of one axis with their averaging times and the ends of their 95 % intervals."""
+    """Deviations of one axis with averaging times and 95 % intervals."""
 
     tau: Floats
     deviation: Floats
@@ -36,13 +36,13 @@ class AxisDeviations(msgspec.Struct, frozen=True, eq=False):
     hi: Floats
 
     @classmethod
-    def of(cls, curve: AllanCurve | TotalCurve | HadamardCurve, axis: int) -> Self:
-        """Return the deviations of column ``axis`` of a curve."""
+    def from_curve(cls, curve: AllanCurve | TotalCurve | HadamardCurve, axis: int) -> Self:
+        """Build the deviations of one axis from a curve."""
         return cls(curve.tau_s, *deviations_with_interval_ends(curve, axis))
 
 
 class TemperatureDependenceValues(msgspec.Struct, frozen=True, rename={"interval_s": "interval"}):
-    """Measures of the dependence of the bias of an axis on temperature."""
+    """Statistics of the dependence of the bias of one axis on temperature."""
 
     share: float
     p_value: float
@@ -52,26 +52,26 @@ class TemperatureDependenceValues(msgspec.Struct, frozen=True, rename={"interval
 
 
 class CoefficientsWithoutTemperature(msgspec.Struct, frozen=True):
-    """K and R of an axis after its temperature-correlated bias has been removed."""
+    """Coefficients K and R of one axis after removal of the temperature-correlated bias."""
 
     model: str
     coefficients: dict[str, CoefficientValue]
     share: dict[str, float | None]
 
     @classmethod
-    def of(cls, found: TemperatureRemoval, axis: str) -> Self:
-        """Return the values of one axis."""
+    def from_temperature_removal(cls, removal: TemperatureRemoval, axis: str) -> Self:
+        """Build the coefficients of one axis."""
         i = AXES.index(axis)
-        values = coefficient_values(found.coefficients, i, found.k_or_r[i])
+        values = coefficient_values(removal.coefficients, i, removal.k_or_r[i])
         return cls(
-            found.models[axis],
+            removal.models[axis],
             {symbol: values[symbol] for symbol in SLOW_LETTERS},
-            {symbol: found.variance_share(symbol, axis) for symbol in SLOW_LETTERS},
+            {symbol: removal.variance_share(symbol, axis) for symbol in SLOW_LETTERS},
         )
 
 
 class AxisAnalysis(msgspec.Struct, frozen=True, kw_only=True):
-    """Results of one axis. Deviations that were not computed are absent."""
+    """Analysis results of one axis. Deviations that were not computed are absent."""
 
     allan: AxisDeviations
     total: AxisDeviations | UnsetType = UNSET
@@ -104,14 +104,14 @@ class ChangeValues(msgspec.Struct, frozen=True):
     text: str
 
     @classmethod
-    def of(cls, change: Change, rate_hz: float) -> Self:
-        """Return the values of a change."""
+    def from_change(cls, change: Change, rate_hz: float) -> Self:
+        """Build the JSON values of a detected change."""
         t = change.since / rate_hz
         return cls(change.kind, AXES[change.axis], t, change.sigma, change.sides(), change.text)
 
 
 class CoefficientSeries(msgspec.Struct, frozen=True, eq=False):
-    """Coefficient of one axis at each time step."""
+    """Time series of one noise coefficient of one axis."""
 
     value: Floats
     lo: Floats
@@ -119,8 +119,8 @@ class CoefficientSeries(msgspec.Struct, frozen=True, eq=False):
     status: list[str]
 
 
-class DynamicAxis(msgspec.Struct, frozen=True, eq=False):
-    """Dynamic Allan deviations of one axis, shape [time steps, τ], and its coefficients over time."""
+class DynamicAllanAxis(msgspec.Struct, frozen=True, eq=False):
+    """Dynamic Allan deviations of one axis, shape [time steps, τ], and coefficients over time."""
 
     deviation: NDArray[np.float64]
     lo: NDArray[np.float64]
@@ -128,8 +128,8 @@ class DynamicAxis(msgspec.Struct, frozen=True, eq=False):
     coefficients: dict[str, CoefficientSeries]
 
     @classmethod
-    def of(cls, dynamic: DynamicAllan, axis: int) -> Self:
-        """Return the values of column ``axis``."""
+    def from_dynamic_allan(cls, dynamic: DynamicAllan, axis: int) -> Self:
+        """Build the dynamic Allan deviations of one axis."""
         coefficients = {
             symbol: CoefficientSeries(
                 dynamic.value[:, row, axis],
@@ -142,13 +142,13 @@ class DynamicAxis(msgspec.Struct, frozen=True, eq=False):
         return cls(dynamic.deviation[:, :, axis], dynamic.lo[:, :, axis], dynamic.hi[:, :, axis], coefficients)
 
 
-class DynamicValues(msgspec.Struct, frozen=True, eq=False):
+class DynamicAllanValues(msgspec.Struct, frozen=True, eq=False):
     """Dynamic Allan deviations. ``t`` is the time from the first sample to the end of each window [s]."""
 
     window: float
     t: Floats
     tau: Floats
-    axes: dict[str, DynamicAxis]
+    axes: dict[str, DynamicAllanAxis]
 
 
 class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="schema", tag=SCHEMA):
@@ -161,10 +161,10 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
     axes: dict[str, AxisAnalysis]
     motions: list[MotionValues]
     changes: list[ChangeValues]
-    dynamic: DynamicValues | UnsetType = UNSET
+    dynamic: DynamicAllanValues | UnsetType = UNSET
 
     @classmethod
-    def of(
+    def from_analysis(
         cls,
         result: Analysis,
         total: TotalCurve | None = None,
@@ -172,7 +172,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
         dynamic: DynamicAllan | None = None,
         temperature: TemperatureRemoval | None = None,
     ) -> Self:
-        """Build the output of an analysis.
+        """Build the JSON output of an analysis.
 
         Parameters
         ----------
@@ -191,15 +191,15 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
         measured = measured_axes(estimate.curve)
         axes = {
             axis: AxisAnalysis(
-                allan=AxisDeviations.of(estimate.curve, i),
-                total=UNSET if total is None else AxisDeviations.of(total, i),
-                hadamard=UNSET if hadamard is None else AxisDeviations.of(hadamard, i),
+                allan=AxisDeviations.from_curve(estimate.curve, i),
+                total=UNSET if total is None else AxisDeviations.from_curve(total, i),
+                hadamard=UNSET if hadamard is None else AxisDeviations.from_curve(hadamard, i),
                 coefficients=coefficient_values(estimate.coefficients, i, bool(estimate.k_or_r[i])),
                 bandwidth=float(result.bandwidth_hz[i]),
                 temperature=_temperature_values(result, temperature, axis),
                 without_temperature=UNSET
                 if temperature is None or axis not in temperature.models
-                else CoefficientsWithoutTemperature.of(temperature, axis),
+                else CoefficientsWithoutTemperature.from_temperature_removal(temperature, axis),
             )
             for i, axis in measured
         }
@@ -210,17 +210,17 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
             notes=result.notes,
             axes=axes,
             motions=[
-                MotionValues(t=one.since / estimate.rate_hz, **shared_fields(MotionValues, one))
+                MotionValues(t=one.since / estimate.rate_hz, **attributes_with_field_names(MotionValues, one))
                 for one in result.motions
             ],
-            changes=[ChangeValues.of(change, estimate.rate_hz) for change in result.changes],
+            changes=[ChangeValues.from_change(change, estimate.rate_hz) for change in result.changes],
             dynamic=UNSET
             if dynamic is None
-            else DynamicValues(
+            else DynamicAllanValues(
                 dynamic.window_s,
                 dynamic.t_s,
                 dynamic.tau_s,
-                {axis: DynamicAxis.of(dynamic, i) for i, axis in measured},
+                {axis: DynamicAllanAxis.from_dynamic_allan(dynamic, i) for i, axis in measured},
             ),
         )
 
@@ -244,7 +244,8 @@ class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag
 def _temperature_values(
     result: Analysis, temperature: TemperatureRemoval | None, axis: str
 ) -> TemperatureDependenceValues | UnsetType:
-    """Return the measures of an axis if temperature explains most of its slow variance."""
     if temperature is None or axis not in result.axes_of_temperature:
         return UNSET
-    return TemperatureDependenceValues(**shared_fields(TemperatureDependenceValues, temperature.dependences[axis]))
+    return TemperatureDependenceValues(
+        **attributes_with_field_names(TemperatureDependenceValues, temperature.dependences[axis])
+    )

@@ -1,9 +1,8 @@
-"""Past results: the reply to ``imu/<device>/history`` and the output of ``history --json``.
+"""Stored results as JSON, for the zenoh reply ``imu/<device>/history`` and for ``history --json``.
 
-All lists are indexed by bucket. For each number, ``value`` is the last value of its bucket, and ``low`` and ``high``
-are the extremes. A coefficient also has a status and the interval of its last value. The status is ``upper_bound`` if
-the coefficient was bounded but never estimated within the bucket. Numbers are written with nine digits, so that the
-decoded float32 values equal the stored values exactly.
+All lists are indexed by time bucket. For each quantity, ``value`` is the last value in the bucket, and ``low`` and
+``high`` are the extremes. The status of a coefficient is ``upper_bound`` if the bucket contains upper bounds but no
+estimates. Numbers are written with nine digits, which preserve every float32 value exactly.
 """
 
 from typing import Any, Final, Literal, Self
@@ -22,17 +21,22 @@ from monitor.history.history_table import MAX_EVENTS, ColumnStatistics, HistoryT
 from monitor.history.query_parameters import COEFFICIENTS, DEVIATIONS, EVENTS, STATUS, HistoryQuery
 from monitor.history.stored_events import StoredEvent
 from monitor.history.time_ranges import TimeRange
-from monitor.publishing.messages.message import Message, decode_message, remove_control_characters, shared_fields
+from monitor.publishing.messages.message import (
+    Message,
+    attributes_with_field_names,
+    decode_message,
+    remove_control_characters,
+)
 
 MAX_BUCKETS: Final = 1_000_000
-"""Largest number of buckets accepted in a message."""
+"""Largest accepted number of time buckets in a message."""
 MAX_HISTORY_BYTES: Final = 1 << 30
 STATUS_COLUMNS: Final = (*HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
 _STATUS_NAMES: Final = {status.value: status.name.lower() for status in Status}
 
 
 class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Last value, minimum and maximum of a number in each bucket."""
+    """Last value, minimum and maximum of a quantity in each time bucket."""
 
     value: Floats
     low: Floats
@@ -40,17 +44,17 @@ class NumberHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @classmethod
     def from_column(cls, column: ColumnStatistics) -> Self:
-        """Return the history of a stored column."""
+        """Build the history of a quantity from a stored column."""
         return cls(value=_nine_digits(column.last), low=_nine_digits(column.low), high=_nine_digits(column.high))
 
     def to_column(self, *shape: int) -> ColumnStatistics:
-        """Return the stored column, or several columns for an array of shape [buckets, columns]."""
+        """Return the stored column. A shape [buckets, columns] gives several columns."""
         low, high, last = (_checked(one, shape) for one in (self.low, self.high, self.value))
         return ColumnStatistics((~np.isnan(last)).astype(np.int64), low, high, last)
 
 
 class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
-    """Coefficient of one axis over time, with intervals, numbers of estimates and statuses."""
+    """History of one noise coefficient with intervals, numbers of estimates and statuses."""
 
     lo: Floats
     hi: Floats
@@ -59,7 +63,7 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
 
     @classmethod
     def coefficient_from_history(cls, past: HistoryTable, value_column: str) -> Self:
-        """Return the history of a coefficient, given the column of its value, such as gz.N."""
+        """Build the history of a coefficient from the value column, such as gz.N."""
         value, bound = past.column(value_column), past.column(f"{value_column}.bound")
         lo, hi = (past.column(f"{value_column}.{end}") for end in ("lo", "hi"))
         estimated, bounded = value.n > 0, bound.n > 0
@@ -75,20 +79,20 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
             status=[_STATUS_NAMES[one] for one in status.tolist()],
         )
 
-    def coefficient_columns(self, value_column: str, buckets: int) -> dict[str, ColumnStatistics]:
-        """Return the stored columns of the coefficient.
+    def coefficient_columns(self, value_column: str, bucket_count: int) -> dict[str, ColumnStatistics]:
+        """Return the stored columns of the coefficient by name.
 
         Parameters
         ----------
         value_column
             Name of the column of the value, such as gz.N.
-        buckets
+        bucket_count
             Number of buckets.
         """
-        value, n = self.to_column(buckets), _checked(self.n, (buckets,))
-        lo, hi = (_checked(one, (buckets,)) for one in (self.lo, self.hi))
+        value, n = self.to_column(bucket_count), _checked(self.n, (bucket_count,))
+        lo, hi = (_checked(one, (bucket_count,)) for one in (self.lo, self.hi))
         only_bounded = np.array([one == _STATUS_NAMES[Status.UPPER_BOUND] for one in self.status], np.bool_)
-        if only_bounded.shape != (buckets,):
+        if only_bounded.shape != (bucket_count,):
             raise ValueError("lists of different lengths")
         return {
             value_column: ColumnStatistics(n, value.low, value.high, value.last),
@@ -99,14 +103,14 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
 
 
 class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """Deviations of all axes over time. The arrays of each axis have the shape [buckets, τ]."""
+    """History of Allan deviations, with arrays of shape [buckets, τ] for each axis."""
 
     tau: list[float]
     axes: dict[str, NumberHistory]
 
     @classmethod
     def deviations_from_history(cls, past: HistoryTable, axes: tuple[str, ...]) -> Self:
-        """Return the stored deviations of the given axes."""
+        """Build the history of the Allan deviations of the given axes."""
         taus, found = past.taus(), {}
         for axis in axes:
             columns = [past.column(f"{axis}.sigma.{tau}") for tau in taus]
@@ -117,11 +121,11 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
                 found[axis] = NumberHistory.from_column(ColumnStatistics(n, low, high, last))
         return cls(tau=[float(tau) for tau in taus], axes=found)
 
-    def deviation_columns(self, buckets: int) -> dict[str, ColumnStatistics]:
-        """Return the stored columns of all axes."""
+    def deviation_columns(self, bucket_count: int) -> dict[str, ColumnStatistics]:
+        """Return the stored columns of the Allan deviations by name."""
         columns = {}
         for axis in (axis for axis in self.axes if axis in AXES):
-            one = self.axes[axis].to_column(buckets, len(self.tau))
+            one = self.axes[axis].to_column(bucket_count, len(self.tau))
             for i, tau in enumerate(self.tau):
                 columns[f"{axis}.sigma.{tau:g}"] = ColumnStatistics(
                     one.n[:, i], one.low[:, i], one.high[:, i], one.last[:, i]
@@ -130,7 +134,7 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
 
 class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
-    """State and sample counters of the device over time."""
+    """History of the state and the sample counters of a device."""
 
     state: list[Literal["ended", "running", "waiting", "lost"]]
     received: Ints
@@ -144,17 +148,17 @@ class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
 
     @classmethod
     def status_from_history(cls, past: HistoryTable) -> Self:
-        """Return the stored states, counters and numbers."""
+        """Build the history of states, sample counters and temperature."""
         counts: dict[str, Any] = {name: past.counts[:, i] for i, name in enumerate(COUNTS)}
         numbers: dict[str, Any] = {
             name: NumberHistory.from_column(past.column(name)) for name in STATUS_COLUMNS if name in past.names
         }
         return cls(state=[STATES[one] for one in past.state.tolist()], **counts, **numbers)
 
-    def status_columns(self, buckets: int) -> dict[str, ColumnStatistics]:
-        """Return the stored columns of the numbers."""
+    def status_columns(self, bucket_count: int) -> dict[str, ColumnStatistics]:
+        """Return the stored columns of rate, latency, memory and temperature by name."""
         numbers = {name: getattr(self, name) for name in STATUS_COLUMNS}
-        return {name: one.to_column(buckets) for name, one in numbers.items() if isinstance(one, NumberHistory)}
+        return {name: one.to_column(bucket_count) for name, one in numbers.items() if isinstance(one, NumberHistory)}
 
 
 class PastEvent(
@@ -163,10 +167,7 @@ class PastEvent(
     kw_only=True,
     rename={"t_s": "t", "since_s": "since", "represented_events": "stands_for"},
 ):
-    """Stored event of the device.
-
-    ``stands_for`` is the number of events that the entry represents, because older events of the same kind are deleted.
-    """
+    """Stored event of a device. ``stands_for`` is the number of events that the entry represents."""
 
     t_s: float
     kind: str
@@ -179,11 +180,14 @@ class PastEvent(
 
     @classmethod
     def from_stored_event(cls, event: StoredEvent) -> Self:
-        """Return a stored event."""
-        return cls(**shared_fields(cls, event) | {"what": {name: dict(sides) for name, sides in event.what.items()}})
+        """Build the message entry from a stored event."""
+        return cls(
+            **attributes_with_field_names(cls, event)
+            | {"what": {name: dict(sides) for name, sides in event.what.items()}}
+        )
 
     def to_event(self) -> StoredEvent:
-        """Return the stored event, without control characters in its texts."""
+        """Return the stored event with control characters removed from all texts."""
         what = {
             name: {side: np.nan if one is None else one for side, one in sides.items()}
             for name, sides in self.what.items()
@@ -198,7 +202,7 @@ class PastEvent(
 
 
 class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.schema()):
-    """Message ``imu/<device>/history``. Parts that were not requested are absent."""
+    """Message ``imu/<device>/history`` with stored results. Parts that were not requested are absent."""
 
     topic = topics.HISTORY
     from_: float = msgspec.field(name="from")
@@ -213,8 +217,8 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
     events_in_all: int | UnsetType = UNSET
 
     @classmethod
-    def reply(cls, past: HistoryTable, query: HistoryQuery, t: float, samples: int) -> Self:
-        """Build the reply to a query.
+    def build_reply(cls, past: HistoryTable, query: HistoryQuery, t: float, samples: int) -> Self:
+        """Build the reply to a history query.
 
         Parameters
         ----------
@@ -254,12 +258,12 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
         )
 
     def to_table(self) -> HistoryTable:
-        """Return the history as a table.
+        """Convert the message to a history table.
 
         Raises
         ------
         ValueError
-            If the lists have different lengths, or if there are more than MAX_BUCKETS buckets.
+            If the lists have different lengths, or if the number of buckets exceeds MAX_BUCKETS.
         """
         buckets = self.start.size
         if self.width.shape != (buckets,) or buckets > MAX_BUCKETS:
@@ -311,17 +315,16 @@ def decode_history(payload: bytes) -> HistoryTable:
 
 
 def _column_without_extremes(last: Floats) -> ColumnStatistics:
-    """Return a column for which only last values are stored; they also serve as extremes."""
     return ColumnStatistics((~np.isnan(last)).astype(np.int64), last, last, last)
 
 
 def _nine_digits(column: Floats) -> Floats:
-    """Return values rounded to nine digits, which identify every float32."""
+    """Round values to nine digits, which identify every float32."""
     return np.array([float(f"{one:.9g}") for one in column.ravel().tolist()]).reshape(column.shape)
 
 
 def _checked(array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """Return the array in the expected shape. An empty array is accepted if there are no buckets."""
+    """Return an array of the expected shape. Accept an empty array if there are no buckets."""
     if array.shape != shape and (array.size or 0 not in shape):
         raise ValueError("lists of different lengths")
     return array.reshape(shape)

@@ -1,12 +1,8 @@
-"""Base class of the messages, and their encoding as JSON.
+"""Base class of all messages, and encoding of messages as JSON.
 
-Each message is one ``msgspec.Struct``. The publisher, ``watch``, ``view`` and the history queries use the same structs.
-The order of the fields is the order of the JSON keys. A field has the name of its JSON key or of the attribute of the
-result (see ``rename``). Numbers are in SI units. NaN is written as null, because JSON cannot represent NaN. In an
-array, null is read as NaN.
-
-Unknown keys are ignored, so messages of newer daemons can be read. A payload that is not the expected message raises
-``ValueError``. The module does no I/O.
+The publisher, ``watch``, ``view`` and history queries use the same structs. The order of the fields is the order of the
+JSON keys. NaN is written as null, because JSON cannot represent NaN. In an array, null is read as NaN. Unknown keys are
+ignored, so that messages of newer daemons remain readable.
 """
 
 from functools import cache
@@ -24,7 +20,7 @@ Count = Annotated[int, msgspec.Meta(ge=0, le=(1 << 63) - 1)]
 
 
 class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="schema"):
-    """Message about one device. msgspec writes and checks the key ``schema``, which is the tag of each subclass."""
+    """Base class of messages about one device. msgspec writes and checks the key ``schema``."""
 
     topic: ClassVar[Topic]
 
@@ -35,7 +31,7 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="sc
     """Number of samples of the device since the start."""
 
     @classmethod
-    def of(cls, device: str, t: float | None, samples: int, result: Any) -> Self:
+    def from_result(cls, device: str, t: float | None, samples: int, result: Any) -> Self:
         """Build the message from a result.
 
         Parameters
@@ -45,16 +41,16 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="sc
         t
             Unix time of the result [s].
         samples
-            Number of samples of the device since the start. A result that contains this number overrides it.
+            Number of samples of the device since the start, used if the result does not contain the number.
         result
             Result of the daemon.
         """
         head = {"device": device, "t": t, "samples": samples}
-        return cls(**head | shared_fields(cls, result) | cls._convert(t, result))
+        return cls(**head | attributes_with_field_names(cls, result) | cls._convert(t, result))
 
     @classmethod
     def _convert(cls, _t: float | None, _result: Any) -> dict[str, Any]:
-        """Return the fields that are not equal to an attribute of the result with the same name."""
+        """Return the message fields that are not attributes of the result."""
         raise NotImplementedError
 
     def encode(self) -> bytes:
@@ -65,12 +61,12 @@ class Message(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_field="sc
 M = TypeVar("M", bound=Message)
 
 
-def decode_message(kind: type[M], payload: bytes, max_bytes: int = MAX_PAYLOAD_BYTES) -> M:
+def decode_message(message_type: type[M], payload: bytes, max_bytes: int = MAX_PAYLOAD_BYTES) -> M:
     """Decode a message.
 
     Parameters
     ----------
-    kind
+    message_type
         Class of the message.
     payload
         JSON text.
@@ -80,16 +76,16 @@ def decode_message(kind: type[M], payload: bytes, max_bytes: int = MAX_PAYLOAD_B
     Raises
     ------
     ValueError
-        If the payload is too large or is not a message of this class.
+        If the payload is too large or does not contain a message of the given class.
     """
     if len(payload) > max_bytes:
         raise ValueError(f"the payload has {len(payload)} bytes; at most {max_bytes} are read")
     try:
-        found = _decoder(kind).decode(payload)  # its errors are ValueErrors
+        found = _decoder(message_type).decode(payload)  # decoding errors are ValueErrors
     except RecursionError as error:
         raise ValueError(str(error)) from error
-    if not isinstance(found, kind):
-        raise ValueError(f'schema "{Message.__name__}" instead of {kind.topic.schema()}')
+    if not isinstance(found, message_type):
+        raise ValueError(f'schema "{Message.__name__}" instead of {message_type.topic.schema()}')
     return found
 
 
@@ -98,21 +94,21 @@ def encode_json(value: Any) -> bytes:
     return _ENCODER.encode(value)
 
 
-def shared_fields(kind: type[msgspec.Struct], source: object) -> dict[str, Any]:
-    """Return the attributes of an object for which a struct has a field of the same name.
+def attributes_with_field_names(struct_type: type[msgspec.Struct], source: object) -> dict[str, Any]:
+    """Return the attributes of an object that have the same names as the fields of a struct.
 
     Parameters
     ----------
-    kind
+    struct_type
         Class of the struct.
     source
         The object.
     """
-    return {name: getattr(source, name) for name in kind.__struct_fields__ if hasattr(source, name)}
+    return {name: getattr(source, name) for name in struct_type.__struct_fields__ if hasattr(source, name)}
 
 
 def remove_control_characters(text: str) -> str:
-    """Replace control characters by spaces, because a terminal would interpret them.
+    """Replace control characters, which a terminal would interpret, with spaces.
 
     >>> remove_control_characters("link\\x1b[2J lost\\nnow")
     'link [2J lost now'
@@ -121,14 +117,12 @@ def remove_control_characters(text: str) -> str:
 
 
 def _encode_array(value: Any) -> Any:
-    """Convert NumPy arrays and scalars, which msgspec cannot encode."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     raise TypeError(f"{type(value).__name__} cannot be encoded as JSON")
 
 
 def _decode_array(kind: Any, value: Any) -> Any:
-    """Convert a list of numbers, or a list of rows, to an array."""
     if kind == Ints:
         try:
             return np.array(msgspec.convert(value, list[int]), np.int64)
@@ -141,7 +135,7 @@ def _decode_array(kind: Any, value: Any) -> Any:
 
 @cache
 def _decoder(kind: type[M]) -> "msgspec.json.Decoder[M | Message]":
-    """Return the decoder of a message. In a union, msgspec requires the key ``schema``."""
+    """Return a decoder for a union, because msgspec requires the key ``schema`` only in unions."""
     return msgspec.json.Decoder(kind | Message, dec_hook=_decode_array)
 
 

@@ -21,25 +21,31 @@ from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 from monitor.noise.standard_terms import unit_allan_variances
-from monitor.publishing.messages.message import Count, Message, decode_message, remove_control_characters, shared_fields
+from monitor.publishing.messages.message import (
+    Count,
+    Message,
+    attributes_with_field_names,
+    decode_message,
+    remove_control_characters,
+)
 
 MAX_AVERAGING_TIMES: Final = 1000
 """Largest accepted number of averaging times."""
 MAX_TEXT_LENGTH: Final = 400
-"""Length to which received texts are cut, because a device must not exhaust the memory of the receiver."""
+"""Largest length of received texts, which limits the memory use of the receiver."""
 MAX_OUTPUTS: Final = 16
 STATUSES: Final = {status.name.lower(): status for status in Status}
 
 
-class SlowStatistics(NamedTuple):
-    """Total and Hadamard deviations of the window, which are computed in small steps."""
+class TotalAndHadamardCurves(NamedTuple):
+    """Total and Hadamard deviations of the samples in the window."""
 
     total: TotalCurve
     hadamard: HadamardCurve
 
 
 class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
-    """Deviations of one axis and the ends of their 95 % intervals."""
+    """Deviations of one axis with 95 % intervals."""
 
     deviation: Floats
     lo: Floats
@@ -47,20 +53,20 @@ class DeviationCurve(msgspec.Struct, frozen=True, eq=False):
 
 
 class AllanAxis(DeviationCurve, frozen=True):
-    """Allan deviations of one axis. ``recent`` uses only the last max(10 s, 16 τ) at each averaging time τ."""
+    """Allan deviations of one axis. ``recent`` uses only the last max(10 s, 16 τ) of samples."""
 
     recent: DeviationCurve | UnsetType = UNSET
 
 
 class CoefficientValue(msgspec.Struct, frozen=True):
-    """Coefficient of one axis with its 95 % interval and status."""
+    """Noise coefficient of one axis with 95 % interval and status."""
 
     value: float | None = None
     lo: float | None = None
     hi: float | None = None
     status: str = ""
     other: str | UnsetType | None = msgspec.field(name="or", default=UNSET)
-    """K for R, and R for K, if the data do not show which of the two is present."""
+    """Alternative coefficient, K or R, if the data cannot distinguish K from R."""
 
 
 class WindowResultMessage(
@@ -69,7 +75,7 @@ class WindowResultMessage(
     kw_only=True,
     rename={"rate_hz": "rate", "window_s": "window", "filled_s": "filled", "tau_s": "tau"},
 ):
-    """Base class of messages with results of the window."""
+    """Base class of messages with results of the sample window."""
 
     rate_hz: float | None = None
     window_s: float | None = None
@@ -79,7 +85,7 @@ class WindowResultMessage(
 
 
 class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.ALLAN.schema()):
-    """Message ``imu/<device>/allan``: Allan deviations of each measured axis."""
+    """Message ``imu/<device>/allan`` with the Allan deviations of each measured axis."""
 
     topic = topics.ALLAN
     tau_s: Floats
@@ -98,19 +104,20 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
         return {"filled_s": result.curve.n / result.rate_hz, "tau_s": result.curve.tau_s, "axes": axes}
 
     def to_estimate(self, coefficients: Coefficients, k_or_r: frozenset[str]) -> Estimate:
-        """Build an estimate. Its degrees of freedom and numbers of terms are unknown, because the message lacks them.
+        """Convert the message to an estimate with unknown degrees of freedom.
 
         Parameters
         ----------
         coefficients
             Coefficients of the device, from which the fitted curve is computed.
         k_or_r
-            Axes on which either K or R is present and the data do not show which.
+            Axes on which the data cannot distinguish K from R.
 
         Raises
         ------
         ValueError
-            If the averaging times are not positive and increasing, or if a list has another length.
+            If the averaging times are not positive and increasing, or if the numbers of deviations and averaging times
+            differ.
         """
         tau_s, m = self.tau_s, self.tau_s.size
         rate_hz, window_s, filled_s = self.rate_hz or 0.0, self.window_s or 0.0, self.filled_s or 0.0
@@ -131,14 +138,14 @@ class AllanMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.AL
             window_s=window_s,
             samples=self.samples,
             curve=AllanCurve(tau_s, factors, deviation**2, terms, edf, lo, hi, round(filled_s * rate_hz)),
-            fitted=fitted_variance(tau_s, rate_hz, coefficients),
+            fitted=fitted_allan_variance(tau_s, rate_hz, coefficients),
             coefficients=coefficients,
             k_or_r=np.array([axis in k_or_r for axis in AXES]),
         )
 
 
 class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.COEFFICIENTS.schema()):
-    """Message ``imu/<device>/coefficients``: Q, N, B, K and R of each measured axis."""
+    """Message ``imu/<device>/coefficients`` with Q, N, B, K and R of each measured axis."""
 
     topic = topics.COEFFICIENTS
     axes: dict[str, dict[str, CoefficientValue]]
@@ -152,7 +159,7 @@ class CoefficientsMessage(WindowResultMessage, frozen=True, kw_only=True, tag=to
         return {"filled_s": result.curve.n / result.rate_hz, "axes": axes}
 
     def to_coefficients(self) -> Coefficients:
-        """Return the coefficients of all axes.
+        """Convert the message to the coefficients of all axes.
 
         Raises
         ------
@@ -178,11 +185,11 @@ class TauRange(msgspec.Struct, frozen=True):
     tau: tuple[float, float]
 
 
-class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
-    """Comparison of one axis with its model."""
+class AxisModelGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
+    """Comparison of the measured Allan deviation of one axis with the noise model."""
 
     agrees: bool | None = None
-    """Decision with hysteresis. It changes later than ``gap`` crosses ``threshold``. None before the first decision."""
+    """True if the axis agrees with the noise model, decided with hysteresis. None before the first decision."""
     gap: float
     where: TauRange
     ratio: float | None = None
@@ -193,18 +200,20 @@ class AxisGapValues(msgspec.Struct, frozen=True, eq=False, kw_only=True):
     z: Floats | None = None
 
 
-class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
-    """Message ``imu/<device>/gap``: comparison of the measured Allan deviations with the noise model of the device."""
+class ModelGapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.schema()):
+    """Message ``imu/<device>/gap`` with the comparison of measured Allan deviations and noise model."""
 
     topic = topics.GAP
     tau_s: Floats | None = None
-    axes: dict[str, AxisGapValues]
+    axes: dict[str, AxisModelGapValues]
 
     @classmethod
     def _convert(cls, _t: float | None, result: ModelGap) -> dict[str, Any]:
         axes = {
-            axis: AxisGapValues(
-                agrees=result.agrees.get(axis), where=TauRange(one.tau_s), **shared_fields(AxisGapValues, one)
+            axis: AxisModelGapValues(
+                agrees=result.agrees.get(axis),
+                where=TauRange(one.tau_s),
+                **attributes_with_field_names(AxisModelGapValues, one),
             )
             for axis, one in result.axes.items()
         }
@@ -212,7 +221,7 @@ class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.
 
 
 class AxisThermalValues(msgspec.Struct, frozen=True):
-    """Mean bias of one axis in an interval, and its predictions. ``text`` states why a prediction is missing."""
+    """Mean bias of one axis in an interval, with predictions. ``text`` states why a prediction is missing."""
 
     bias: float | None
     error: float | None
@@ -232,7 +241,7 @@ class ThermalMessage(
     tag=topics.THERMAL.schema(),
     rename={"interval_s": "interval", "temperature_c": "temperature"},
 ):
-    """Message ``imu/<device>/thermal``: mean biases of the interval that ends at ``t``, and their predictions."""
+    """Message ``imu/<device>/thermal`` with measured and predicted mean biases of the interval that ends at ``t``."""
 
     topic = topics.THERMAL
     interval_s: float
@@ -242,39 +251,44 @@ class ThermalMessage(
     @classmethod
     def _convert(cls, _t: float | None, result: ThermalIntervalResult) -> dict[str, Any]:
         axes = {
-            axis: AxisThermalValues(**shared_fields(AxisThermalValues, one) | {"model": one.model or None})
+            axis: AxisThermalValues(
+                **attributes_with_field_names(AxisThermalValues, one) | {"model": one.model or None}
+            )
             for axis, one in result.axes.items()
         }
         return {"axes": axes}
 
 
 class DeviationTable(msgspec.Struct, frozen=True, eq=False):
-    """Deviations of all measured axes at the same averaging times."""
+    """Deviations of all measured axes at common averaging times."""
 
     tau: Floats
     axes: dict[str, DeviationCurve]
 
     @classmethod
-    def of(cls, curve: TotalCurve | HadamardCurve) -> Self:
-        """Return the deviations of all axes that have at least one deviation."""
+    def from_curve(cls, curve: TotalCurve | HadamardCurve) -> Self:
+        """Build the table of deviations, without the axes that have no deviation."""
         curves = {axis: DeviationCurve(*deviations_with_interval_ends(curve, i)) for i, axis in enumerate(AXES)}
         return cls(curve.tau_s, {axis: one for axis, one in curves.items() if np.isfinite(one.deviation).any()})
 
 
-class TotalMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()):
-    """Message ``imu/<device>/total``: total and Hadamard deviations, each with its own averaging times."""
+class TotalAndHadamardMessage(Message, frozen=True, kw_only=True, tag=topics.TOTAL.schema()):
+    """Message ``imu/<device>/total`` with total and Hadamard deviations."""
 
     topic = topics.TOTAL
     total: DeviationTable
     hadamard: DeviationTable
 
     @classmethod
-    def _convert(cls, _t: float | None, result: SlowStatistics) -> dict[str, Any]:
-        return {"total": DeviationTable.of(result.total), "hadamard": DeviationTable.of(result.hadamard)}
+    def _convert(cls, _t: float | None, result: TotalAndHadamardCurves) -> dict[str, Any]:
+        return {
+            "total": DeviationTable.from_curve(result.total),
+            "hadamard": DeviationTable.from_curve(result.hadamard),
+        }
 
 
 class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()):
-    """Message ``imu/<device>/event``."""
+    """Message ``imu/<device>/event`` with a detected event."""
 
     topic = topics.EVENT
     kind: str
@@ -296,12 +310,12 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode a message of another process. Control characters are removed from all texts.
+        """Decode an event of another process, and remove control characters from all texts.
 
         Raises
         ------
         ValueError
-            If the payload is not an event, or has no time.
+            If the payload is not an event message, or if the event has no time.
         """
         found = decode_message(cls, payload)
         if found.t is None:
@@ -309,7 +323,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
         return msgspec.structs.replace(found, kind=_clean(found.kind), text=_clean(found.text))
 
     def to_event(self) -> Event:
-        """Build an event with the changed coefficients."""
+        """Convert the message to an event with the changed coefficients."""
         values: dict[str, dict[str, float]] = {
             symbol: {side: value for side, value in self.what[symbol].items() if isinstance(value, float | int)}
             for symbol in SYMBOLS
@@ -319,7 +333,7 @@ class EventMessage(Message, frozen=True, kw_only=True, tag=topics.EVENT.schema()
         return Event(self.kind, round((self.t or 0.0) * 1e9), self.text, axis, values)
 
 
-class Latency(msgspec.Struct, frozen=True):
+class LatencyPercentiles(msgspec.Struct, frozen=True):
     """Percentiles of the latency from receipt to publication [s]."""
 
     p50: float | None = None
@@ -333,7 +347,7 @@ class StatusMessage(
     tag=topics.STATUS.schema(),
     rename={"rate_hz": "rate", "memory_bytes": "memory", "uptime_s": "uptime"},
 ):
-    """Message ``imu/<device>/status``. The fields have the meaning of the fields of ``Health``."""
+    """Message ``imu/<device>/status`` with the fields of ``Health``."""
 
     topic = topics.STATUS
     state: str
@@ -342,7 +356,7 @@ class StatusMessage(
     lost: Count
     bad: Count
     overflowed: Count = 0
-    latency: Latency = Latency()
+    latency: LatencyPercentiles = LatencyPercentiles()
     memory_bytes: Count = 0
     outputs: dict[str, str] = msgspec.field(default_factory=dict)
     uptime_s: float = 0.0
@@ -357,19 +371,19 @@ class StatusMessage(
     def _convert(cls, _t: float | None, result: Health) -> dict[str, Any]:
         return {
             "samples": result.received,
-            "latency": Latency(result.latency_p50_s, result.latency_p99_s),
+            "latency": LatencyPercentiles(result.latency_p50_s, result.latency_p99_s),
             "outputs": {name: mask_secrets(state) for name, state in result.outputs.items()},
             "text": mask_secrets(result.text),
         }
 
     @classmethod
     def decode(cls, payload: bytes) -> Self:
-        """Decode a message of another process. Control characters are removed from all texts.
+        """Decode a status of another process, and remove control characters from all texts.
 
         Raises
         ------
         ValueError
-            If the payload is not a status.
+            If the payload is not a status message.
         """
         found = decode_message(cls, payload)
         outputs = {_clean(name): _clean(state) for name, state in list(found.outputs.items())[:MAX_OUTPUTS]}
@@ -379,7 +393,7 @@ class StatusMessage(
         )
 
     def to_health(self) -> Health:
-        """Build the health of the device."""
+        """Convert the message to a ``Health`` object."""
         known = {field.name: getattr(self, field.name) for field in fields(Health) if hasattr(self, field.name)}
         return Health(**known, latency_p50_s=self.latency.p50, latency_p99_s=self.latency.p99)
 
@@ -396,31 +410,31 @@ class ResetReply(Message, frozen=True, kw_only=True, tag=topics.RESET.schema()):
 
 
 class ReconcileReply(Message, frozen=True, kw_only=True, tag=topics.RECONCILE.schema()):
-    """First keys of the reply to ``imu/<device>/command/reconcile``. The keys of the report follow."""
+    """First keys of the reply to ``imu/<device>/command/reconcile``, which precede the keys of the report."""
 
     topic = topics.RECONCILE
 
-    def encode_report(self, report: Mapping[str, Any], status: int, folder: str | None) -> bytes:
-        """Encode the reply.
+    def encode_report(self, report: Mapping[str, Any], exit_status: int, folder: str | None) -> bytes:
+        """Encode the reply with the report as JSON.
 
         Parameters
         ----------
         report
             Report of the command.
-        status
+        exit_status
             Exit status of the command.
         folder
             Folder that contains the complete report. None if the report was not saved.
         """
         head = msgspec.to_builtins(self)
         keys = {key: value for key, value in report.items() if key not in head}
-        return msgspec.json.encode({**head, **keys, "exit": status, "folder": folder})
+        return msgspec.json.encode({**head, **keys, "exit": exit_status, "folder": folder})
 
 
 def coefficient_values(
     coefficients: Coefficients, axis: int, k_r_ambiguous: bool = False
 ) -> dict[str, CoefficientValue]:
-    """Return the coefficients of one axis by symbol, as in messages and in ``analyze --json``.
+    """Return the noise coefficients of one axis by symbol.
 
     Parameters
     ----------
@@ -429,7 +443,7 @@ def coefficient_values(
     axis
         Column of the axis.
     k_r_ambiguous
-        True if either K or R is present and the data do not show which.
+        True if the data cannot distinguish K from R.
     """
     other = {"K": "R", "R": "K"} if k_r_ambiguous else {}
     return {
@@ -445,7 +459,7 @@ def coefficient_values(
 
 
 def event_start_s(unix_s: float, event: Event) -> float | None:
-    """Return the Unix time [s] at which the condition reported by an event began; None if unknown.
+    """Return the Unix time [s] at which the condition of an event began, or None if unknown.
 
     Parameters
     ----------
@@ -457,8 +471,8 @@ def event_start_s(unix_s: float, event: Event) -> float | None:
     return None if event.since_ns is None else unix_s - (event.t_ns - event.since_ns) / 1e9
 
 
-def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -> Floats:
-    """Return the Allan variance of the estimated terms, shape [m, 6]. It is NaN on axes without estimated terms.
+def fitted_allan_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -> Floats:
+    """Return the Allan variance of the estimated noise terms, shape [m, 6]. Axes without estimates are NaN.
 
     Parameters
     ----------
@@ -477,7 +491,7 @@ def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -
 def deviations_with_interval_ends(
     curve: AllanCurve | TotalCurve | HadamardCurve, axis: int
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the deviations of one axis and the ends of their intervals, each of shape [m].
+    """Return the deviations of one axis and the ends of the 95 % intervals, each of shape [m].
 
     Parameters
     ----------
@@ -497,10 +511,9 @@ def deviations_with_interval_ends(
 
 
 def measured_axes(curve: AllanCurve) -> list[tuple[int, str]]:
-    """Return the column and name of each axis with Allan variances."""
+    """Return the column index and the name of each axis with Allan variances."""
     return [(i, axis) for i, axis in enumerate(AXES) if not np.isnan(curve.avar[:, i]).all()]
 
 
 def _clean(text: str) -> str:
-    """Return a received text without control characters, cut to MAX_TEXT_LENGTH."""
     return remove_control_characters(text[:MAX_TEXT_LENGTH])

@@ -1,1 +1,1 @@
-"""Figures in PNG format."""
+"""Plots as image files and as SVG elements of HTML reports."""

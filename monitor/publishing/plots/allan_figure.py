@@ -1,9 +1,8 @@
 """Allan plot of one kind of sensor, for the image of ``analyze --plot`` and for the HTML report.
 
-The plot shows the measured Allan deviation of three axes with 95 % bands, and the fitted deviation as a dashed line.
-Each estimated noise term has a thin line. A ring on this line marks the averaging time at which the coefficient is read
-(IEEE Std 952). Rings that would overlap share one label. Markers, rings and dashes differ between the axes, so that
-identical deviations of two axes do not hide each other.
+The plot shows the measured Allan deviations with 95 % bands, and the fitted deviations as dashed lines. Each estimated
+noise term has a thin line with a ring at the averaging time at which the coefficient is read (IEEE Std 952). Markers,
+rings and dashes differ between axes, so that equal deviations of two axes remain visible.
 """
 
 from collections.abc import Collection, Sequence
@@ -34,66 +33,72 @@ READING_TAU_S: Final = {
     "N": 1.0,
     "K": 3.0,
     "R": 2.0**0.5,
-}  # τ at which the deviation of the term equals the coefficient
-LINE_TAU_S: Final = np.array([1e-6, 1e9])  # ends of the line of a term, beyond any plot
-TAU0_S: Final = 1e-9  # sample interval for the line of a term, so short that sampling has no effect
+}  # averaging time at which the deviation of the noise term equals the coefficient
+LINE_TAU_S: Final = np.array([1e-6, 1e9])  # ends of the line of a noise term, outside every plot
+TAU0_S: Final = 1e-9  # sample interval that is too short to affect the line of a noise term
 LEGEND_TEXT: Final = (
     "○ a coefficient, read on its own line: Q at √3 s, N at 1 s, K at 3 s, R at √2 s; 0.664 B where the curve is lowest"
 )
 OTHER_LINE_STYLES: Final = ("-", ":", "-.")
 TERM_LINE_ALPHA: Final = 0.4
-MAX_DEPTH_RATIO: Final = 300.0  # a ring further below the lowest point is omitted
+MAX_DEPTH_RATIO: Final = 300.0  # largest ratio between the lowest point and a ring; lower rings are omitted
 MAX_BAND_RATIO: Final = 3.0  # a band extends the plot by at most this factor beyond the points
 MARGIN_FACTOR: Final = 1.6
-MIN_LETTER_DISTANCE: Final = 0.045  # rings closer than this share of the height of the plot share a label
+MIN_LETTER_DISTANCE: Final = 0.045  # smallest distance between two labels, as a share of the height of the plot
 
 
 @dataclass(frozen=True, slots=True)
-class OtherDeviation:
-    """Total or Hadamard deviation that is drawn in addition to the Allan deviation."""
+class AdditionalDeviation:
+    """Total or Hadamard deviation to draw in addition to the Allan deviation."""
 
     name: str  # "total" or "Hadamard"
     tau_s: Floats  # [k]
     deviation: Floats  # [k, 6] SI unit of the axis
     lo: Floats  # [k, 6] ends of the 95 % interval; NaN if unknown
     hi: Floats
-    only_beyond: bool = False  # True to draw only τ longer than the longest τ of the Allan deviation
+    only_beyond: bool = False  # True to draw only averaging times beyond the Allan deviation
 
-    def drawn_points(self, axis: int, longest_s: float) -> NDArray[np.bool_]:
-        """Return a mask of the points of an axis that are drawn, shape [k].
+    def drawn_points_mask(self, axis: int, longest_allan_tau_s: float) -> NDArray[np.bool_]:
+        """Return a mask of the points of one axis that the plot shows, shape [k].
 
         Parameters
         ----------
         axis
             Column of the axis.
-        longest_s
+        longest_allan_tau_s
             Longest averaging time of the Allan deviation of this axis [s].
         """
         positive = np.isfinite(self.deviation[:, axis]) & (self.deviation[:, axis] > 0)
-        return np.asarray(positive & (self.tau_s > longest_s) if self.only_beyond else positive)
+        return np.asarray(positive & (self.tau_s > longest_allan_tau_s) if self.only_beyond else positive)
 
 
-def other_deviations(total: TotalCurve | None = None, hadamard: HadamardCurve | None = None) -> list[OtherDeviation]:
-    """Return the total deviation, to be drawn beyond the longest τ of the Allan deviation, and the Hadamard deviation.
+def additional_deviations(
+    total: TotalCurve | None = None, hadamard: HadamardCurve | None = None
+) -> list[AdditionalDeviation]:
+    """Return the total and Hadamard deviations to draw.
+
+    The total deviation is drawn only beyond the longest averaging time of the Allan deviation.
 
     Parameters
     ----------
     total
-        Total variance; None to omit it.
+        Total variance, or None.
     hadamard
-        Hadamard variance; None to omit it.
+        Hadamard variance, or None.
     """
     found = []
     if total is not None:
-        found.append(OtherDeviation("total", total.tau_s, np.sqrt(total.tvar), total.lo, total.hi, only_beyond=True))
+        found.append(
+            AdditionalDeviation("total", total.tau_s, np.sqrt(total.tvar), total.lo, total.hi, only_beyond=True)
+        )
     if hadamard is not None:
-        found.append(OtherDeviation("Hadamard", hadamard.tau_s, np.sqrt(hadamard.hvar), hadamard.lo, hadamard.hi))
+        found.append(AdditionalDeviation("Hadamard", hadamard.tau_s, np.sqrt(hadamard.hvar), hadamard.lo, hadamard.hi))
     return found
 
 
 @dataclass(frozen=True, slots=True)
 class _Ring:
-    """Ring that marks where one coefficient of one axis is read from the plot."""
+    """Ring at the averaging time at which a coefficient is read from the Allan plot."""
 
     letter: str
     tau_s: float
@@ -102,7 +107,7 @@ class _Ring:
     line: Floats  # deviation of the term at both ends of LINE_TAU_S
 
 
-def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequence[OtherDeviation] = ()) -> None:
+def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequence[AdditionalDeviation] = ()) -> None:
     """Draw the Allan plot of one kind of sensor.
 
     Parameters
@@ -128,7 +133,7 @@ def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequ
             continue
         fitted, measured = (np.sqrt(a[:, i]) * factor for a in (estimate.fitted, estimate.curve.avar))
         lo, hi = (a[valid, i] * factor for a in (estimate.curve.lo, estimate.curve.hi))
-        measured, longest_s = measured[valid], float(tau_s[valid][-1])
+        measured, longest_allan_tau_s = measured[valid], float(tau_s[valid][-1])
         draw_band(panel, tau_s[valid], lo, hi, COLOURS[number])
         panel.plot(tau_s, fitted, linestyle=FIT_DASHES[number], color=COLOURS[number], zorder=3)
         style = {"color": COLOURS[number], "markersize": MARKER_SIZES[number], "mew": 1.1}
@@ -137,9 +142,9 @@ def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequ
         near_lo, near_hi = np.maximum(lo, measured / MAX_BAND_RATIO), np.minimum(hi, measured * MAX_BAND_RATIO)
         shown += [measured, fitted, near_lo, near_hi]
         for style_name, other in zip(OTHER_LINE_STYLES, others, strict=False):
-            points = other.drawn_points(i, longest_s)
+            points = other.drawn_points_mask(i, longest_allan_tau_s)
             if points.any():
-                shown.append(_draw_other(panel, other, points, number, i, factor, longest_s, style_name))
+                shown.append(_draw_other(panel, other, points, number, i, factor, longest_allan_tau_s, style_name))
                 drawn.add(other.name)
         rings += _rings(estimate, i, factor, minimum_tau_s, float(measured.min()))
     _set_limits(panel, shown, rings)
@@ -148,12 +153,12 @@ def draw_allan_panel(panel: "Axes", estimate: Estimate, kind: Kind, others: Sequ
 
 
 def _draw_other(
-    panel: "Axes", other: OtherDeviation, points: NDArray[np.bool_], number: int, i: int, factor: float,
-    longest_s: float, line_style: str,
+    panel: "Axes", other: AdditionalDeviation, points: NDArray[np.bool_], number: int, i: int, factor: float,
+    longest_allan_tau_s: float, line_style: str,
 ) -> Floats:  # fmt: skip
-    """Draw another deviation of one axis as a thin line; return the values that the plot must contain."""
-    # The line begins at the last point of the Allan deviation, so that its origin is visible.
-    line = points | (other.tau_s == longest_s) if other.only_beyond else points
+    """Draw an additional deviation of one axis, and return the drawn values."""
+    # The line begins at the last point of the Allan deviation to show the connection.
+    line = points | (other.tau_s == longest_allan_tau_s) if other.only_beyond else points
     y, colour = other.deviation[:, i] * factor, COLOURS[number]
     panel.plot(other.tau_s[line], y[line], line_style, color=colour, linewidth=0.9, alpha=0.8, zorder=2)
     if other.only_beyond:  # at shorter τ, the markers would hide the Allan deviation
@@ -164,7 +169,7 @@ def _draw_other(
 
 
 def _tau_of_minimum_s(estimate: Estimate, kind: Kind) -> float:
-    """Return the averaging time [s] at which the mean deviation of all axes has its minimum; B is read there."""
+    """Return the averaging time [s] with the lowest mean deviation, at which B is read."""
     avar = estimate.curve.avar[:, [AXES.index(axis) for axis in axes_of(kind)]]
     good = np.isfinite(avar) & (avar > 0)
     common = (good | ~good.any(axis=0)).all(axis=1) & good.any(axis=1)
@@ -175,7 +180,6 @@ def _tau_of_minimum_s(estimate: Estimate, kind: Kind) -> float:
 
 
 def _rings(estimate: Estimate, i: int, factor: float, minimum_tau_s: float, lowest: float) -> list[_Ring]:
-    """Return the rings of the estimated coefficients of one axis."""
     known, rings = estimate.coefficients, []
     for row, (letter, source) in enumerate(zip(SYMBOLS, UNIT_SOURCES, strict=True)):
         if known.status[row, i] != Status.ESTIMATED:
@@ -188,7 +192,6 @@ def _rings(estimate: Estimate, i: int, factor: float, minimum_tau_s: float, lowe
 
 
 def _set_limits(panel: "Axes", shown: Sequence[Floats], rings: Sequence[_Ring]) -> None:
-    """Set limits that contain all data, rings and labels."""
     panel.set(xscale="log", yscale="log")
     values = np.concatenate([*shown, [ring.sigma for ring in rings]]) if shown else np.array([1.0])
     values = values[np.isfinite(values) & (values > 0)]
@@ -199,7 +202,6 @@ def _set_limits(panel: "Axes", shown: Sequence[Floats], rings: Sequence[_Ring]) 
 
 
 def _draw_terms(panel: "Axes", rings: Sequence[_Ring]) -> None:
-    """Draw a line and a ring for each noise term, and a label for each group of rings."""
     for ring in rings:
         colour, size = COLOURS[ring.number], RING_SIZES[ring.number]
         panel.plot(LINE_TAU_S, ring.line, color=colour, linewidth=0.7, alpha=TERM_LINE_ALPHA, zorder=1, scalex=False)
@@ -221,7 +223,7 @@ def _draw_terms(panel: "Axes", rings: Sequence[_Ring]) -> None:
 
 
 def _group_rings(panel: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
-    """Group the rings of one coefficient whose labels would overlap; the lowest ring is first."""
+    """Group rings of one coefficient whose labels would overlap."""
     bottom, top = np.log(panel.get_ylim())
     groups: list[list[_Ring]] = []
     for ring in sorted(rings, key=lambda one: (one.letter, one.sigma)):
@@ -234,8 +236,7 @@ def _group_rings(panel: "Axes", rings: Sequence[_Ring]) -> list[list[_Ring]]:
     return groups
 
 
-def _draw_labels(panel: "Axes", kind: Kind, others: Sequence[OtherDeviation], drawn: Collection[str]) -> None:
-    """Draw axis labels, grid and legend."""
+def _draw_labels(panel: "Axes", kind: Kind, others: Sequence[AdditionalDeviation], drawn: Collection[str]) -> None:
     panel.plot([], [], "--", color=GREY, label="fit")
     panel.fill_between([], [], [], color=GREY, alpha=0.25, label="95 %")
     for line_style, other in zip(OTHER_LINE_STYLES, others, strict=False):

@@ -1,7 +1,7 @@
 """Plot of one analysis, for ``imu-monitor analyze --plot FILE.png``.
 
-Gyroscopes and accelerometers are shown side by side: the Allan plot, a table of the coefficients, and the dynamic
-Allan deviation if it was computed.
+The figure shows Allan plots, tables of coefficients and dynamic Allan deviations, with one column for each kind of
+sensor.
 """
 
 from collections.abc import Sequence
@@ -24,15 +24,15 @@ from monitor.publishing.coefficient_cells import (
     mark_temperature_axis,
 )
 from monitor.publishing.messages.results import measured_axes
-from monitor.publishing.plots.allan_figure import LEGEND_TEXT, OtherDeviation, draw_allan_panel
-from monitor.publishing.plots.dynamic_figure import ChangeMark, draw_dynamic_panels, height_inches
+from monitor.publishing.plots.allan_figure import LEGEND_TEXT, AdditionalDeviation, draw_allan_panel
+from monitor.publishing.plots.dynamic_figure import ChangeMark, draw_dynamic_panels, dynamic_figure_height_inches
 from monitor.publishing.plots.style import COLOURS, GREY, create_figure, figure_style, save_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-INCHES: Final = (7.2, 7.6)  # size of one Allan plot and the table below it
-COLUMNS: Final = (0.0, 0.46, 0.65, 0.84)  # left edges of the table's columns, as shares of its width
+INCHES: Final = (7.2, 7.6)  # size of one Allan plot with table
+COLUMNS: Final = (0.0, 0.46, 0.65, 0.84)  # left edges of the columns, as shares of the table width
 TABLE_LEGEND: Final = (
     "small print: 95 % interval;  ≤ one-sided 95 % bound;  — too few data;  K or R: the data do not show which"
 )
@@ -40,65 +40,65 @@ TABLE_LEGEND: Final = (
 
 @dataclass(frozen=True, slots=True)
 class AnalysisPlotData:
-    """Content of the plot and of the HTML report of one recording."""
+    """Content of the analysis plot and of the HTML report of one recording."""
 
     analysis: Analysis
-    others: Sequence[OtherDeviation] = ()  # such as total and Hadamard deviation
+    others: Sequence[AdditionalDeviation] = ()  # such as total and Hadamard deviation
     dynamic: DynamicAllan | None = None
     marks: Sequence[ChangeMark] = ()  # changes to mark in the dynamic Allan deviation
 
 
-def save_analysis_plot(drawn: AnalysisPlotData, path: Path, title: str = "") -> None:
-    """Write the plot.
+def save_analysis_plot(plot_data: AnalysisPlotData, path: Path, title: str = "") -> None:
+    """Write the analysis plot to a file.
 
     Parameters
     ----------
-    drawn
+    plot_data
         Analysis of the recording.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
     title
         Title of the figure.
 
     Raises
     ------
     ConfigError
-        If matplotlib is missing or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     """
-    estimate, dynamic = drawn.analysis.estimate, drawn.dynamic
+    estimate, dynamic = plot_data.analysis.estimate, plot_data.dynamic
     with figure_style():
         kinds = measured_kinds(estimate)
         heights = [INCHES[1]]
         if dynamic is not None:
-            heights.append(max(height_inches(dynamic, kind) for kind in kinds))
+            heights.append(max(dynamic_figure_height_inches(dynamic, kind) for kind in kinds))
         figure = create_figure(INCHES[0] * len(kinds), sum(heights))
         parts = figure.subfigures(len(heights), len(kinds), squeeze=False, height_ratios=heights)
         for column, kind in enumerate(kinds):
             curves, table = parts[0, column].subplots(2, 1, height_ratios=[3.6, 1.75])
-            draw_allan_panel(curves, estimate, kind, drawn.others)
-            _draw_table(table, drawn.analysis, kind)
+            draw_allan_panel(curves, estimate, kind, plot_data.others)
+            _draw_table(table, plot_data.analysis, kind)
             if dynamic is not None:
-                draw_dynamic_panels(parts[1, column], dynamic, kind, drawn.marks)
-        figure.suptitle("\n".join([*([title] if title else []), recording_line(estimate)]))
+                draw_dynamic_panels(parts[1, column], dynamic, kind, plot_data.marks)
+        figure.suptitle("\n".join([*([title] if title else []), describe_recording(estimate)]))
         save_figure(figure, path)
 
 
 def measured_kinds(estimate: Estimate) -> list[Kind]:
-    """Return the measured kinds of sensor, or both kinds if no axis is measured."""
+    """Return the kinds of sensor with measured axes, or both kinds if no axis is measured."""
     present = {axis for _, axis in measured_axes(estimate.curve)}
     return [kind for kind in KINDS if set(axes_of(kind)) & present] or list(KINDS)
 
 
-def recording_line(estimate: Estimate) -> str:
-    """Return one line with the number of samples, rate, duration and number of missing samples."""
+def describe_recording(estimate: Estimate) -> str:
+    """Return one line with the number of samples, the rate, the duration and the number of missing samples."""
     missing = estimate.curve.n - estimate.samples
     gaps = f", {missing:,} missing" if missing > 0 else ""
     duration = format_duration(estimate.curve.n / estimate.rate_hz)
     return f"{estimate.samples:,} samples at {estimate.rate_hz:.6g} Hz, {duration}{gaps}"
 
 
-def is_k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
-    """Return True if a coefficient is K or R with an upper bound, and the data do not show which of the two is present.
+def is_k_r_ambiguous(estimate: Estimate, letter: str, axis: str) -> bool:
+    """Return True if a coefficient has only an upper bound because the data cannot distinguish K from R.
 
     Parameters
     ----------
@@ -115,7 +115,6 @@ def is_k_or_r(estimate: Estimate, letter: str, axis: str) -> bool:
 
 
 def _draw_table(panel: "Axes", analysis: Analysis, kind: Kind) -> None:
-    """Draw the table of coefficients with their intervals in small print."""
     estimate = analysis.estimate
     panel.axis("off")
     rows = np.linspace(0.97, 0.19, len(SYMBOLS) + 1)
@@ -129,7 +128,7 @@ def _draw_table(panel: "Axes", analysis: Analysis, kind: Kind) -> None:
         for axis, x, _ in columns:
             cell = format_coefficient(estimate.coefficients, letter, axis)
             panel.text(x, y + 0.02, cell.value, va="center")
-            small = "K or R" if is_k_or_r(estimate, letter, axis) else cell.interval
+            small = "K or R" if is_k_r_ambiguous(estimate, letter, axis) else cell.interval
             panel.text(x, y - 0.05, small, va="center", fontsize=6.5, color=GREY)
     temperature = f";  {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if analysis.axes_of_temperature else ""
     for y, text in ((0.03, TABLE_LEGEND + temperature), (-0.04, LEGEND_TEXT)):

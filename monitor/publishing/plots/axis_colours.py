@@ -1,8 +1,7 @@
-"""Colours of the axes in all plots: x red, y green, z blue, in shades that colour-blind readers can distinguish.
+"""Colours of the axes in all plots, which colour-blind readers can distinguish.
 
-The colours differ in lightness as well as in hue. They are close to vermilion, bluish green and sky blue of the
-palette of Okabe & Ito, which remain distinct with deuteranopia and protanopia. A gyroscope and an accelerometer of
-the same direction share a colour, because they never share a plot.
+The colours are close to vermilion, bluish green and sky blue of the Okabe-Ito palette, and also differ in lightness. A
+gyroscope and an accelerometer of the same direction share a colour, because they never share a plot.
 """
 
 from typing import Final
@@ -21,21 +20,21 @@ BACKGROUND: Final[Colour] = (13, 16, 17)
 FRAME: Final[Colour] = (92, 98, 104)
 MAJOR: Final[Colour] = (48, 53, 57)
 MINOR: Final[Colour] = (23, 27, 29)
-TEXT: Final[Colour] = (236, 239, 242)  # legible on the label boxes of the dark and the light theme
+TEXT: Final[Colour] = (236, 239, 242)  # legible on label boxes in the dark and light themes
 TEMPERATURE: Final[Colour] = (236, 180, 72)
 
 
-def blend(colour: Colour, share: float, ground: Colour = BACKGROUND) -> Colour:
+def blend_colours(colour: Colour, colour_share: float, background: Colour = BACKGROUND) -> Colour:
     """Return the mixture of a colour and a background, as a translucent area would appear.
 
     Parameters
     ----------
     colour
         Colour as red, green and blue, 0 to 255.
-    share
+    colour_share
         Share of the colour, 0 to 1.
-    ground
+    background
         Background colour.
     """
-    r, g, b = (round(share * c + (1 - share) * d) for c, d in zip(colour, ground, strict=True))
+    r, g, b = (round(colour_share * c + (1 - colour_share) * d) for c, d in zip(colour, background, strict=True))
     return r, g, b

@@ -1,6 +1,6 @@
-"""Plot of drift compensation with one row per axis: drift over time, and Allan deviation before and after.
+"""Plot of drift compensation, with the drift over time and the Allan deviation before and after compensation.
 
-The predicted drift of a long recording is averaged over groups of intervals, so that its 95 % band stays visible.
+The predicted drift of a long recording is averaged over groups of intervals, so that the 95 % band stays visible.
 """
 
 from pathlib import Path
@@ -20,24 +20,24 @@ if TYPE_CHECKING:
 
 ROW_INCHES: Final = (11.0, 2.6)
 UNIT: Final = DEVIATION_UNITS["gyro"]
-MAX_LINE_POINTS: Final = 400  # a line with more points would cover its band and the measured means
+MAX_LINE_POINTS: Final = 400  # more points would hide the band and the measured means
 MEANS_ALPHA: Final = 0.6
 
 
 def save_compensation_plot(result: CompensationResult, path: Path) -> None:
-    """Write the plot.
+    """Write the plot of a drift compensation to a file.
 
     Parameters
     ----------
     result
         Results of the compensation.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
 
     Raises
     ------
     ConfigError
-        If matplotlib is missing or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     """
     with style.figure_style():
         figure = style.create_figure(ROW_INCHES[0], 0.7 + ROW_INCHES[1] * len(result.axes))
@@ -52,7 +52,6 @@ def save_compensation_plot(result: CompensationResult, path: Path) -> None:
 
 
 def _draw_drift(panel: "Axes", axis: str, result: CompensationResult) -> None:
-    """Draw the means at rest and the predicted drift of one axis."""
     i, colour = AXES.index(axis), style.axis_colour(axis)
     minutes = np.array([one.end for one in result.intervals]) / result.rate_hz / 60.0
     used = np.array([one.outcome[i] for one in result.intervals]) == USED
@@ -75,12 +74,11 @@ def _draw_drift(panel: "Axes", axis: str, result: CompensationResult) -> None:
 
 
 def _average_groups(values: Floats, size: int) -> Floats:
-    """Return the means of groups of ``size`` values; an incomplete last group is omitted."""
+    """Return the means of groups of ``size`` values, without an incomplete last group."""
     return np.asarray(values[: values.size // size * size].reshape(-1, size).mean(axis=1))
 
 
 def _draw_allan_deviation(panel: "Axes", axis: str, one: AxisCompensation) -> None:
-    """Draw the Allan deviation of one axis before and after compensation."""
     for curve, colour, label in (
         (one.uncompensated, style.GREY, "before compensation"),
         (one.compensated, style.axis_colour(axis), "after"),

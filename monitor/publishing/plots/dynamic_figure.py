@@ -1,10 +1,8 @@
-"""Plot of the dynamic Allan deviation of one kind of sensor: heat maps over time, and the coefficients over time.
+"""Plot of the dynamic Allan deviation of one kind of sensor, with heat maps and coefficients over time.
 
-The time axis of all panels is the time at the end of the window. A heat map shows each τ over time. Its colour is the
-deviation divided by the median over time, so that all τ share one scale. Cells whose 95 % interval contains the median
-are pale. A coefficient has a panel if it is estimated for some time on some axis. A vertical line marks a change. In
-the heat map of the changed axis, the line has a label. In the panels of the coefficients, it has the colour of the
-axis.
+The time axis shows the end of the window. The colour of a heat map is the deviation divided by the median deviation
+over time. Cells are pale if the 95 % interval contains the median. A coefficient that is estimated in at least 5 % of
+the time steps has a panel. A vertical line marks a detected change.
 """
 
 import warnings
@@ -29,7 +27,7 @@ if TYPE_CHECKING:
 HEAT_MAP_INCHES: Final = 1.35
 COEFFICIENT_INCHES: Final = 1.6
 SPARE_INCHES: Final = 1.2  # height of title, colour bar and time axis
-MIN_ESTIMATED_SHARE: Final = 0.05  # smallest share of time steps with an estimate for a coefficient to have a panel
+MIN_ESTIMATED_SHARE: Final = 0.05  # smallest share of estimated time steps of a coefficient with a panel
 PALE_ALPHA: Final = 0.3
 MIN_LABEL_DISTANCE: Final = 0.13  # smallest distance between two labels, as a share of the width
 COLOUR_SCALE_RATIOS: Final = (1.25, 1.5, 2.0, 3.0, 5.0, 10.0)  # possible upper ends of the colour scale
@@ -46,19 +44,17 @@ class ChangeMark:
 
 
 def _shown_coefficients(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
-    """Return the coefficients that are estimated often enough to have a panel."""
     columns = [AXES.index(axis) for axis in axes_of(kind)]
     share = (dynamic.status[:, :, columns] == Status.ESTIMATED).mean(axis=0).max(axis=1)
     return tuple(letter for letter, one in zip(SYMBOLS, share, strict=True) if one >= MIN_ESTIMATED_SHARE)
 
 
 def _shown_axes(dynamic: DynamicAllan, kind: Kind) -> tuple[str, ...]:
-    """Return the measured axes of a kind of sensor."""
     return tuple(a for a in axes_of(kind) if bool(np.isfinite(dynamic.deviation[:, :, AXES.index(a)]).any()))
 
 
-def height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
-    """Return the height of the figure [inches].
+def dynamic_figure_height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
+    """Return the height of the dynamic Allan figure [inches].
 
     Parameters
     ----------
@@ -71,12 +67,14 @@ def height_inches(dynamic: DynamicAllan, kind: Kind) -> float:
     return SPARE_INCHES + HEAT_MAP_INCHES * heat_maps + COEFFICIENT_INCHES * coefficients
 
 
-def divide_by_median(dynamic: DynamicAllan) -> Floats:
-    """Return the deviation divided by the median over time, shape [T, m, 6]. NaN if it is missing or the median is 0.
+def divide_by_time_median(dynamic: DynamicAllan) -> Floats:
+    """Return the deviation divided by the median over time, shape [T, m, 6].
+
+    The ratio is NaN if the deviation is missing or the median is zero.
 
     >>> from monitor.estimation.allan.dynamic_allan import compute_dynamic_allan as of
     >>> steady = of(np.random.default_rng(1).standard_normal((3000, 6)), 10.0, 100.0)
-    >>> bool(np.allclose(np.median(divide_by_median(steady), axis=0), 1.0))
+    >>> bool(np.allclose(np.median(divide_by_time_median(steady), axis=0), 1.0))
     True
     """
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -86,7 +84,7 @@ def divide_by_median(dynamic: DynamicAllan) -> Floats:
 def draw_dynamic_panels(
     figure: "Figure | SubFigure", dynamic: DynamicAllan, kind: Kind, marks: Sequence[ChangeMark] = ()
 ) -> None:
-    """Draw the panels of one kind of sensor.
+    """Draw the heat maps and the coefficients of one kind of sensor over time.
 
     Parameters
     ----------
@@ -97,14 +95,14 @@ def draw_dynamic_panels(
     kind
         Kind of sensor.
     marks
-        Changes of all axes. Only changes of this kind of sensor are drawn.
+        Changes to draw. Changes of the other kind of sensor are ignored.
     """
     axes, letters = _shown_axes(dynamic, kind), _shown_coefficients(dynamic, kind)
     ratios = [HEAT_MAP_INCHES] * len(axes) + [COEFFICIENT_INCHES] * len(letters)
     panels = list(figure.subplots(len(ratios), 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0])
-    unit, unit_s = style.time_unit(float(dynamic.t_s[-1]))
+    unit, unit_s = style.select_time_unit(float(dynamic.t_s[-1]))
     edges = _time_edges(dynamic.t_s) / unit_s
-    ratio, mesh = _colour_scale_end(divide_by_median(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
+    ratio, mesh = _colour_scale_end(divide_by_time_median(dynamic)[..., [AXES.index(axis) for axis in axes]]), None
     for panel, axis in zip(panels, axes, strict=False):
         mesh = _draw_heat_map(panel, dynamic, axis, edges, ratio)
     for panel, letter in zip(panels[len(axes) :], letters, strict=True):
@@ -121,7 +119,6 @@ def draw_dynamic_panels(
 
 
 def _draw_changes(heat_map: "Axes", others: "Sequence[Axes]", axis: str, times: Sequence[float]) -> None:
-    """Draw the changes of one axis as vertical lines, with labels in its heat map."""
     left, right = heat_map.get_xlim()
     distance = MIN_LABEL_DISTANCE * (right - left)
     for t in times:
@@ -146,20 +143,19 @@ def _group_times(times: Sequence[float], distance: float) -> list[list[float]]:
     groups: list[list[float]] = []
     for time in sorted(times):
         groups.append([time])
-        # Joining two groups moves their mean, so that the previous group may be too close as well.
+        # The mean of a merged group may be too close to the previous group.
         while len(groups) > 1 and float(np.mean(groups[-1]) - np.mean(groups[-2])) < distance:
             groups[-2:] = [groups[-2] + groups[-1]]
     return groups
 
 
 def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Floats, ratio: float) -> "QuadMesh":
-    """Draw the heat map of one axis, time by τ."""
     i = AXES.index(axis)
     with np.errstate(invalid="ignore", divide="ignore"):
-        colour = np.log(divide_by_median(dynamic)[:, :, i].T)
+        colour = np.log(divide_by_time_median(dynamic)[:, :, i].T)
     median = _median(dynamic)[:, :, i]
     usual = (dynamic.lo[:, :, i] <= median) & (median <= dynamic.hi[:, :, i])
-    alpha: Any = np.where(usual.T, PALE_ALPHA, 1.0)  # matplotlib accepts an array, but its type hints do not
+    alpha: Any = np.where(usual.T, PALE_ALPHA, 1.0)  # matplotlib accepts an array, but the type hints do not
     mesh = panel.pcolormesh(
         edges, _tau_edges(dynamic.tau_s), colour,
         cmap="RdBu_r", vmin=-np.log(ratio), vmax=np.log(ratio), alpha=alpha, rasterized=True, linewidth=0,
@@ -173,10 +169,9 @@ def _draw_heat_map(panel: "Axes", dynamic: DynamicAllan, axis: str, edges: Float
 
 
 def _draw_colour_bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "list[Axes]", ratio: float) -> None:
-    """Draw the colour scale with factors as labels."""
     from matplotlib.cm import ScalarMappable
 
-    # A separate mappable is used, because the colour bar of the mesh would be as pale as its cells.
+    # The colour bar needs a separate mappable, because the cells of the mesh are translucent.
     bar = figure.colorbar(ScalarMappable(mesh.norm, mesh.cmap), ax=panels, aspect=30, pad=0.015, fraction=0.05)
     ticks = np.log(ratio) * np.linspace(-1.0, 1.0, 5)
     bar.set_ticks(ticks.tolist(), labels=[f"× {np.exp(tick):.2g}" for tick in ticks])
@@ -186,7 +181,6 @@ def _draw_colour_bar(figure: "Figure | SubFigure", mesh: "QuadMesh", panels: "li
 
 
 def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: str, t: Floats) -> None:
-    """Draw one coefficient of three axes over time."""
     row, unit = SYMBOLS.index(letter), COEFFICIENT_UNITS[kind][letter]
     values, ends = [], []
     for axis in axes_of(kind):
@@ -196,14 +190,14 @@ def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: 
             np.where(estimated, part[:, row, i] * unit.factor, np.nan)
             for part in (dynamic.value, dynamic.value_lo, dynamic.value_hi)
         )
-        style.draw_band(panel, t, lo, hi, colour, rasterized=True)  # hundreds of corners would make a report larger
+        style.draw_band(panel, t, lo, hi, colour, rasterized=True)  # a large vector image otherwise
         panel.plot(t, value, color=colour, label=axis)
         alone = _isolated(estimated)
         panel.plot(t[alone], value[alone], ".", color=colour, markersize=3.5)
         values.append(value)
         ends.append((lo, hi))
     low, high = float(np.nanmin(values)), float(np.nanmax(values))
-    style.set_value_scale(panel, low, high, 0.25)
+    style.set_y_scale(panel, low, high, 0.25)
     if not (low > 0 and high > style.LOG_SCALE_RATIO * low):
         lowest, highest = np.nanquantile(ends, [1.0 - BAND_ENDS_INSIDE, BAND_ENDS_INSIDE]).tolist()
         bottom, top = panel.get_ylim()
@@ -214,21 +208,20 @@ def _draw_coefficient(panel: "Axes", dynamic: DynamicAllan, kind: Kind, letter: 
 
 
 def _isolated(estimated: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return a mask of the points without a neighbour, which a line does not show."""
+    """Return a mask of points without neighbours, which a line plot does not show."""
     padded = np.concatenate([[False], estimated, [False]])
     return np.asarray(estimated & ~padded[:-2] & ~padded[2:])
 
 
 def _median(dynamic: DynamicAllan) -> Floats:
-    """Return the median of the deviation over time, shape [1, m, 6]. NaN if it is missing or 0."""
+    """Return the median deviation over time, shape [1, m, 6], with NaN for a missing or zero median."""
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # raised for an axis that is not measured
+        warnings.simplefilter("ignore", RuntimeWarning)  # an axis that is not measured raises this warning
         median = np.nanmedian(dynamic.deviation, axis=0, keepdims=True)
     return np.asarray(np.where(median > 0.0, median, np.nan))
 
 
 def _colour_scale_end(ratios: Floats) -> float:
-    """Return the smallest of the COLOUR_SCALE_RATIOS that contains MIN_CELLS_IN_SCALE of the cells."""
     with np.errstate(invalid="ignore", divide="ignore"):
         size = np.abs(np.log(ratios))
     size = size[np.isfinite(size)]
@@ -237,13 +230,12 @@ def _colour_scale_end(ratios: Floats) -> float:
 
 
 def _time_edges(t: Floats) -> Floats:
-    """Return the edges of the cells around equally spaced times."""
     half = (t[1] - t[0]) / 2.0 if t.size > 1 else t[0] / 40.0
     return np.append(t - half, t[-1] + half)
 
 
 def _tau_edges(tau_s: Floats) -> Floats:
-    """Return the edges of the cells: the geometric means of neighbouring τ."""
+    """Return the cell edges as geometric means of neighbouring averaging times."""
     if tau_s.size == 1:
         return np.array([0.7, 1.4]) * float(tau_s[0])
     middle = np.sqrt(tau_s[1:] * tau_s[:-1])

@@ -1,8 +1,7 @@
-"""Plot of the history of a device: coefficients with their extremes, temperature, lost samples and events.
+"""Plot of the history of a device, with coefficients, temperature, missing samples and events.
 
-Gyroscopes are on the left and accelerometers on the right, with one row for each coefficient that was ever estimated. A
-line shows the last value of each bucket, the dark band the extremes, and the pale band the 95 % interval. Lines have
-gaps where the device sent no data. A vertical line with a label marks an event.
+A line shows the last value of each bucket, a dark band the extremes, and a pale band the 95 % interval. Lines are
+interrupted where buckets are missing. Vertical lines mark events.
 """
 
 from collections.abc import Sequence
@@ -41,28 +40,28 @@ EVENT_LABELS: Final = {
     "temperature_unexplained": "temperature",
     "drift_unexplained": "drift",
 }
-"""Label of each kind of event that is drawn. Lost samples have a separate panel."""
-MAX_EVENTS: Final = 40  # largest number of events that are drawn; the most significant events are selected
+"""Label of each drawn kind of event."""
+MAX_EVENTS: Final = 40  # largest number of drawn events; the most significant events are selected
 MIN_LABEL_DISTANCE: Final = 0.055  # smallest distance between two labels, as a share of the width
 PRIORITY_KINDS: Final = ("noise_changed", "bias_stepped", "limit_crossed", "model_disagrees")
 
 
 def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES) -> None:
-    """Write the plot.
+    """Write the plot of a history to a file.
 
     Parameters
     ----------
     past
         The history.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
     axes
         Axes to draw.
 
     Raises
     ------
     ConfigError
-        If matplotlib is missing or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     NotReady
         If the history has no rows.
     """
@@ -95,12 +94,10 @@ def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES
 
 
 def _estimated_coefficients(past: HistoryTable, axis: str) -> list[str]:
-    """Return the coefficients of an axis that were estimated in at least one bucket."""
     return [letter for letter in SYMBOLS if np.isfinite(past.column(f"{axis}.{letter}").last).any()]
 
 
 def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str, axes: Sequence[str]) -> None:
-    """Draw one coefficient of up to three axes."""
     unit = COEFFICIENT_UNITS[kind][letter]
     lows, highs = [], []
     for axis in axes:
@@ -117,7 +114,7 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
         lows.append(np.nanmin(low))
         highs.append(np.nanmax(high))
     if lows:
-        style.set_value_scale(panel, float(min(lows)), float(max(highs)), 0.15)
+        style.set_y_scale(panel, float(min(lows)), float(max(highs)), 0.15)
         panel.legend(loc="upper left", ncols=3, fontsize=style.SMALL_TEXT, frameon=True, edgecolor="none")
     else:
         _draw_absence(panel, "never estimated")
@@ -126,7 +123,6 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
 
 
 def _draw_temperature(panel: "Axes", past: HistoryTable) -> None:
-    """Draw the temperature with its extremes."""
     column = past.column("temperature")
     t, low, high, last = _with_gaps(past, column.low, column.high, column.last)
     if np.isfinite(last).any():
@@ -139,7 +135,6 @@ def _draw_temperature(panel: "Axes", past: HistoryTable) -> None:
 
 
 def _draw_losses(panel: "Axes", past: HistoryTable) -> None:
-    """Draw the number of missing samples by bucket, and the time in which the device was not running."""
     t, width = _days(past.start_s), past.width_s / DAY_S
     missing = past.counts[:, [COUNTS.index(name) for name in ("lost", "bad", "overflowed")]].sum(axis=1)
     panel.bar(t, missing, width, align="edge", color=style.DARK)
@@ -151,25 +146,22 @@ def _draw_losses(panel: "Axes", past: HistoryTable) -> None:
 
 
 def _draw_absence(panel: "Axes", text: str) -> None:
-    """Write the reason for missing data into an empty panel."""
     panel.text(0.5, 0.5, text, transform=panel.transAxes, ha="center", color=style.GREY)
 
 
 def _draw_title(panel: "Axes", text: str) -> None:
-    """Write the title into the panel, because the labels of events are above the panel."""
+    """Draw the title inside the panel, because event labels occupy the space above."""
     position: dict[str, Any] = {"transform": panel.transAxes, "ha": "right", "va": "top", "bbox": style.LABEL_BOX}
     panel.text(0.995, 0.95, text, fontsize=9, color=style.GREY, **position)
 
 
 def _select_events(past: HistoryTable) -> list[StoredEvent]:
-    """Return the events to draw, in order of time."""
     known = [one for one in past.events if one.kind in EVENT_LABELS]
     known.sort(key=lambda one: (one.kind not in PRIORITY_KINDS, -(one.sigma or 0.0)))
     return sorted(known[:MAX_EVENTS], key=lambda one: one.t_s)
 
 
 def _draw_events(panels: "Sequence[Axes]", events: Sequence[StoredEvent]) -> None:
-    """Draw event lines through all panels, and labels above the first panel. Labels that would overlap are omitted."""
     left, right = panels[0].get_xlim()
     last_label = -np.inf
     for event in events:
@@ -189,7 +181,6 @@ def _draw_events(panels: "Sequence[Axes]", events: Sequence[StoredEvent]) -> Non
 
 
 def _set_dates(panels: Any, past: HistoryTable) -> None:
-    """Set the limits and labels of the time axes."""
     from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
     panels[0, 0].set_xlim(float(_days(past.start_s[:1])[0]), float(_days(past.end_s[-1:])[0]))
@@ -201,7 +192,7 @@ def _set_dates(panels: Any, past: HistoryTable) -> None:
 
 
 def _with_gaps(past: HistoryTable, *columns: Floats) -> tuple[Floats, ...]:
-    """Return the times in days and the given columns, with NaN inserted where buckets are missing."""
+    """Return times in days and columns, with NaN inserted where buckets are missing."""
     ends, starts = past.end_s[:-1], past.start_s[1:]
     gaps: NDArray[np.int64] = np.flatnonzero(starts > ends) + 1
     t = np.insert(_days(past.start_s + 0.5 * past.width_s), gaps, _days(ends[gaps - 1].astype(np.float64)))
@@ -209,5 +200,5 @@ def _with_gaps(past: HistoryTable, *columns: Floats) -> tuple[Floats, ...]:
 
 
 def _days(unix_s: "Floats | NDArray[np.int64]") -> Floats:
-    """Convert Unix times [s] to the dates of matplotlib, which are days since 1970."""
+    """Convert Unix times [s] to matplotlib dates, which are days since 1970."""
     return np.asarray(unix_s, np.float64) / DAY_S

@@ -1,9 +1,8 @@
-"""Figures of the reports of ``reconcile``, as SVG elements.
+"""Figures of the ``reconcile`` reports as SVG elements.
 
-A diagnostic figure shows the measurement, the expectation of the model, and the band that contains 95 of 100 recordings
-simulated from the model. Panels side by side have the same limits, so that the figures of two models can be compared.
-A gap is the difference between measurement and model. A gap chart shows the gap of each diagnostic divided by the
-threshold. An interval chart shows one parameter in several recordings.
+A diagnostic figure shows the measurement, the model expectation, and the band that contains 95 % of recordings
+simulated from the model. A gap chart shows the difference between measurement and model (gap), divided by the threshold
+of each diagnostic. An interval chart shows one parameter in several recordings.
 """
 
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from monitor.common.units import DEVIATION_UNITS, sensor_kind
 from monitor.publishing.plots import style
 from monitor.publishing.reports.reconcile_sentences import (
     diagnostic_name,
-    field_unit,
+    displayed_unit,
     format_range,
     gap_to_threshold_ratio,
     readable_name,
@@ -29,13 +28,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MARGINS_INCHES: Final = (0.58, 0.15, 0.30, 0.44)  # left, right, top and bottom of a panel, for its labels
+MARGINS_INCHES: Final = (0.58, 0.15, 0.30, 0.44)  # left, right, top and bottom margins for the labels of a panel
 BAND_COLOUR: Final = "#cfd5dd"
 RANGE_TEXT_COLOUR: Final = "#8a5a00"
 ABOVE_THRESHOLD_COLOUR: Final = "#b3261e"
 BELOW_THRESHOLD_COLOUR: Final = "#1b7f4d"
 MAX_MARKERS: Final = 60  # largest number of points that are drawn with markers
-MARGIN_SHARE: Final = 0.06  # margin above and below the curves, as a share of their height
+MARGIN_SHARE: Final = 0.06  # margin above and below the curves, as a share of the height of the curves
 MAX_BAND_SHARE: Final = 0.35  # a band extends a panel by at most this share of the height of the curves
 LOWEST_SHARE: Final = 0.02  # share of the points that may lie below a logarithmic panel
 MIN_RANGE_SHARE: Final = 0.08  # a range narrower than this share of the width has a detail plot
@@ -50,7 +49,7 @@ MIN_GAP_RATIO: Final = 0.05  # a smaller ratio of gap to threshold is drawn at t
 
 @dataclass(frozen=True, slots=True)
 class DiagnosticPlot:
-    """Data of one panel in the units of the plot."""
+    """Curves of one diagnostic panel in displayed units."""
 
     title: str
     x_label: str
@@ -65,10 +64,10 @@ class DiagnosticPlot:
     mark_label: str
 
 
-def compared_diagnostic_svg(
+def diagnostic_comparison_svg(
     model_panels: Sequence[tuple[str, PlotData]], axis: str, width: float, height: float, where: Location | None = None
 ) -> str:
-    """Draw one diagnostic, one panel for each model, and return it as an SVG element.
+    """Draw one diagnostic with a panel for each model, and return the figure as an SVG element.
 
     Parameters
     ----------
@@ -82,9 +81,9 @@ def compared_diagnostic_svg(
         Range to mark in the first panel.
     """
     plots = [
-        to_field_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(model_panels)
+        to_displayed_units(title, view, axis, where if i == 0 else None) for i, (title, view) in enumerate(model_panels)
     ]
-    limits = value_limits(plots)
+    limits = common_y_limits(plots)
     left, right, top, bottom = MARGINS_INCHES
     share = width / len(plots)
     with style.figure_style():
@@ -93,27 +92,27 @@ def compared_diagnostic_svg(
             size = ((share - left - right) / width, (height - top - bottom) / height)
             panel = figure.add_axes(((i * share + left) / width, bottom / height, *size))
             _draw_panel(panel, plot if i == 0 else replace(plot, y_label=""), style.axis_colour(axis), limits)
-        return style.svg_element(figure, f"{axis}: {plots[0].y_label} over {plots[0].x_label}")
+        return style.to_svg_element(figure, f"{axis}: {plots[0].y_label} over {plots[0].x_label}")
 
 
-def select_view(views: Sequence[PlotData], lens: str, where: Location) -> PlotData | None:
-    """Return the data of a diagnostic, or the data of the first diagnostic whose x axis contains the range.
+def select_diagnostic_view(views: Sequence[PlotData], diagnostic_id: str, where: Location) -> PlotData | None:
+    """Return the data of a diagnostic, or of the first diagnostic whose x axis shows the range.
 
     Parameters
     ----------
     views
         Data of all diagnostics.
-    lens
+    diagnostic_id
         Identifier of the diagnostic.
     where
         Range that the diagnostic found.
     """
-    own = [view for view in views if view.lens == lens]
+    own = [view for view in views if view.lens == diagnostic_id]
     return next(iter(own or [view for view in views if range_on_x_axis(view, where) is not None]), None)
 
 
 def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | None:
-    """Return the part of a range that lies along the x axis of a diagnostic, in the unit of the diagnostic.
+    """Return the range along the x axis of a diagnostic, or None if the x axis shows another quantity.
 
     Parameters
     ----------
@@ -136,8 +135,8 @@ def range_on_x_axis(view: PlotData, where: Location) -> tuple[float, float] | No
     return None
 
 
-def detail_view(view: PlotData, where: Location) -> PlotData | None:
-    """Return the data around a range that is too narrow to be visible. Return None if the range is wide enough.
+def zoomed_view(view: PlotData, where: Location) -> PlotData | None:
+    """Return the diagnostic data near a narrow range, or None if the range is wide enough to be visible.
 
     Parameters
     ----------
@@ -163,8 +162,8 @@ def detail_view(view: PlotData, where: Location) -> PlotData | None:
     return replace(view, y_name="detail", **lines)
 
 
-def to_field_units(title: str, view: PlotData, axis: str, where: Location | None) -> DiagnosticPlot:
-    """Convert the data of a diagnostic to the units of the plot.
+def to_displayed_units(title: str, view: PlotData, axis: str, where: Location | None) -> DiagnosticPlot:
+    """Convert the data of a diagnostic to displayed units.
 
     Parameters
     ----------
@@ -175,17 +174,17 @@ def to_field_units(title: str, view: PlotData, axis: str, where: Location | None
     axis
         Name of the axis.
     where
-        Range to mark. A range of another quantity than the x axis is omitted.
+        Range to mark. The range is ignored if the x axis shows another quantity.
     """
     x_unit, y_unit = (
-        field_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)))
+        displayed_unit(unit, float(np.abs(line[np.isfinite(line)]).max(initial=0.0)))
         for unit, line in ((view.x_unit, view.x), (view.y_unit, view.measured))
     )
     if view.x_name == "averaging time" and view.y_unit in ("rad/s", "m/s²"):
         y_unit = DEVIATION_UNITS[sensor_kind(axis)]  # as in all Allan plots
     x_name, factor = x_unit.name, x_unit.factor
     if view.x_name == "time" and not view.log:
-        x_name, seconds = style.time_unit(float(np.ptp(view.x)))
+        x_name, seconds = style.select_time_unit(float(np.ptp(view.x)))
         factor = 1.0 / seconds
     mark = None if where is None else range_on_x_axis(view, where)
     measured, expected, lo, hi = (line * y_unit.factor for line in (view.measured, view.expected, view.lo, view.hi))
@@ -204,14 +203,14 @@ def to_field_units(title: str, view: PlotData, axis: str, where: Location | None
     )
 
 
-def value_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
-    """Return the common limits of all panels, which contain all curves and the parts of the bands near the curves."""
+def common_y_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
+    """Return common limits of the y axis for all panels."""
     log = plots[0].log
     curves = _finite([line for plot in plots for line in (plot.measured, plot.expected)], log)
     if curves.size == 0:
         return (0.1, 10.0) if log else (-1.0, 1.0)
     low, high = float(curves.min()), float(curves.max())
-    if log:  # an almost empty bin of a spectrum lies decades below the other bins
+    if log:  # an almost empty bin of a spectrum is decades below the other bins
         low = float(min(np.quantile(curves, LOWEST_SHARE), *_finite([plot.expected for plot in plots], log), high))
     reach = MAX_BAND_SHARE * (high - low)
     bands = _finite([line for plot in plots for line in (plot.lo, plot.hi)], log).clip(low - reach, high + reach)
@@ -221,20 +220,19 @@ def value_limits(plots: Sequence[DiagnosticPlot]) -> tuple[float, float]:
 
 
 def _finite(lines: Sequence[Floats], log: bool) -> Floats:
-    """Return all values that a panel can show. The values of a logarithmic panel are returned as logarithms."""
+    """Return all finite values, as logarithms for a logarithmic panel."""
     values = np.concatenate(lines)
     values = values[np.isfinite(values) & ((values > 0) | (not log))]
     return np.log10(values) if log else values
 
 
 def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[float, float]) -> None:
-    """Draw the band, the measurement, the expectation and the marked range of one panel."""
     x = plot.x[np.isfinite(plot.x) & ((plot.x > 0) | (not plot.log))]
     left, right = (float(x.min()), float(x.max())) if np.ptp(x) > 0 else (0.5, 1.5)
     scale = "log" if plot.log else "linear"
     panel.set(xscale=scale, yscale=scale, xlim=(left, right), ylim=limits, xlabel=plot.x_label)
     panel.autoscale(False)
-    # A lower end of zero has no logarithm. It is drawn below the panel.
+    # A lower end of zero is drawn below the panel, because zero has no logarithm.
     lo, hi = (np.fmax(line, 0.1 * limits[0]) if plot.log else line for line in (plot.lo, plot.hi))
     panel.fill_between(plot.x, lo, hi, where=np.isfinite(plot.hi).tolist(), color=BAND_COLOUR, linewidth=0)
     few = plot.x.size <= MAX_MARKERS
@@ -242,7 +240,7 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[
     panel.plot(plot.x, plot.expected, "--", color=style.DARK, linewidth=1.0)
     if plot.mark is not None:
         ends = np.clip(plot.mark, left, right).tolist()
-        # The edge of the area keeps a very narrow range visible.
+        # The outline keeps a very narrow range visible.
         panel.axvspan(*ends, facecolor=style.ORANGE, edgecolor=style.ORANGE, alpha=0.35, linewidth=3)
         panel.set_title(plot.mark_label, loc="right", fontsize=9, color=RANGE_TEXT_COLOUR, fontweight="bold")
     else:
@@ -257,7 +255,7 @@ def _draw_panel(panel: "Axes", plot: DiagnosticPlot, colour: str, limits: tuple[
 
 
 def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap] = ()) -> str:
-    """Draw the gap of each diagnostic divided by its threshold, and return the chart as an SVG element.
+    """Draw the gap of each diagnostic divided by the threshold, and return the chart as an SVG element.
 
     Parameters
     ----------
@@ -285,13 +283,13 @@ def gap_chart_svg(before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap
         style.style_log_axis(panel, "x", minor_grid=False)
         if after:
             panel.set_title("○ before   ● after", loc="right", fontsize=9, color=style.GREY)
-        return style.svg_element(figure, "gap over threshold of each diagnostic")
+        return style.to_svg_element(figure, "gap over threshold of each diagnostic")
 
 
 def interval_chart_svg(
     intervals: Sequence[tuple[str, ParameterInterval]], x_label: str, factor: float, colour: str
 ) -> str:
-    """Draw values with 95 % intervals, one row for each recording, and return the chart as an SVG element.
+    """Draw parameter values with 95 % intervals, and return the chart as an SVG element.
 
     Parameters
     ----------
@@ -316,11 +314,10 @@ def interval_chart_svg(
                 fmt="D" if pooled else "o", color=style.DARK if pooled else colour, elinewidth=1.8, markersize=6,
             )  # fmt: skip
         panel.xaxis.set_major_formatter(lambda value, _: style.format_tick(value))
-        return style.svg_element(figure, f"{x_label}, of each recording")
+        return style.to_svg_element(figure, f"{x_label}, of each recording")
 
 
 def _create_row_panel(names: Sequence[str], x_label: str) -> "tuple[Figure, Axes]":
-    """Return a figure and a panel with one row for each name. The first name is on top."""
     figure = style.create_figure(ROWS_WIDTH_INCHES, 0.75 + ROW_INCHES * len(names))
     panel = figure.subplots()
     short = [name if len(name) <= MAX_NAME_LENGTH else f"{name[: MAX_NAME_LENGTH - 1]}…" for name in names]

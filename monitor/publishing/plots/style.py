@@ -1,8 +1,7 @@
-"""Style of all figures, and their output as image files and as SVG elements of a page.
+"""Style of all figures, and output of figures as image files and SVG elements.
 
-Figures are ``Figure`` objects of matplotlib without pyplot, so they need no display. ``figure_style`` applies the
-colours, line widths and text sizes. Two files of the same figure are identical: identifiers in an SVG depend only on
-its content, and no file contains a date. matplotlib is imported when a figure is drawn.
+Figures do not use pyplot and need no display. Equal figures give identical files, because files contain no date and no
+random identifiers. matplotlib is imported when a figure is drawn.
 """
 
 import hashlib
@@ -64,12 +63,12 @@ STYLE: Final[dict[Any, Any]] = {
     "svg.hashsalt": "imu-monitor",
 }
 UNDATED: Final[dict[str, dict[str, Any]]] = {".svg": {"Date": None}, ".pdf": {"CreationDate": None}}
-"""Metadata that keep the date out of a file, by suffix."""
+"""Metadata settings that omit the date from a file, by suffix."""
 RASTER_DPI: Final = 80  # resolution of heat maps and dense bands, which are images inside an SVG
-FEW_DECADES_RATIO: Final = 60.0  # an axis with a smaller ratio of its ends has labels between the powers of ten
+FEW_DECADES_RATIO: Final = 60.0  # below this ratio of the limits, an axis has labels between powers of ten
 MAX_LABELS: Final = 7  # largest number of powers of ten with a label
 LOG_SCALE_RATIO: Final = 3.0  # ratio of largest to smallest value above which a logarithmic scale is used
-MAX_INTERVAL_RATIO: Final = 1.5  # ratio between value and end of an interval above which the interval is not drawn
+MAX_INTERVAL_RATIO: Final = 1.5  # largest drawn ratio between the end of an interval and the value
 SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 LABEL_BOX: Final[dict[str, Any]] = {
     "boxstyle": "square,pad=0.15",
@@ -77,19 +76,19 @@ LABEL_BOX: Final[dict[str, Any]] = {
     "edgecolor": "none",
     "alpha": 0.8,
 }
-"""Box behind a label inside a panel, so that curves do not cross the text."""
+"""Box behind a label inside a panel, which keeps the text legible over curves."""
 TIME_UNITS: Final = (("s", 1.0, 600.0), ("min", 60.0, 10_800.0), ("h", 3600.0, 259_200.0), ("d", 86_400.0, np.inf))
-"""Name of each time unit, its length [s], and the duration [s] below which the unit is used."""
+"""Name and length [s] of each time unit, and the duration [s] below which the unit is used."""
 
 
 def axis_colour(axis: str) -> str:
-    """Return the colour of an axis, which is the same for both kinds of sensor."""
+    """Return the colour of an axis, which is the same for gyroscopes and accelerometers."""
     return COLOURS[AXES.index(axis) % 3]
 
 
 @contextmanager
 def figure_style() -> Iterator[None]:
-    """Apply the style to all figures that are drawn inside the ``with`` block.
+    """Apply the figure style inside the ``with`` block.
 
     Raises
     ------
@@ -113,7 +112,7 @@ def create_figure(width: float, height: float, layout: Literal["constrained"] | 
     width, height
         Size [inches].
     layout
-        By default, panels are arranged so that no labels overlap. None keeps the given positions.
+        By default, matplotlib arranges panels without overlapping labels. None keeps the given positions.
     """
     from matplotlib.figure import Figure
 
@@ -128,7 +127,7 @@ def save_figure(figure: "Figure", path: Path) -> None:
     figure
         Figure to write.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
 
     Raises
     ------
@@ -141,30 +140,29 @@ def save_figure(figure: "Figure", path: Path) -> None:
         raise ConfigError(f"cannot write the plot {path}: {error}") from error
 
 
-def svg_element(figure: "Figure", description: str) -> str:
-    """Return a figure as an SVG element without width and height, so that it fills its column in a page.
+def to_svg_element(figure: "Figure", description: str) -> str:
+    """Convert a figure to an SVG element without a fixed width and height.
 
     Parameters
     ----------
     figure
         Figure to convert.
     description
-        Short description for readers who cannot see the figure.
+        Text alternative for readers who cannot see the figure.
     """
     text = io.StringIO()
     figure.savefig(text, format="svg", dpi=RASTER_DPI, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     element = text.getvalue()[text.getvalue().index("<svg") :]
     element = re.sub(r' (?:width|height)="[\d.]+pt"', "", element, count=2)
     element = element.replace("<svg", f'<svg role="img" aria-label="{html.escape(description)}"', 1)
-    element = re.sub(r'<g id="[^"]*"', "<g", element)  # nothing refers to these identifiers
+    element = re.sub(r'<g id="[^"]*"', "<g", element)  # the identifiers are not used
     element = re.sub(r"<[^>]*>", lambda tag: re.sub(r"\d+\.\d{3,}", _shorten, tag[0]), element)
     element = re.sub(r"\n(?:L )?\s*", " ", element)  # without a letter, a path continues with lines
-    prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # figures on one page must have different identifiers
+    prefix = hashlib.sha256(element.encode()).hexdigest()[:8]  # figures on a page need different identifiers
     return re.sub(r'(\bid="|url\(#|href="#)', rf"\g<1>{prefix}", element)
 
 
 def _shorten(number: re.Match[str]) -> str:
-    """Return a coordinate of an SVG with one decimal."""
     return f"{float(number[0]):.1f}".removesuffix(".0")
 
 
@@ -183,9 +181,9 @@ def format_tick(value: float) -> str:
 
 
 def style_log_axis(panel: "Axes", which: str, minor_grid: bool = True) -> None:
-    """Label a logarithmic axis with plain numbers and draw its grid.
+    """Label a logarithmic axis with plain numbers and draw the grid.
 
-    Powers of ten have labels. If the axis spans only a few decades, 2 and 5 also have labels.
+    Powers of ten have labels. On an axis with few decades, the factors 2 and 5 also have labels.
 
     Parameters
     ----------
@@ -208,7 +206,7 @@ def style_log_axis(panel: "Axes", which: str, minor_grid: bool = True) -> None:
 
 
 def draw_band(panel: "Axes", x: Floats, lo: Floats, hi: Floats, colour: str, **options: Any) -> None:
-    """Draw the band of an interval.
+    """Draw a confidence interval as a translucent band.
 
     Parameters
     ----------
@@ -225,7 +223,7 @@ def draw_band(panel: "Axes", x: Floats, lo: Floats, hi: Floats, colour: str, **o
 
 
 def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
-    """Draw the legend above the panel, where it covers no curve.
+    """Draw the legend above the panel.
 
     Parameters
     ----------
@@ -239,43 +237,43 @@ def draw_legend_above(panel: "Axes", columns: int, **options: Any) -> None:
     panel.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.2, ncols=columns, **options)
 
 
-def set_value_scale(panel: "Axes", low: float, high: float, margin: float) -> None:
-    """Set scale and limits of the y axis of a positive quantity. The scale is logarithmic if the values differ much.
+def set_y_scale(panel: "Axes", smallest: float, largest: float, margin: float) -> None:
+    """Set the scale and the limits of the y axis, with a logarithmic scale for a wide range of values.
 
     Parameters
     ----------
     panel
         Axes of matplotlib.
-    low, high
+    smallest, largest
         Smallest and largest value that is drawn.
     margin
         Margin of a linear scale above and below, as a share of the range.
     """
-    if low > 0 and high > LOG_SCALE_RATIO * low:
+    if smallest > 0 and largest > LOG_SCALE_RATIO * smallest:
         panel.set_yscale("log")
-        panel.set_ylim(low / 1.3, high * 1.3)
+        panel.set_ylim(smallest / 1.3, largest * 1.3)
         style_log_axis(panel, "y")
     else:
-        space = margin * (high - low) + 0.02 * high
-        panel.set_ylim(max(low - space, 0.0), high + space)
+        space = margin * (largest - smallest) + 0.02 * largest
+        panel.set_ylim(max(smallest - space, 0.0), largest + space)
 
 
 def omit_wide_intervals(value: Floats, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
-    """Return the ends of intervals, with NaN for intervals that would determine the scale of a plot.
+    """Return interval ends, with NaN for wide intervals that would dominate the scale of a plot.
 
     Parameters
     ----------
     value, lo, hi
-        Values and ends of their intervals, of one shape.
+        Values and interval ends, of equal shape.
     """
     near = (lo * MAX_INTERVAL_RATIO > value) & (hi < value * MAX_INTERVAL_RATIO)
     return np.where(near, lo, np.nan), np.where(near, hi, np.nan)
 
 
-def time_unit(duration_s: float) -> tuple[str, float]:
-    """Return the name and the length [s] of the unit that suits a time axis of this duration [s].
+def select_time_unit(duration_s: float) -> tuple[str, float]:
+    """Return the name and the length [s] of a suitable time unit for a time axis.
 
-    >>> time_unit(7200.0), time_unit(5e5)
+    >>> select_time_unit(7200.0), select_time_unit(5e5)
     (('min', 60.0), ('d', 86400.0))
     """
     return next((name, seconds) for name, seconds, below in TIME_UNITS if duration_s < below)

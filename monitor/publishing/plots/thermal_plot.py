@@ -1,4 +1,4 @@
-"""Plots of bias and temperature, one row per axis: over time, and against each other."""
+"""Plots of bias and temperature over time, and of bias against temperature."""
 
 from pathlib import Path
 from typing import Final
@@ -15,19 +15,19 @@ ROW_INCHES: Final = (11.0, 2.6)
 
 
 def save_thermal_fit_plot(report: ThermalFitReport, path: Path) -> None:
-    """Write a plot of interval means and the fitted thermal models.
+    """Write a plot of interval means and fitted thermal models to a file.
 
     Parameters
     ----------
     report
         The fitted models.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
 
     Raises
     ------
     ConfigError
-        If matplotlib is missing or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     """
     rows = [
         (
@@ -42,19 +42,19 @@ def save_thermal_fit_plot(report: ThermalFitReport, path: Path) -> None:
 
 
 def save_thermal_prediction_plot(report: ThermalPredictionReport, path: Path) -> None:
-    """Write a plot of interval means and the predictions of another recording's models, with the offset removed.
+    """Write a plot of interval means and thermal predictions, with the offset removed, to a file.
 
     Parameters
     ----------
     report
         The predictions.
     path
-        File to write. Its suffix selects the format.
+        File to write. The suffix selects the format.
 
     Raises
     ------
     ConfigError
-        If matplotlib is missing or the file cannot be written.
+        If matplotlib is not installed or the file cannot be written.
     """
     rows = []
     for axis, one in report.judged.items():
@@ -65,7 +65,6 @@ def save_thermal_prediction_plot(report: ThermalPredictionReport, path: Path) ->
 
 
 def _save_plot(rows: list[tuple[str, IntervalMeans, Prediction, str]], title: str, path: Path) -> None:
-    """Draw one row for each axis, and write the plot."""
     with style.figure_style():
         figure = style.create_figure(ROW_INCHES[0], 0.6 + ROW_INCHES[1] * len(rows))
         panels = figure.subplots(len(rows), 2, squeeze=False, sharex="col", sharey="row", width_ratios=[2.4, 1.0])

@@ -1,8 +1,7 @@
-"""Comparison of several recordings of one sensor as a self-contained HTML page, ``report.html``.
+"""HTML report on the comparison of several recordings of one sensor, ``report.html``.
 
-The page needs no network. The page contains a summary, a table of axes and recordings with links to the report of each
-recording, and the effects. A common effect has a table and a chart of its parameters in all recordings. If an effect
-was found in some recordings only, the page states for each other recording why it may be absent there.
+The page is self-contained and contains a summary, the results of each recording, and the noise effects. For each
+recording without an effect, the page states why the effect may be absent.
 """
 
 from monitor.common.units import format_duration
@@ -11,18 +10,18 @@ from monitor.publishing.plots.reconcile_figures import interval_chart_svg
 from monitor.publishing.plots.style import axis_colour
 from monitor.publishing.reports import comparison_sentences, reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
-from monitor.publishing.reports.reconcile_sentences import Parameter, parameter_unit, readable_name
+from monitor.publishing.reports.reconcile_sentences import FormattedParameter, parameter_unit, readable_name
 from monitor.reconcile.result import AddedOrResizedEffect
 from monitor.reconcile.several_recordings.comparison import Comparison, MatchedEffect
 
 
 def render_page(c: Comparison) -> str:
-    """Return the page as text.
+    """Return the HTML report of a comparison as text.
 
     Raises
     ------
     ConfigError
-        If matplotlib or Jinja2 is missing.
+        If matplotlib or Jinja2 is not installed.
     """
     return render_template(
         "reconcile_runs.html.j2",
@@ -40,17 +39,15 @@ def render_page(c: Comparison) -> str:
 
 
 def _rows(seen: MatchedEffect) -> list[tuple[str, AddedOrResizedEffect]]:
-    """Return the name and the step of each recording and of the pooled recordings."""
     return [*seen.steps.items(), ("all together", seen.pooled_step())]
 
 
-def _parameters_by_name(c: Comparison, step: AddedOrResizedEffect, axis: str) -> dict[str, Parameter]:
-    """Return the text of each parameter of a step."""
+def _parameters_by_name(c: Comparison, step: AddedOrResizedEffect, axis: str) -> dict[str, FormattedParameter]:
     return {one.name: one for one in reconcile_sentences.format_parameters(step, axis, c.baseline)}
 
 
 def _draw_intervals(seen: MatchedEffect, axis: str) -> str:
-    """Draw the first parameter that has an interval, in all recordings. Return "" if no parameter has an interval."""
+    """Draw the first parameter with an interval, or return an empty string without intervals."""
     name = next((name for name, one in seen.parameters.items() if one.freedom), "")
     rows = [(run, step.parameters[name]) for run, step in _rows(seen) if name in step.parameters]
     if not any(one.lo is not None and one.hi is not None and one.hi > one.lo for _, one in rows):

@@ -1,4 +1,4 @@
-"""Sentences about a comparison of several recordings, used by the page and the terminal."""
+"""Sentences about a comparison of several recordings, for the HTML report and the terminal."""
 
 from typing import Final
 
@@ -14,11 +14,11 @@ ABSENCE_TEXTS: Final = {
     "unnamed": "unnamed there",
     "may_differ": "may differ",
 }
-"""Text for each reason why an effect is absent from a recording."""
+"""Text for each reason for the absence of an effect in a recording."""
 
 
 def summarize(c: Comparison) -> str:
-    """Return a summary of the effects in all recordings and of the effects in some recordings only."""
+    """Summarize which noise effects all recordings show, and which effects only some recordings show."""
     model = "the model" if c.fitted_to is None else f"the five classic terms, fitted to {c.fitted_to}"
     compared = f"{len(c.runs)} recordings were compared with {model}."
     if c.verdict == "agrees":
@@ -31,11 +31,11 @@ def summarize(c: Comparison) -> str:
     return " ".join([compared, *lists])
 
 
-def describe_agreement(seen: MatchedEffect) -> str:
-    """Return a text on whether the sizes of an effect agree between the recordings, with the p-value."""
-    if seen.p is None:
+def describe_size_agreement(effect: MatchedEffect) -> str:
+    """Describe whether the sizes of an effect agree between recordings, with the p-value."""
+    if effect.p is None:
         return "nothing to compare"
-    return f"sizes {'agree' if seen.consistent else 'differ'} ({_format_p_value(seen.p)})"
+    return f"sizes {'agree' if effect.consistent else 'differ'} ({_format_p_value(effect.p)})"
 
 
 def _format_p_value(p: float) -> str:
@@ -47,8 +47,8 @@ def _format_p_value(p: float) -> str:
     return "p < 0.001" if p < 0.001 else f"p = {format_number(p, 2)}"
 
 
-def count_findings(result: AxisResult | None) -> str:
-    """Return the numbers of effects and of unexplained differences of one axis in one recording."""
+def describe_finding_counts(result: AxisResult | None) -> str:
+    """Describe how many effects and unexplained differences were found on one axis."""
     if result is None:
         return "not recorded"
     effects = f"{len(result.steps)} effect{'' if len(result.steps) == 1 else 's'}" if result.steps else ""
@@ -57,5 +57,4 @@ def count_findings(result: AxisResult | None) -> str:
 
 
 def _name_effect(seen: MatchedEffect) -> str:
-    """Return the name of an effect, with a remark if the effect is a changed term of the model."""
     return readable_name(seen.effect) + (" of another size" if seen.kind == "retuned" else "")

@@ -1,8 +1,8 @@
-"""Export of a history as a table: CSV, Parquet, Arrow or .npz, one row per bucket and one column per number, in SI.
+"""Export of a history as a table in CSV, Parquet, Arrow or .npz format.
 
-Column names include the unit in ASCII, as in ``gz.N (rad/sqrt(s))``. The columns of the extremes are named
-``gz.N low (rad/sqrt(s))`` and ``gz.N high (rad/sqrt(s))``. Missing values are empty or NaN. If writing fails, no file
-remains.
+Each row is a time bucket, and each column is a quantity in SI units. Column names contain the unit in ASCII, as in
+``gz.N (rad/sqrt(s))``. The columns with the extremes of ``gz.N`` are named ``gz.N low`` and ``gz.N high``. If writing
+fails, no file remains.
 """
 
 from pathlib import Path
@@ -23,7 +23,7 @@ STATE_COLUMN_NAME: Final = "state (" + "; ".join(f"{i} {name}" for i, name in en
 
 
 def save_history(past: HistoryTable, path: Path) -> None:
-    """Write a history in the format of the path's suffix.
+    """Write a history to a file in the format that the suffix selects.
 
     Parameters
     ----------
@@ -44,7 +44,7 @@ def save_history(past: HistoryTable, path: Path) -> None:
 
 
 def history_columns(past: HistoryTable) -> dict[str, Floats]:
-    """Return all columns by name, each of shape [p]. Interval ends and bounds have no extremes."""
+    """Return all columns of the exported table by name, each of shape [p]."""
     columns: dict[str, Floats] = {
         "t (Unix s)": past.start_s.astype(np.float64),
         "width (s)": past.width_s.astype(np.float64),

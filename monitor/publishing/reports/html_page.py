@@ -1,4 +1,4 @@
-"""Self-contained HTML pages from the templates of this package. Equal values give identical pages."""
+"""Rendering of self-contained HTML pages from templates. Equal values give identical pages."""
 
 from typing import Any, Final
 
@@ -8,7 +8,7 @@ MISSING_MESSAGE: Final = 'matplotlib and Jinja2 are needed: pip install "imu-mon
 
 
 def render_template(name: str, **values: Any) -> str:
-    """Return a page as text.
+    """Render a template as an HTML page.
 
     Parameters
     ----------
@@ -20,7 +20,7 @@ def render_template(name: str, **values: Any) -> str:
     Raises
     ------
     ConfigError
-        If matplotlib or Jinja2 is missing.
+        If matplotlib or Jinja2 is not installed.
     """
     try:
         import matplotlib.figure as _  # noqa: F401

@@ -1,9 +1,7 @@
-"""Report of a reconciliation as a self-contained HTML page, ``report.html``.
+"""HTML report of a reconciliation, ``report.html``.
 
-The page needs no network. It contains a summary, a table of the axes, and a section for each step. A section shows
-where measurement and model differed, the added or changed effect with its parameters, and every diagnostic before and
-after the step. Axes that agree with the model share a table of their diagnostics. The template ``reconcile.html.j2``
-arranges the sentences of ``reconcile_sentences`` and the figures of ``diagnostic_figure``.
+The page is self-contained and contains a summary, a table of the axes, and a section for each step. A section shows the
+added or changed noise effect, and all diagnostics before and after the step.
 """
 
 from collections.abc import Sequence
@@ -15,20 +13,20 @@ from monitor.common.units import format_duration
 from monitor.noise.effects import EFFECTS
 from monitor.publishing.plots import reconcile_figures as diagnostic_figure
 from monitor.publishing.plots import style
-from monitor.publishing.plots.reconcile_figures import compared_diagnostic_svg, detail_view, select_view
+from monitor.publishing.plots.reconcile_figures import diagnostic_comparison_svg, select_diagnostic_view, zoomed_view
 from monitor.publishing.reports import reconcile_sentences
 from monitor.publishing.reports.html_page import render_template
 from monitor.reconcile.result import AxisResult, DiagnosticGap, DiagnosticSnapshot, PlotData, Reconciliation
 
-RANGE_INCHES: Final = (8.0, 3.3)  # plot of a range in its diagnostic, without a detail plot
-RANGE_WITH_DETAIL_INCHES: Final = (4.9, 3.3)  # the same plot next to a detail plot
+RANGE_INCHES: Final = (8.0, 3.3)  # size of a plot without a detail plot
+RANGE_WITH_DETAIL_INCHES: Final = (4.9, 3.3)  # size of a plot next to a detail plot
 DETAIL_INCHES: Final = (3.33, 3.3)
 PAIR_INCHES: Final = (6.8, 2.35)
 SINGLE_INCHES: Final = (3.4, 2.05)
 
 
 def render_page(r: Reconciliation, title: str = "") -> str:
-    """Return the page as text.
+    """Return the HTML report of a reconciliation as text.
 
     Parameters
     ----------
@@ -40,7 +38,7 @@ def render_page(r: Reconciliation, title: str = "") -> str:
     Raises
     ------
     ConfigError
-        If matplotlib or Jinja2 is missing.
+        If matplotlib or Jinja2 is not installed.
     """
     return render_template(
         "reconcile.html.j2",
@@ -70,41 +68,36 @@ def render_page(r: Reconciliation, title: str = "") -> str:
 def _pair_scores(
     before: Sequence[DiagnosticGap], after: Sequence[DiagnosticGap]
 ) -> list[tuple[DiagnosticGap, DiagnosticGap | None]]:
-    """Return each score with the score of the same diagnostic after a step, or None if that score is missing."""
     later = {score.lens: score for score in after}
     return [(score, later.get(score.lens)) for score in before]
 
 
 def _scores_by_diagnostic(results: Sequence[AxisResult]) -> list[tuple[str, list[DiagnosticGap | None]]]:
-    """Return each diagnostic with the scores of all axes for the first model. None if an axis has no score."""
     known = [{score.lens: score for score in result.start.gaps} for result in results]
     return [(lens, [scores.get(lens) for scores in known]) for lens in dict.fromkeys(one for k in known for one in k)]
 
 
 def _draw_single(view: PlotData, axis: str) -> str:
-    """Draw one diagnostic for one model."""
-    return compared_diagnostic_svg([("", view)], axis, *SINGLE_INCHES)
+    return diagnostic_comparison_svg([("", view)], axis, *SINGLE_INCHES)
 
 
 def _draw_pairs(before: DiagnosticSnapshot, after: DiagnosticSnapshot, axis: str) -> list[str]:
-    """Draw each diagnostic before and after a step."""
     later = {view.lens: view for view in after.plots}
     return [
-        compared_diagnostic_svg([("before", view), ("after", later[view.lens])], axis, *PAIR_INCHES)
+        diagnostic_comparison_svg([("before", view), ("after", later[view.lens])], axis, *PAIR_INCHES)
         for view in before.plots
         if view.lens in later
     ]
 
 
 def _draw_range(snapshot: DiagnosticSnapshot, found: DiagnosticGap, axis: str) -> list[str]:
-    """Draw the diagnostic that shows a range best, and a detail plot if the range is narrow."""
-    view = select_view(snapshot.plots, found.lens, found.where)
+    view = select_diagnostic_view(snapshot.plots, found.lens, found.where)
     if view is None:
         return []
-    detail = detail_view(view, found.where)
+    detail = zoomed_view(view, found.where)
     if detail is None:
-        return [compared_diagnostic_svg([("", view)], axis, *RANGE_INCHES, where=found.where)]
-    whole = compared_diagnostic_svg(
+        return [diagnostic_comparison_svg([("", view)], axis, *RANGE_INCHES, where=found.where)]
+    whole = diagnostic_comparison_svg(
         [("", view)], axis, *RANGE_WITH_DETAIL_INCHES, where=replace(found.where, source=None)
     )
-    return [whole, compared_diagnostic_svg([("", detail)], axis, *DETAIL_INCHES, where=found.where)]
+    return [whole, diagnostic_comparison_svg([("", detail)], axis, *DETAIL_INCHES, where=found.where)]

@@ -1,10 +1,8 @@
-"""Result of a reconciliation as a Rerun recording, ``reconcile.rrd``, with a separate layout.
+"""Result of a reconciliation as a Rerun recording, ``reconcile.rrd``.
 
-Each axis has a tab. On the left are the steps as text and the gap of each diagnostic relative to its threshold. On the
-right, each diagnostic with logarithmic axes is drawn twice: for the first model and for the model after the steps. The
-timeline ``step`` is the index of the model. Index 0 is the model that was given or fitted first, and each step adds an
-index. The right plot of a pair follows this timeline. Rerun has no logarithmic axes, so ``allan_chart`` converts plots
-to lines. The stream is separate from the stream of the live view. Importing this module imports Rerun.
+Each axis has a tab with the steps as text, the gap of each diagnostic divided by the threshold, and plots of the
+diagnostics. A diagnostic with logarithmic axes is drawn for the first model and for the model after the steps. The
+timeline ``step`` selects the model, and index 0 is the first model. Importing this module imports Rerun.
 
 Entities: ``/<axis>/steps``, ``/<axis>/gap/<lens>``, ``/<axis>/<lens>/before``, ``/<axis>/<lens>/after``, ``/overview``.
 """
@@ -22,17 +20,17 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from monitor.common.units import format_duration
 from monitor.publishing.plots import axis_colours as colours
-from monitor.publishing.plots.reconcile_figures import MAX_MARKERS, DiagnosticPlot, to_field_units, value_limits
+from monitor.publishing.plots.reconcile_figures import MAX_MARKERS, DiagnosticPlot, common_y_limits, to_displayed_units
 from monitor.publishing.reports import reconcile_sentences as words
-from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH, Scale, clip_to_box, decade_range, finite_sections
+from monitor.publishing.rerun.allan_chart import HEIGHT, WIDTH, ChartScale, clip_to_box, decade_range, finite_sections
 from monitor.publishing.rerun.allan_drawing import fill_band, log_grid, log_lines
-from monitor.publishing.rerun.shared_views import collapsed_blueprint, drawing_view, markdown
+from monitor.publishing.rerun.shared_views import collapsed_blueprint, drawing_view, markdown_document
 from monitor.reconcile.result import AxisResult, DiagnosticSnapshot, Reconciliation
 
 APPLICATION: Final = "imu-monitor"
 TIMELINE: Final = "step"
-MAX_PLOTTED_DIAGNOSTICS: Final = 2  # number of diagnostics drawn per axis; the first ones are used
-BAND_COLOUR: Final = colours.blend(colours.FRAME, 0.55)
+MAX_PLOTTED_DIAGNOSTICS: Final = 2  # largest number of drawn diagnostics per axis
+BAND_COLOUR: Final = colours.blend_colours(colours.FRAME, 0.55)
 LEGEND_X: Final = (8.6, 12.2, 15.4)  # positions of the names of the curves, above the box
 RANGE_COLOUR: Final = colours.TEMPERATURE  # orange, as on the HTML page
 GAP_LINE_COLOURS: Final = (  # more lines would not fit into the legend
@@ -41,7 +39,7 @@ GAP_LINE_COLOURS: Final = (  # more lines would not fit into the legend
 
 
 def write_rrd(r: Reconciliation, path: Path) -> None:
-    """Write the recording.
+    """Write the result of a reconciliation as a Rerun recording.
 
     Parameters
     ----------
@@ -63,7 +61,7 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.save(path, default_blueprint=blueprint(r))
-    stream.log("overview", markdown(_overview(r)), static=True)
+    stream.log("overview", markdown_document(_overview(r)), static=True)
     for axis in _axes(r):
         _log_axis(stream, r, r.axes[axis])
     stream.flush()
@@ -71,7 +69,7 @@ def write_rrd(r: Reconciliation, path: Path) -> None:
 
 
 def blueprint(r: Reconciliation) -> rrb.Blueprint:
-    """Return the layout with one tab for each axis and one for all axes. Axes that differ from the model come first."""
+    """Return the Rerun layout with a tab for each axis and an overview. Axes that differ from the model come first."""
     axes = sorted(_axes(r), key=lambda axis: r.axes[axis].verdict == "agrees")
     tabs: list[rrb.View | rrb.Container] = [_tab(r.axes[axis]) for axis in axes]
     tabs.append(rrb.TextDocumentView(origin="/overview", contents="$origin", name="All axes"))
@@ -79,7 +77,6 @@ def blueprint(r: Reconciliation) -> rrb.Blueprint:
 
 
 def _overview(r: Reconciliation) -> str:
-    """Return the overview of all axes as Markdown."""
     rows = []
     for axis in _axes(r):
         result = r.axes[axis]
@@ -95,7 +92,6 @@ def _overview(r: Reconciliation) -> str:
 
 
 def _steps_text(r: Reconciliation, result: AxisResult) -> str:
-    """Return the steps and the unexplained differences of one axis as Markdown."""
     parts = [f"## {result.axis}: {words.RESULT_TEXTS[result.verdict]}", words.describe_result(result)]
     for count, step in enumerate(result.steps, start=1):
         known = words.format_parameters(step, result.axis, r.baseline)
@@ -116,22 +112,18 @@ def _steps_text(r: Reconciliation, result: AxisResult) -> str:
 
 
 def _axes(r: Reconciliation) -> list[str]:
-    """Return the axes of the result in the usual order."""
     return [axis for axis in AXES if axis in r.axes]
 
 
 def _snapshots_by_step(result: AxisResult) -> list[DiagnosticSnapshot]:
-    """Return the diagnostics for the first model and after each step. Withdrawn effects are not in the last model."""
     return [result.start, *(step.snapshot_after for step in result.steps[:-1]), *([result.end] if result.steps else [])]
 
 
 def _drawn_diagnostics(result: AxisResult) -> list[str]:
-    """Return the first diagnostics with logarithmic axes, which are drawn."""
     return [view.lens for view in result.start.plots if view.log][:MAX_PLOTTED_DIAGNOSTICS]
 
 
 def _tab(result: AxisResult) -> rrb.Container:
-    """Return the tab of one axis."""
     axis, steps = result.axis, len(result.steps)
     text = rrb.TextDocumentView(origin=f"/{axis}/steps", contents="$origin", name="What was found")
     gaps = rrb.TimeSeriesView(
@@ -152,7 +144,6 @@ def _tab(result: AxisResult) -> rrb.Container:
 
 
 def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
-    """Return the view of one diagnostic, before or after the steps."""
     what = words.diagnostic_name(lens)
     what = what[0].upper() + what[1:]
     names = {"before": f"{what}: first model", "after": f"{what}: after the steps"}
@@ -161,15 +152,13 @@ def _diagnostic_view(result: AxisResult, lens: str, when: str) -> rrb.View:
 
 
 def _log_axis(stream: rr.RecordingStream, r: Reconciliation, result: AxisResult) -> None:
-    """Log all entities of one axis."""
-    stream.log(f"{result.axis}/steps", markdown(_steps_text(r, result)), static=True)
+    stream.log(f"{result.axis}/steps", markdown_document(_steps_text(r, result)), static=True)
     for lens in _drawn_diagnostics(result):
         _log_diagnostic(stream, result, lens)
     _log_gaps(stream, result)
 
 
 def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
-    """Log the largest gaps divided by their thresholds, and a line at 1 for the threshold."""
     snapshots = [
         {score.lens: words.gap_to_threshold_ratio(score) for score in snapshot.gaps}
         for snapshot in _snapshots_by_step(result)
@@ -186,20 +175,18 @@ def _log_gaps(stream: rr.RecordingStream, result: AxisResult) -> None:
 
 
 def _log_by_step(stream: rr.RecordingStream, path: str, values: Sequence[float]) -> None:
-    """Log one value for each step."""
     steps = rr.TimeColumn(TIMELINE, sequence=range(len(values)))
     stream.send_columns(path, [steps], rr.Scalars.columns(scalars=np.array(values)))
 
 
 def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -> None:
-    """Draw both plots of one diagnostic with the same scale."""
     axis = result.axis
     views = [
         next((view for view in snapshot.plots if view.lens == lens), None) for snapshot in _snapshots_by_step(result)
     ]
-    plots = {step: to_field_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
+    plots = {step: to_displayed_units("", view, axis, None) for step, view in enumerate(views) if view is not None}
     every = list(plots.values())
-    scale = Scale(decade_range(plot.x for plot in every), decade_range([np.array(value_limits(every))]))
+    scale = ChartScale(decade_range(plot.x for plot in every), decade_range([np.array(common_y_limits(every))]))
     for when in ("before", "after") if result.steps else ("before",):
         _log_grid(stream, f"{axis}/{lens}/{when}", scale, plots[0], axis)
     stream.reset_time()
@@ -211,37 +198,34 @@ def _log_diagnostic(stream: rr.RecordingStream, result: AxisResult, lens: str) -
 
 
 def _log_curves(
-    stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str, static: bool
+    stream: rr.RecordingStream, path: str, scale: ChartScale, plot: DiagnosticPlot, axis: str, static: bool
 ) -> None:
-    """Draw the band, the measured curve and the expected curve."""
-    # A lower end of zero has no logarithm. It is drawn below the box.
-    low, high = (scale.to_chart(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
+    # A lower end of zero is drawn below the box, because zero has no logarithm.
+    low, high = (scale.to_chart_positions(plot.x, np.maximum(edge, 10.0 ** scale.y[0])) for edge in (plot.lo, plot.hi))
     log = partial(stream.log, static=static)
     log(f"{path}/band", fill_band(low, high, BAND_COLOUR))
-    colour, at = colours.AXIS_COLOURS[axis], _inside(scale.to_chart(plot.x, plot.measured))
+    colour, at = colours.AXIS_COLOURS[axis], _inside(scale.to_chart_positions(plot.x, plot.measured))
     log_lines(log, f"{path}/measured", finite_sections(at), [colour], 0.8, 5.0)
     if len(at) <= MAX_MARKERS:
         log(f"{path}/points", rr.Points2D(at, colors=[colour], radii=rr.Radius.ui_points(3.0), draw_order=20.0))
-    expected = finite_sections(_inside(scale.to_chart(plot.x, plot.expected)))
+    expected = finite_sections(_inside(scale.to_chart_positions(plot.x, plot.expected)))
     log_lines(log, f"{path}/expected", expected, [colours.TEXT], 1.0, 10.0)
 
 
-def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: Scale, result: AxisResult, lens: str) -> None:
-    """Draw a frame around each range in which a diagnostic found a gap."""
+def _log_found_ranges(stream: rr.RecordingStream, path: str, scale: ChartScale, result: AxisResult, lens: str) -> None:
     view = next(view for view in result.start.plots if view.lens == lens)
     founds = [step.before for step in result.steps] + list(result.left_over)
-    marks = [to_field_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
+    marks = [to_displayed_units("", view, result.axis, found.where) for found in founds if found.lens == lens]
     bounds = [mark.mark for mark in marks if mark.mark is not None]
     if not bounds:
         return
     one = 10.0 ** np.array([scale.y[0], scale.y[0]], float)
-    ends = [np.clip(scale.to_chart(np.array(bound), one)[:, 0], 0.0, WIDTH) for bound in bounds]
+    ends = [np.clip(scale.to_chart_positions(np.array(bound), one)[:, 0], 0.0, WIDTH) for bound in bounds]
     frames = [np.array([[a, 0], [b, 0], [b, HEIGHT], [a, HEIGHT], [a, 0]]) for a, b in ends]
     log_lines(partial(stream.log, static=True), f"{path}/place", frames, [RANGE_COLOUR], 0.75, -5.0)
 
 
-def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: DiagnosticPlot, axis: str) -> None:
-    """Draw the frame, the decade lines, the labels and the legend."""
+def _log_grid(stream: rr.RecordingStream, path: str, scale: ChartScale, plot: DiagnosticPlot, axis: str) -> None:
     log = partial(stream.log, static=True)
     key = [("measured", colours.AXIS_COLOURS[axis]), ("model", colours.TEXT), ("95 %", BAND_COLOUR)]
     names = [(x, -0.85, name) for x, (name, _) in zip(LEGEND_X, key, strict=True)]
@@ -252,5 +236,5 @@ def _log_grid(stream: rr.RecordingStream, path: str, scale: Scale, plot: Diagnos
 
 
 def _inside(at: Floats) -> Floats:
-    """Limit a curve to the box. Values outside are drawn on the edge of the box."""
+    """Clip a curve to the edges of the chart."""
     return np.column_stack([at[:, 0], clip_to_box(at[:, 1])])

@@ -1,9 +1,8 @@
-"""Sentences and formatted values for the results of ``reconcile``, used by the page, the viewer and the terminal.
+"""Sentences and formatted values for the results of ``reconcile``.
 
-The functions of this module convert the types of ``monitor.reconcile.result``, which are in SI units, into short text.
-The SI unit of a quantity selects the displayed unit. A small rate is displayed in °/h and a large rate in °/s, although
-both have the SI unit rad/s. A value has as many digits as its 95 % interval allows. This module does not depend on
-HTML, Rerun or a terminal.
+The HTML report, the viewer and the terminal share the texts. Values in SI units are converted to displayed units. For
+example, a small angular rate is displayed in °/h and a large rate in °/s. The 95 % interval of a value determines the
+number of digits.
 """
 
 from collections.abc import Sequence
@@ -43,12 +42,12 @@ RESULT_TEXTS: Final = {
     "partly_explained": "partly explained",
     "unexplained": "unexplained",
 }
-"""Text for each result of an axis or a recording."""
+"""Text for each possible result of an axis or a recording."""
 DIAGNOSTIC_NAMES: Final = {"psd": "spectrum", "allan": "Allan deviation"}
-"""Displayed names of the diagnostics whose identifier is no plain word."""
+"""Displayed names of diagnostics with an abbreviated identifier."""
 SAMPLE_SI_UNITS: Final[dict[Kind, str]] = {"gyro": "rad/s", "accel": "m/s²"}
 GRAVITY: Final = 9.80665  # m/s², standard (CGPM 1901)
-SMALL_UNIT_BELOW: Final = 0.1  # °/s or m/s²; below it, a rate or an acceleration is shown in °/h or µg
+SMALL_UNIT_BELOW: Final = 0.1  # in °/s or m/s²; smaller values are displayed in °/h or µg
 _DEGREES_PER_HOUR: Final = DEVIATION_UNITS["gyro"].factor  # °/h per rad/s
 _SI_OF_COEFFICIENTS: Final = {
     si: COEFFICIENT_UNITS[kind][letter]
@@ -70,7 +69,7 @@ FIELD_UNITS: Final = {
     "m/s²/√Hz": Unit(MICRO_G, "µg/√Hz"),
     **dict.fromkeys(("(m/s²)²", "m²/s⁴"), Unit(MICRO_G**2, "µg²")),
 }
-"""Displayed unit for each SI unit. Units that are absent, such as Hz, s and °C, are displayed unchanged."""
+"""Displayed unit for each SI unit. Other units, such as Hz, s and °C, are displayed unchanged."""
 UNITS_BY_NAME: Final = {"phase": Unit(DEGREE, "°"), "fraction": Unit(100.0, "%")}
 """Displayed units of the parameters whose SI unit does not determine the displayed unit."""
 RANGE_FORMATS: Final = {
@@ -80,40 +79,40 @@ RANGE_FORMATS: Final = {
     "temperature": ("", Unit(1.0, "°C")),
 }
 """Prefix and unit for each kind of range."""
-MIN_RANGE_SHARE: Final = 1e-3  # a range narrower than this share of its position is written as one number
-SYMMETRY_TOLERANCE: Final = 0.1  # sides of an interval that differ by less than this share are written as ±
+MIN_RANGE_SHARE: Final = 1e-3  # a relatively narrower range is written as one number
+SYMMETRY_TOLERANCE: Final = 0.1  # largest relative difference of the interval sides that are written as ±
 
 
 @dataclass(frozen=True, slots=True)
-class Parameter:
-    """Texts for one parameter. Unknown parts are empty."""
+class FormattedParameter:
+    """Texts for one parameter of a noise effect. Unknown texts are empty."""
 
     name: str
     value: str  # "30.94", "ax"
     interval: str  # "30.4 … 31.5", the 95 % interval
-    short: str  # "30.94 ± 0.55 °/h", with its unit
+    short: str  # "30.94 ± 0.55 °/h", with the unit
     unit: str  # "°/h"
     given: str  # value in the model under test, if the model has the effect exactly once
 
 
-def field_unit(si: str, size: float) -> Unit:
+def displayed_unit(si_unit: str, value_si: float) -> Unit:
     """Return the displayed unit of a quantity.
 
-    >>> field_unit("rad/s", 1e-4).name, field_unit("rad/s", 5.0).name, field_unit("Hz", 17.0).name
+    >>> displayed_unit("rad/s", 1e-4).name, displayed_unit("rad/s", 5.0).name, displayed_unit("Hz", 17.0).name
     ('°/h', '°/s', 'Hz')
 
     Parameters
     ----------
-    si
+    si_unit
         SI unit.
-    size
+    value_si
         Value of the quantity in the SI unit.
     """
     for kind in KINDS:
-        if si == SAMPLE_SI_UNITS[kind]:
+        if si_unit == SAMPLE_SI_UNITS[kind]:
             large = SAMPLE_UNITS[kind]
-            return DEVIATION_UNITS[kind] if abs(size) * large.factor < SMALL_UNIT_BELOW else large
-    return FIELD_UNITS.get(si, Unit(1.0, si))
+            return DEVIATION_UNITS[kind] if abs(value_si) * large.factor < SMALL_UNIT_BELOW else large
+    return FIELD_UNITS.get(si_unit, Unit(1.0, si_unit))
 
 
 def readable_name(name: str) -> str:
@@ -121,26 +120,26 @@ def readable_name(name: str) -> str:
     return name.replace("_", " ")
 
 
-def diagnostic_name(lens: str) -> str:
-    """Return the name of a diagnostic for the user."""
-    return DIAGNOSTIC_NAMES.get(lens, readable_name(lens))
+def diagnostic_name(diagnostic_id: str) -> str:
+    """Return the displayed name of a diagnostic."""
+    return DIAGNOSTIC_NAMES.get(diagnostic_id, readable_name(diagnostic_id))
 
 
-def format_probability(share: float) -> str:
-    """Format a probability. Values near 0 and 1 are written as inequalities.
+def format_probability(probability: float) -> str:
+    """Format a probability. Probabilities near 0 and 1 are written as inequalities.
 
     >>> format_probability(0.998), format_probability(0.99999), format_probability(0.0002)
     ('99.8 %', '> 99.9 %', '< 0.1 %')
     """
-    if not isfinite(share):
+    if not isfinite(probability):
         return "—"
-    if share > 0.999:
+    if probability > 0.999:
         return "> 99.9 %"
-    return "< 0.1 %" if share < 0.001 else f"{100.0 * share:.1f} %"
+    return "< 0.1 %" if probability < 0.001 else f"{100.0 * probability:.1f} %"
 
 
 def format_range(where: Location, axis: str) -> str:
-    """Format the range in which a diagnostic found a gap. Return "everywhere" if no range is given.
+    """Format the range in which a diagnostic found a difference. Without a range, return "everywhere".
 
     >>> format_range(Location(tau=(1.0, 4.0), source="ax"), "gz"), format_range(Location(time=(1800.0, 1800.5)), "gz")
     ('τ = 1 … 4 s, from ax', 't = 1800 s')
@@ -150,7 +149,7 @@ def format_range(where: Location, axis: str) -> str:
     where
         The range.
     axis
-        Name of the axis, which selects the units.
+        Name of the axis, which determines the units.
     """
     texts = []
     for name, ends in where.resolved_dimensions().items():
@@ -159,7 +158,7 @@ def format_range(where: Location, axis: str) -> str:
             continue
         prefix, unit = RANGE_FORMATS.get(name, ("", Unit(1.0, "")))
         if name == "value":
-            unit = field_unit(SAMPLE_SI_UNITS[sensor_kind(axis)], max(map(abs, ends)))
+            unit = displayed_unit(SAMPLE_SI_UNITS[sensor_kind(axis)], max(map(abs, ends)))
         low, high = (end * unit.factor for end in ends)
         narrow = not abs(high - low) > MIN_RANGE_SHARE * max(abs(low), abs(high))
         text = _short(0.5 * (low + high)) if narrow else f"{_short(low)} … {_short(high)}"
@@ -167,39 +166,39 @@ def format_range(where: Location, axis: str) -> str:
     return ", ".join(texts) or "everywhere"
 
 
-def describe_gap(one: DiagnosticGap, axis: str) -> str:
-    """Return one line with the diagnostic, its range, its gap and its threshold.
+def describe_gap(gap: DiagnosticGap, axis: str) -> str:
+    """Describe a difference between model and recording (gap) with the diagnostic, range and threshold.
 
     Parameters
     ----------
-    one
+    gap
         Gap of a diagnostic.
     axis
-        Name of the axis, which selects the units.
+        Name of the axis, which determines the units.
     """
-    gap = f"gap {format_gap(one.gap)}, threshold {format_gap(one.threshold)}"
-    return f"{diagnostic_name(one.lens)}, {format_range(one.where, axis)}: {gap}"
+    sizes = f"gap {format_gap(gap.gap)}, threshold {format_gap(gap.threshold)}"
+    return f"{diagnostic_name(gap.lens)}, {format_range(gap.where, axis)}: {sizes}"
 
 
-def format_gap(size: float) -> str:
-    """Format the size of a gap.
+def format_gap(gap: float) -> str:
+    """Format the size of a difference between model and recording (gap).
 
     >>> format_gap(0.6), format_gap(41.23), format_gap(12345.0)
     ('0.60', '41.2', '12300')
     """
-    if not isfinite(size) or size >= 1000.0:
-        return format_number(size)
-    return f"{size:.2f}" if size < 10.0 else f"{size:.1f}"
+    if not isfinite(gap) or gap >= 1000.0:
+        return format_number(gap)
+    return f"{gap:.2f}" if gap < 10.0 else f"{gap:.1f}"
 
 
-def gap_to_threshold_ratio(one: DiagnosticGap) -> float:
-    """Return the gap divided by the threshold, or 0 if this ratio is not finite."""
-    share = one.gap / one.threshold if one.threshold > 0.0 else 0.0
+def gap_to_threshold_ratio(gap: DiagnosticGap) -> float:
+    """Return the gap of a diagnostic divided by the threshold, or 0 if the ratio is not finite."""
+    share = gap.gap / gap.threshold if gap.threshold > 0.0 else 0.0
     return share if isfinite(share) else 0.0
 
 
-def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> tuple[Parameter, ...]:
-    """Return the texts of all parameters of a step.
+def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> tuple[FormattedParameter, ...]:
+    """Format all parameters of the noise effect that a step adds or changes.
 
     Parameters
     ----------
@@ -219,9 +218,9 @@ def format_parameters(step: AddedOrResizedEffect, axis: str, baseline: NoiseMode
 
 
 def describe_step(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -> str:
-    """Return one line with an effect and its parameters.
+    """Describe the noise effect and the parameters of a step in one line.
 
-    Example: "sinusoidal: amplitude 30.94 ± 0.55 °/h, frequency 17.30000 ± 0.00010 Hz".
+    An example is "sinusoidal: amplitude 30.94 ± 0.55 °/h, frequency 17.30000 ± 0.00010 Hz".
 
     Parameters
     ----------
@@ -237,7 +236,7 @@ def describe_step(step: AddedOrResizedEffect, axis: str, baseline: NoiseModel) -
 
 
 def summarize(r: Reconciliation) -> str:
-    """Return the result of the whole recording in a few sentences."""
+    """Summarize the result of a reconciliation in a few sentences."""
     differ = [axis for axis in AXES if axis in r.axes and r.axes[axis].verdict != "agrees"]
     unexplained = [axis for axis in differ if r.axes[axis].left_over]
     model = "The model of five classic terms, fitted first," if r.fitted_first else "The model"
@@ -255,7 +254,7 @@ def summarize(r: Reconciliation) -> str:
 
 
 def describe_result(result: AxisResult) -> str:
-    """Return the result of one axis in a sentence."""
+    """Describe the result of one axis in one sentence."""
     match result.verdict:
         case "agrees":
             return "In every diagnostic, model and measurement differ by no more than chance."
@@ -268,7 +267,7 @@ def describe_result(result: AxisResult) -> str:
 
 
 def describe_alternatives(step: AddedOrResizedEffect) -> str:
-    """Return a sentence on the effects that were also tried, with their probabilities."""
+    """Describe the alternative effects of a step and their probabilities."""
     if not step.runners_up:
         return "No other effect explains the gap nearly as well."
     tried = [f"{readable_name(one.effect)} ({format_probability(one.confidence)})" for one in step.runners_up]
@@ -276,15 +275,15 @@ def describe_alternatives(step: AddedOrResizedEffect) -> str:
 
 
 def describe_held_out_gap(step: AddedOrResizedEffect) -> str:
-    """Return the gap before and after a step on held-out data, which were not used to choose the effect."""
+    """Describe the gap before and after a step on data that were not used to choose the effect."""
     before, after = step.held_out_before, step.held_out_after
     if before is None or after is None:
         return f"None: {step.held_out_reason}."
     return f"{format_gap(before.gap)} → {format_gap(after.gap)}, threshold {format_gap(after.threshold)}"
 
 
-def parameter_unit(effect: str, name: str, axis: str, size: float) -> Unit:
-    """Return the displayed unit of a parameter of an effect.
+def parameter_unit(effect: str, name: str, axis: str, value_si: float) -> Unit:
+    """Return the displayed unit of a parameter of a noise effect.
 
     Parameters
     ----------
@@ -294,17 +293,16 @@ def parameter_unit(effect: str, name: str, axis: str, size: float) -> Unit:
         Name of the parameter.
     axis
         Name of the axis.
-    size
+    value_si
         Value of the parameter in the SI unit.
     """
     si = gyro_and_accel_units(EFFECTS[effect])[name][KINDS.index(sensor_kind(axis))]
-    return UNITS_BY_NAME.get(name) or field_unit(si, size)
+    return UNITS_BY_NAME.get(name) or displayed_unit(si, value_si)
 
 
-def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: str, given: Any) -> Parameter:
-    """Return the text of one parameter."""
+def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: str, given: Any) -> FormattedParameter:
     if isinstance(bounds.value, str):
-        return Parameter(name, bounds.value, "", bounds.value, "", "" if given is None else str(given))
+        return FormattedParameter(name, bounds.value, "", bounds.value, "", "" if given is None else str(given))
     unit = parameter_unit(effect, name, axis, bounds.value)
 
     def with_unit(text: str) -> str:
@@ -315,14 +313,14 @@ def _format_parameter(effect: str, name: str, bounds: ParameterInterval, axis: s
     whole = any(f.name == name and f.metadata["whole"] for f in fields(EFFECTS[effect]))  # type: ignore[arg-type]
     if whole or not isfinite(hi - lo) or hi <= lo:
         text = f"{value:.0f}" if whole else format_number(value)
-        return Parameter(name, text, "", with_unit(text), unit.name, was)
+        return FormattedParameter(name, text, "", with_unit(text), unit.name, was)
     texts = _with_interval(value, lo, hi)
     short = with_unit(_plus_minus(value, lo, hi, texts))
-    return Parameter(name, texts[0], f"{texts[1]} … {texts[2]}", short, unit.name, was)
+    return FormattedParameter(name, texts[0], f"{texts[1]} … {texts[2]}", short, unit.name, was)
 
 
 def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str:
-    """Format a value with ±, or with both ends of an asymmetric interval."""
+    """Format a value with ±, or with two interval ends if the interval is asymmetric."""
     below, above = value - lo, hi - value
     if abs(above - below) > SYMMETRY_TOLERANCE * (above + below):
         return f"{texts[0]} ({texts[1]} … {texts[2]})"
@@ -330,7 +328,7 @@ def _plus_minus(value: float, lo: float, hi: float, texts: Sequence[str]) -> str
 
 
 def _with_interval(value: float, lo: float, hi: float) -> tuple[str, ...]:
-    """Format value, lo, hi and half width of an interval with the two leading digits of the half width."""
+    """Format a value, the interval ends and the half width to two digits of the half width."""
     half = 0.5 * (hi - lo)
     decimals = 1 - floor(log10(half))
     if 0 <= decimals <= 9 and max(map(abs, (value, lo, hi))) < 1e6:
@@ -347,7 +345,6 @@ def _short(value: float) -> str:
 
 
 def _count_steps(steps: Sequence[AddedOrResizedEffect]) -> list[str]:
-    """Return the numbers of added effects and of changed terms, with their names."""
     texts = []
     for kind, noun in (("added", "added effect"), ("retuned", "retuned term")):
         names = [readable_name(step.effect) for step in steps if step.kind == kind]

@@ -1,9 +1,7 @@
 """Geometry of a log-log Allan plot for a viewer without logarithmic axes.
 
-Averaging times and deviations are converted to points and lines in chart units. The chart is a box of ``WIDTH`` by
-``HEIGHT`` with equal units on both axes. The y axis points down, as in the 2D view of Rerun. The size of the box is
-fixed, so that the limits of the view are set only once. The range of decades is chosen from the data. The module does
-no I/O.
+Averaging times and deviations are converted to points and lines in chart units. The chart is a box of fixed size with a
+y axis that points down, as in the 2D view of Rerun.
 """
 
 import math
@@ -22,14 +20,16 @@ FILL_STEPS: Final = 96  # number of vertical strokes that fill a band
 
 
 @dataclass(frozen=True, slots=True)
-class Scale:
-    """Range of averaging times and deviations that the box shows, as exponents of ten."""
+class ChartScale:
+    """Decades of averaging times and deviations that the chart shows, as exponents of ten."""
 
     x: tuple[int, int]
     y: tuple[int, int]
 
-    def to_chart(self, tau: Floats, sigma: Floats) -> Floats:
-        """Return positions in chart units, shape [n, 2]. NaN where the deviation is not positive.
+    def to_chart_positions(self, tau: Floats, sigma: Floats) -> Floats:
+        """Convert averaging times and deviations to chart positions, shape [n, 2].
+
+        Positions are NaN where the deviation is not positive.
 
         Parameters
         ----------
@@ -47,7 +47,7 @@ class Scale:
         return np.column_stack([across, down])
 
 
-def decade_range(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tuple[int, int]:
+def decade_range(values: Iterable[Floats], min_decades: int = int(MIN_DECADES)) -> tuple[int, int]:
     """Return the exponents of the decades that contain all positive finite numbers.
 
     >>> decade_range([np.array([0.02, 300.0])])
@@ -57,31 +57,31 @@ def decade_range(values: Iterable[Floats], least: int = int(MIN_DECADES)) -> tup
     ----------
     values
         Arrays of numbers.
-    least
+    min_decades
         Smallest number of decades.
     """
     good = np.concatenate([v[np.isfinite(v) & (v > 0)] for v in values])
     if good.size == 0:
-        return 0, least
+        return 0, min_decades
     low = math.floor(math.log10(float(good.min())) + 1e-9)
     high = math.ceil(math.log10(float(good.max())) - 1e-9)
-    return low, max(high, low + least)
+    return low, max(high, low + min_decades)
 
 
 def clip_to_box(y: Floats) -> Floats:
-    """Limit heights to the box. An interval may extend far below the plot."""
+    """Limit y coordinates to the height of the chart."""
     return np.clip(y, 0.0, HEIGHT)
 
 
 def finite_sections(positions: Floats) -> list[Floats]:
-    """Return the sections of a line with at least two finite points. NaN separates sections."""
+    """Split a line at NaN into sections with at least two points."""
     good = np.isfinite(positions).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], good, [False]]).astype(np.int8)))
     return [positions[a:b] for a, b in zip(edges[::2], edges[1::2], strict=True) if b - a >= 2]
 
 
 def dash_line(line: Floats, length: float = 0.22) -> list[Floats]:
-    """Divide a line of shape [n, 2] into dashes with gaps of the same length.
+    """Divide a line of shape [n, 2] into dashes that are as long as the spaces between the dashes.
 
     >>> [stroke.tolist() for stroke in dash_line(np.array([[0.0, 0.0], [4.0, 0.0]]), 1.0)]
     [[[0.0, 0.0], [1.0, 0.0]], [[2.0, 0.0], [3.0, 0.0]]]
@@ -118,7 +118,7 @@ def band_strokes(low: Floats, high: Floats) -> Floats:
 
 
 def interval_strokes(low: Floats, high: Floats) -> Floats:
-    """Return one vertical stroke per point from the lower to the upper end of its interval, shape [n, 2, 2].
+    """Return one vertical stroke per point from the lower to the upper end of the interval, shape [n, 2, 2].
 
     Parameters
     ----------
@@ -132,8 +132,8 @@ def interval_strokes(low: Floats, high: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class Grid:
-    """Lines and tick labels of a scale."""
+class ChartGrid:
+    """Grid lines and tick labels of a chart."""
 
     frame: list[Floats]
     major: list[Floats]
@@ -141,14 +141,14 @@ class Grid:
     ticks: list[tuple[float, float, str]]  # x, y, label
 
 
-def grid_lines(scale: Scale) -> Grid:
-    """Return lines at the powers of ten, minor lines at multiples, and labels below and to the left of the box."""
+def chart_grid(scale: ChartScale) -> ChartGrid:
+    """Return grid lines at powers of ten and at multiples, and tick labels outside the box."""
     x_at, x_minor = _line_positions(scale.x, WIDTH)
     y_at, y_minor = _line_positions(scale.y, HEIGHT)
     flip = HEIGHT
     ticks = [(x, HEIGHT + 0.25, _tick(p)) for x, p in zip(x_at, range(scale.x[0], scale.x[1] + 1), strict=True)]
     ticks += [(-0.75, flip - y - 0.35, _tick(p)) for y, p in zip(y_at, range(scale.y[0], scale.y[1] + 1), strict=True)]
-    return Grid(
+    return ChartGrid(
         frame=[np.array([[0, 0], [WIDTH, 0], [WIDTH, HEIGHT], [0, HEIGHT], [0, 0]], float)],
         major=[_vertical(x) for x in x_at[1:-1]] + [_horizontal(flip - y) for y in y_at[1:-1]],
         minor=[_vertical(x) for x in x_minor] + [_horizontal(flip - y) for y in y_minor],
@@ -157,7 +157,7 @@ def grid_lines(scale: Scale) -> Grid:
 
 
 def _line_positions(span: tuple[int, int], length: float) -> tuple[list[float], list[float]]:
-    """Return the positions of the powers of ten along an axis, and of 2 to 9 times each power of ten."""
+    """Return positions of the powers of ten, and of the multiples 2 to 9, along an axis."""
     per_decade = length / (span[1] - span[0])
     at = [i * per_decade for i in range(span[1] - span[0] + 1)]
     between = [a + math.log10(k) * per_decade for a in at[:-1] for k in range(2, 10)]
@@ -165,15 +165,13 @@ def _line_positions(span: tuple[int, int], length: float) -> tuple[list[float], 
 
 
 def _vertical(x: float) -> Floats:
-    """Return a vertical line across the box."""
     return np.array([[x, 0.0], [x, HEIGHT]])
 
 
 def _horizontal(y: float) -> Floats:
-    """Return a horizontal line across the box."""
     return np.array([[0.0, y], [WIDTH, y]])
 
 
 def _tick(power: int) -> str:
-    """Format a power of ten, as a plain number between 0.0001 and 10000 and otherwise as 1e6."""
+    """Format a power of ten, with exponent notation outside 0.0001 to 10000."""
     return f"{10.0**power:g}" if -4 <= power <= 4 else f"1e{power}"

@@ -1,7 +1,7 @@
-"""Allan plots of the viewer, with measured points, intervals, the fitted deviation and the noise model.
+"""Allan plots in the viewer, with measured deviations, intervals, fitted deviations and the noise model.
 
-Rerun draws a plot as lines and points in chart units. The entity of an axis therefore also contains tau, deviation, lo
-and hi in SI units, for programs that read the recording. Importing this module imports Rerun.
+Rerun draws a plot as lines and points in chart units. The entity of an axis therefore also contains the deviations in
+SI units, for programs that read the recording. Importing this module imports Rerun.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,21 +21,21 @@ from monitor.publishing.rerun.allan_chart import (
     FILL_STEPS,
     HEIGHT,
     WIDTH,
-    Scale,
+    ChartScale,
     band_strokes,
+    chart_grid,
     dash_line,
     decade_range,
     finite_sections,
-    grid_lines,
     interval_strokes,
 )
 
 Log = Callable[..., Any]
-"""Function that logs an entity, given its path and its components."""
+"""Function that logs an entity, given the path and the components."""
 
 
 class AllanPlot:
-    """Allan plots of a device, one for each kind of sensor.
+    """Allan plots of one device, with a plot for each kind of sensor.
 
     Parameters
     ----------
@@ -48,10 +48,10 @@ class AllanPlot:
     def __init__(self, log: Log, path: str) -> None:
         self._log = log
         self._path = path
-        self._scales: dict[Kind, Scale] = {}  # scale of the newest grid
+        self._scales: dict[Kind, ChartScale] = {}  # scale of the newest grid
 
     def draw(self, estimate: Estimate, gap: ModelGap | None) -> None:
-        """Draw the curves of an estimate.
+        """Draw the Allan deviations of an estimate.
 
         Parameters
         ----------
@@ -61,12 +61,14 @@ class AllanPlot:
             Comparison with the noise model, which is drawn as dashed lines. None if there is no model.
         """
         for kind in KINDS:
-            curves = [curve for axis in axes_of(kind) if (curve := _Curve.of(estimate, axis, gap)) is not None]
+            curves = [
+                curve for axis in axes_of(kind) if (curve := _Curve.from_estimate(estimate, axis, gap)) is not None
+            ]
             if not curves:
                 continue
-            scale = Scale(
+            scale = ChartScale(
                 decade_range(one.tau for one in curves),
-                decade_range(part for one in curves for part in one.curves_for_height),
+                decade_range(part for one in curves for part in one.curves_in_y_range),
             )
             if self._scales.get(kind) != scale:
                 self._scales[kind] = scale
@@ -74,8 +76,7 @@ class AllanPlot:
             for curve in curves:
                 self._draw_curve(scale, curve)
 
-    def _draw_grid(self, kind: Kind, scale: Scale, axes: Sequence[str]) -> None:
-        """Draw frame, decade lines and tick labels of a plot, and a legend above the right end of the box."""
+    def _draw_grid(self, kind: Kind, scale: ChartScale, axes: Sequence[str]) -> None:
         path = f"{self._path}/{kind}"
         titles = [
             (WIDTH / 2, HEIGHT + 0.85, "averaging time τ, s"),
@@ -89,16 +90,21 @@ class AllanPlot:
         )
         self._log(f"{path}/legend", label_points([(x, -0.85, axis) for axis, x in ends]))
 
-    def _draw_curve(self, scale: Scale, curve: "_Curve") -> None:
-        """Draw band, fitted line, intervals and measured points of one axis, and the noise model as a dashed line."""
+    def _draw_curve(self, scale: ChartScale, curve: "_Curve") -> None:
         path, colour = f"{self._path}/{curve.axis}", colours.AXIS_COLOURS[curve.axis]
         low, high, fitted, model, deviation = (
-            scale.to_chart(curve.tau, part) for part in (curve.lo, curve.hi, curve.fitted, curve.model, curve.deviation)
+            scale.to_chart_positions(curve.tau, part)
+            for part in (curve.lo, curve.hi, curve.fitted, curve.model, curve.deviation)
         )
-        fill = fill_band(low, high, colours.blend(colour, 0.22))
+        fill = fill_band(low, high, colours.blend_colours(colour, 0.22))
         self._log(f"{path}/band", fill)
         log_lines(
-            self._log, f"{path}/interval", list(interval_strokes(low, high)), [colours.blend(colour, 0.6)], 0.75, 5.0
+            self._log,
+            f"{path}/interval",
+            list(interval_strokes(low, high)),
+            [colours.blend_colours(colour, 0.6)],
+            0.75,
+            5.0,
         )
         log_lines(self._log, f"{path}/fit", finite_sections(fitted), [colour], 1.25, 10.0)
         dashes = [stroke for section in finite_sections(model) for stroke in dash_line(section)]
@@ -109,7 +115,7 @@ class AllanPlot:
 
 @dataclass(frozen=True)
 class _Curve:
-    """Deviations of one axis at its measured averaging times, in the unit of the plot."""
+    """Deviations of one axis in the unit of the Allan plot."""
 
     axis: str
     tau: Floats
@@ -121,13 +127,13 @@ class _Curve:
     si: dict[str, Floats]
 
     @property
-    def curves_for_height(self) -> tuple[Floats, ...]:
-        """Curves that determine the range of the y axis. Intervals may extend beyond this range."""
+    def curves_in_y_range(self) -> tuple[Floats, ...]:
+        """Curves that determine the range of the y axis. Intervals may extend beyond the range."""
         return self.deviation, self.fitted, self.model
 
     @classmethod
-    def of(cls, estimate: Estimate, axis: str, gap: ModelGap | None) -> "_Curve | None":
-        """Return the deviations of an axis, or None if there are fewer than two points."""
+    def from_estimate(cls, estimate: Estimate, axis: str, gap: ModelGap | None) -> "_Curve | None":
+        """Return None if the axis has fewer than two deviations."""
         curve, i = estimate.curve, AXES.index(axis)
         rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)
         if int(rows.sum()) < 2:
@@ -141,8 +147,10 @@ class _Curve:
         return cls(axis, si["tau"], deviation * f, si["lo"] * f, si["hi"] * f, fitted * f, model * f, si)
 
 
-def log_grid(log: Log, path: str, scale: Scale, labels_path: str, labels: Sequence[tuple[float, float, str]]) -> None:
-    """Log frame, decade lines, tick labels and further labels of a plot.
+def log_grid(
+    log: Log, path: str, scale: ChartScale, labels_path: str, labels: Sequence[tuple[float, float, str]]
+) -> None:
+    """Log the grid lines, tick labels and further labels of a plot.
 
     Parameters
     ----------
@@ -157,7 +165,7 @@ def log_grid(log: Log, path: str, scale: Scale, labels_path: str, labels: Sequen
     labels
         Further labels, each given by x, y and text.
     """
-    lines = grid_lines(scale)
+    lines = chart_grid(scale)
     log_lines(log, f"{path}/minor", lines.minor, [colours.MINOR], 0.5, -30.0)
     log_lines(log, f"{path}/major", lines.major, [colours.MAJOR], 0.5, -29.0)
     log_lines(log, f"{path}/frame", lines.frame, [colours.FRAME], 0.5, -10.0)
@@ -167,7 +175,7 @@ def log_grid(log: Log, path: str, scale: Scale, labels_path: str, labels: Sequen
 def log_lines(
     log: Log, path: str, strips: Sequence[Floats], line_colours: Sequence[Colour], radius: float, order: float
 ) -> None:
-    """Log lines.
+    """Log lines with colours and a width.
 
     Parameters
     ----------
@@ -203,7 +211,7 @@ def fill_band(low: Floats, high: Floats, colour: Colour) -> rr.LineStrips2D:
 
 
 def label_points(labels: Sequence[tuple[float, float, str]]) -> rr.Points2D:
-    """Return labels as points of a 2D view, each given by x, y and text."""
+    """Return labels as points of a 2D view. Each label has the coordinates x and y and a text."""
     return rr.Points2D(
         [(x, y) for x, y, _ in labels],
         labels=[text for _, _, text in labels],

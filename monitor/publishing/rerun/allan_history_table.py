@@ -1,8 +1,8 @@
 """History of the Allan deviations of a device, in a table of limited size for the live view.
 
-Estimates are aggregated into columns, oldest first. Each column is the mean of the logarithms of the estimates in one
-time interval. When the table has COLUMNS columns, pairs of neighbouring columns are averaged, and each column then
-covers twice the time. The table therefore covers the whole history with constant memory. The module does no I/O.
+Each column is the mean logarithmic deviation of all estimates in a time interval. When the table has COLUMNS columns,
+neighbouring columns are averaged in pairs, and the time interval of a column doubles. The table covers the
+whole history with constant memory.
 """
 
 import numpy as np
@@ -11,13 +11,16 @@ from drivers.data_types import AXES, Floats, Ints
 from monitor.estimation.estimate import Estimate
 
 COLUMNS = 300
-"""Largest number of columns. The number must be even, because columns are merged in pairs."""
+"""Largest number of columns, which must be even because columns are merged in pairs."""
 INITIAL_COLUMN_S = 2.0
 """Initial duration of a column [s], in the time of the samples."""
 
 
 class AllanHistory:
-    """Allan deviations of one device over time. An estimate with other τ or an earlier time starts a new history."""
+    """Allan deviations of one device over time.
+
+    An estimate with different averaging times or an earlier time starts a new history.
+    """
 
     def __init__(self, column_s: float = INITIAL_COLUMN_S) -> None:
         """Create an empty history with columns of ``column_s`` seconds."""
@@ -25,21 +28,19 @@ class AllanHistory:
         self._reset(np.empty(0), 0.0)
 
     def _reset(self, tau_s: Floats, wall_s: float) -> None:
-        """Start a new, empty history."""
         self.column_s = self._first_s
         self.tau_s = tau_s  # [m]
-        self.ends_s: list[float] = []  # Unix time of the newest estimate in each column
+        self.ends_s: list[float] = []  # Unix time [s] of the newest estimate in each column
         self._columns: list[Floats] = []  # [m, 6] natural logarithm of the deviation
         self._begin_column(wall_s)
 
     def _begin_column(self, wall_s: float) -> None:
-        """Start a new column."""
         self._since_s = self._newest_s = wall_s
         self._sums: Floats = np.zeros((self.tau_s.size, len(AXES)))
         self._counts: Ints = np.zeros((self.tau_s.size, len(AXES)), np.int64)
 
     def add_estimate(self, wall_s: float, estimate: Estimate) -> bool:
-        """Add an estimate, and return True if it completes a column.
+        """Add an estimate. Return True if the estimate completes a column.
 
         Parameters
         ----------
@@ -50,7 +51,7 @@ class AllanHistory:
         """
         if wall_s < self._newest_s or not np.array_equal(self.tau_s, estimate.curve.tau_s):
             self._reset(estimate.curve.tau_s, wall_s)
-        # The recent deviations use a short time for each τ, so that a change appears at once and at the correct time.
+        # The recent deviations use only the newest samples, so that a change appears without delay.
         avar = (estimate.display_curve or estimate.curve).avar
         there = np.isfinite(avar) & (avar > 0.0)
         self._sums[there] += 0.5 * np.log(avar[there])
@@ -66,7 +67,6 @@ class AllanHistory:
         return True
 
     def _merge_pairs(self) -> None:
-        """Average neighbouring columns."""
         pairs = np.stack(self._columns).reshape(COLUMNS // 2, 2, self.tau_s.size, len(AXES))
         there = np.isfinite(pairs)
         means = np.where(there, pairs, 0.0).sum(axis=1) / np.maximum(there.sum(axis=1), 1)
@@ -75,7 +75,10 @@ class AllanHistory:
         self.column_s *= 2.0
 
     def log_ratio_to_median(self) -> Floats:
-        """Return ln(deviation / median over time), shape [columns, m, 6]. NaN if there is no deviation."""
+        """Return the logarithm of the deviation divided by the median over time, shape [columns, m, 6].
+
+        Missing deviations are NaN.
+        """
         whole = np.stack(self._columns) if self._columns else np.empty((0, self.tau_s.size, len(AXES)))
         there = np.isfinite(whole).any(axis=0)
         median = np.full(there.shape, np.nan)

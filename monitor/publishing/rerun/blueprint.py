@@ -1,8 +1,7 @@
-"""Layout of the Rerun viewer: health, current noise, and changes.
+"""Layout of the Rerun viewer.
 
-A single device fills the window. Several devices have an overview and one tab each. A second tab of a device shows its
-noise over time. Panels may add separate tabs. The time panel follows the newest sample. This module defines only the
-layout and handles no data. Importing it imports Rerun.
+A single device fills the window. Several devices have an overview and one tab each. The tab of a device contains panels
+for current noise and for noise over time. Importing this module imports Rerun.
 """
 
 from collections.abc import Sequence
@@ -28,7 +27,7 @@ from monitor.publishing.rerun.viewer_settings import DeviceInfo
 NOW_COEFFICIENTS: Final = ("N", "B")
 DYNAMIC_COEFFICIENTS: Final = ("N", "B", "K")
 TYPICAL_TAU_COUNT: Final = 17
-"""Number of averaging times of one hour at 100 Hz. A heat map with another number has a slightly different height."""
+"""Number of averaging times of a one-hour window at 100 Hz."""
 MAX_DEVICES_WITH_ACCEL: Final = 4
 """Largest number of devices for which the overview also shows accelerometers."""
 MAX_GRID_COLUMNS: Final = 4
@@ -36,14 +35,14 @@ SHORT_KIND_NAMES: Final = {"gyro": "Gyro", "accel": "Accel"}
 
 
 def blueprint(devices: Sequence[DeviceInfo], fleet: bool = False) -> rrb.Blueprint:
-    """Return the layout for the devices.
+    """Return the Rerun layout for a list of devices.
 
     Parameters
     ----------
     devices
         The devices.
     fleet
-        True if the overview is a table of further devices.
+        True if the overview is a table that also contains devices without detail.
     """
     pages, names = [_device(one) for one in devices], [one.name for one in devices]
     if fleet:
@@ -54,13 +53,11 @@ def blueprint(devices: Sequence[DeviceInfo], fleet: bool = False) -> rrb.Bluepri
 
 
 def _device(device: DeviceInfo) -> rrb.Container:
-    """Return the tabs of one device."""
     tabs = [tab for panel in PANELS if (tab := panel.tab_layout(device)) is not None]
     return rrb.Tabs(_now(device), _dynamic(device.name), *tabs, active_tab=0, name=device.name)
 
 
 def _now(device: DeviceInfo) -> rrb.Container:
-    """Return the tab with health, current noise, newest samples and the gap to a model."""
     name = device.name
     left = rrb.Vertical(
         rrb.TextDocumentView(origin=f"/{name}/status", name="Is it healthy?"),
@@ -81,7 +78,6 @@ def _now(device: DeviceInfo) -> rrb.Container:
 
 
 def _dynamic(device: str) -> rrb.Container:
-    """Return the tab with the heat maps of all axes and the coefficients over time."""
     columns = [
         rrb.Vertical(
             *(_heat_map(device, axis) for axis in axes_of(kind)),
@@ -94,7 +90,6 @@ def _dynamic(device: str) -> rrb.Container:
 
 
 def _overview(devices: Sequence[str]) -> rrb.Container:
-    """Return the overview of several devices."""
     kinds = KINDS if len(devices) <= MAX_DEVICES_WITH_ACCEL else KINDS[:1]
     charts = [_allan(device, kind, f"{device}: ") for kind in kinds for device in devices]
     return rrb.Vertical(
@@ -106,7 +101,6 @@ def _overview(devices: Sequence[str]) -> rrb.Container:
 
 
 def _fleet(devices: Sequence[str]) -> rrb.Container:
-    """Return the overview of many devices: table, events, and Allan plots of the devices shown in detail."""
     charts = [_allan(device, kind, f"{device}: ") for device in devices for kind in KINDS]
     if not charts:
         return rrb.Vertical(*_overview_texts(), row_shares=[4, 1], name="Fleet")
@@ -116,47 +110,40 @@ def _fleet(devices: Sequence[str]) -> rrb.Container:
 
 
 def _overview_texts() -> tuple[rrb.View, rrb.View]:
-    """Return the views of the table and of the events of all devices."""
     table = rrb.TextDocumentView(origin="/overview", contents="$origin", name="Is it healthy?")
     return table, _event_log("/overview/events")
 
 
 def _event_log(origin: str) -> rrb.View:
-    """Return the view of events. The time of day is part of the text, because the time column is too narrow."""
     hidden = TimelineColumn(timeline=TIMELINE, visible=False)
     columns = rrb.TextLogColumns(timeline_columns=[hidden], text_log_columns=["LogLevel", "Body"])
     return rrb.TextLogView(origin=origin, name="Has it changed?", columns=columns)
 
 
 def _heat_map(device: str, axis: str) -> rrb.View:
-    """Return the view of the heat map of one axis."""
-    x, y = dynamic_heat_map.view_bounds(TYPICAL_TAU_COUNT)
+    x, y = dynamic_heat_map.heat_map_bounds(TYPICAL_TAU_COUNT)
     name = f"{axis}: Allan deviation over time, divided by its median"
     return drawing_view(f"/{device}/dynamic/{axis}", name, "$origin/**", x, y)
 
 
 def _allan(device: str, kind: Kind, prefix: str = "") -> rrb.View:
-    """Return the view of the Allan plot of one kind of sensor."""
     paths = [f"+ /{device}/allan/{kind}/**", *(f"+ /{device}/allan/{axis}/**" for axis in axes_of(kind))]
     name = f"{prefix}{KIND_NAMES[kind]}: Allan deviation, {DEVIATION_UNITS[kind].name}"
     return drawing_view(f"/{device}/allan", name, paths, (-1.6, WIDTH + 0.6), (-1.3, HEIGHT + 1.7))
 
 
 def _coefficient(device: str, kind: Kind, symbol: str) -> rrb.View:
-    """Return the view of one coefficient over time."""
     name = f"{SHORT_KIND_NAMES[kind]} {symbol}, {COEFFICIENT_UNITS[kind][symbol].name}"
     return time_series_view(f"/{device}/coefficients/{symbol}", name, [f"$origin/{axis}/**" for axis in axes_of(kind)])
 
 
 def _raw(device: str, kind: Kind) -> rrb.View:
-    """Return the view of the raw samples."""
     name = f"{KIND_NAMES[kind]}: samples, {SAMPLE_UNITS[kind].name}"
     contents = [f"$origin/{axis}" for axis in axes_of(kind)]
     return time_series_view(f"/{device}/samples", name, contents, RAW_SAMPLES_S, legend=True)
 
 
 def _gap(device: str, kind: Kind) -> rrb.View:
-    """Return the view of the gap to the model."""
     name = f"{KIND_NAMES[kind]}: gap to the model, σ, and its threshold"
     contents = ["$origin/threshold", *(f"$origin/{axis}" for axis in axes_of(kind))]
     return time_series_view(f"/{device}/gap", name, contents)

@@ -1,8 +1,7 @@
-"""Decimation of samples for display.
+"""Decimation of samples for display, to at most ``ROWS_PER_S`` rows per second and axis.
 
-At most ``ROWS_PER_S`` rows per second and axis are passed to the viewer. Samples of a slow device are not changed. For
-a fast device, each time bucket keeps its smallest and its largest sample, each at its own time. An outlier of a single
-sample therefore remains visible. Only the display uses these rows.
+For a fast device, each time bucket keeps the smallest and the largest sample, so that an outlier of a single sample
+remains visible.
 """
 
 from typing import Final
@@ -12,12 +11,14 @@ import numpy as np
 from drivers.data_types import Floats, Ints
 
 ROWS_PER_S: Final = 200.0
-BUCKETS_PER_S: Final = 95.0  # two rows per bucket, and some rows for the buckets that a flush divides
-ROWS_PER_FLUSH: Final = 4000  # limits the rows of a replay at full speed, which delivers hours at once
+BUCKETS_PER_S: Final = 95.0  # a bucket gives two rows, and a divided bucket gives more rows
+ROWS_PER_FLUSH: Final = 4000  # limits the rows of a fast replay, which delivers hours of samples at once
 
 
 def decimate_extremes(wall_s: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Return the times and values of the samples of one axis to draw, which are the extremes of buckets at high rates.
+    """Return times and values of the smallest and largest sample in each time bucket.
+
+    Samples at a low rate are returned unchanged.
 
     Parameters
     ----------
@@ -39,7 +40,7 @@ def decimate_extremes(wall_s: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def average_buckets(wall_s: Floats, values: Floats, per_s: float) -> tuple[Floats, Floats]:
-    """Return the mean time and mean value of each time bucket. This method suits slow quantities such as temperature.
+    """Return the mean time and the mean value of each time bucket, for slow quantities such as temperature.
 
     Parameters
     ----------
@@ -55,13 +56,13 @@ def average_buckets(wall_s: Floats, values: Floats, per_s: float) -> tuple[Float
     if values.size == 0:
         return wall_s, values
     _, inverse, count = np.unique(np.floor(wall_s * per_s), return_inverse=True, return_counts=True)
-    origin = wall_s[0]  # sums of absolute Unix times would lose microseconds
+    origin = wall_s[0]  # sums of absolute Unix times would be rounded by microseconds
     t = origin + np.bincount(inverse, wall_s - origin) / count
     return t, np.bincount(inverse, values) / count
 
 
 def _bucket_width_s(wall_s: Floats) -> float | None:
-    """Return the width of a bucket [s], or None if the sample rate is low enough without decimation."""
+    """Return the bucket width [s], or None if the sample rate needs no decimation."""
     span_s = float(wall_s.max() - wall_s.min())
     rate_hz = (wall_s.size - 1) / span_s if span_s > 0 else np.inf
     if rate_hz <= ROWS_PER_S and wall_s.size <= ROWS_PER_FLUSH:
@@ -70,7 +71,7 @@ def _bucket_width_s(wall_s: Floats) -> float | None:
 
 
 def _bucket_ends(order: Ints, bucket: Ints) -> Ints:
-    """Return the indices of the first and last entry of each bucket in ``order``, sorted and without duplicates."""
+    """Return the positions of the first and last entry of each bucket."""
     sorted_bucket = bucket[order]
     first = np.concatenate([[True], sorted_bucket[1:] != sorted_bucket[:-1]])
     last = np.concatenate([first[1:], [True]])

@@ -1,9 +1,8 @@
-"""Allan deviation of a device over time as a heat map, shown by the viewer under ``/<device>/dynamic/<axis>``.
+"""Heat maps of the Allan deviation of a device over time, under ``/<device>/dynamic/<axis>`` in the viewer.
 
-Each axis has an image and labels. Time increases to the right and τ upwards. The colour is the deviation divided by its
-median over time. Rerun draws an image with one unit per pixel and without axes. Each τ is therefore several pixels
-high, and labels are drawn as points with text. An image is a PNG file of a few kilobytes with a palette. A new image is
-drawn when a column is complete. Columns become longer as the history grows. Importing this module imports Rerun.
+Time increases to the right and the averaging time τ increases upwards. The colour is the deviation divided by the
+median over time. Each heat map is a PNG image with a palette. Rerun draws no axes on an image, so labels are drawn as
+points with text. Importing this module imports Rerun.
 """
 
 import io
@@ -30,14 +29,14 @@ BAR_STEPS: Final = 24
 LABEL_MARGINS_PX: Final = (24.0, 7.0, 32.0, 13.0)  # left, above, right and below the image, for labels
 
 
-def view_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Return the limits in x and y of a view with the given number of averaging times."""
+def heat_map_bounds(tau_count: int) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return the limits in x and y of a heat map view with the given number of averaging times."""
     left, above, right, below = LABEL_MARGINS_PX
     return (-left, COLUMNS + right), (-above, _rows(tau_count) * tau_count + below)
 
 
-def draw_heat_maps(log: Log, path: str, surface: AllanHistory) -> None:
-    """Log the images and labels of all measured axes at the current time of the stream.
+def draw_heat_maps(log: Log, path: str, allan_history: AllanHistory) -> None:
+    """Log the heat maps and labels of all measured axes at the current time of the stream.
 
     Parameters
     ----------
@@ -45,27 +44,27 @@ def draw_heat_maps(log: Log, path: str, surface: AllanHistory) -> None:
         Function that logs an entity.
     path
         Path of the heat maps.
-    surface
+    allan_history
         Deviations over time.
     """
-    whole = surface.log_ratio_to_median()
+    whole = allan_history.log_ratio_to_median()
     if len(whole) < MIN_COLUMNS:
         return
     for i, axis in enumerate(AXES):
         if not np.isfinite(whole[:, :, i]).any():
             continue
-        height = _rows(surface.tau_s.size) * surface.tau_s.size
+        height = _rows(allan_history.tau_s.size) * allan_history.tau_s.size
         log(
             f"{path}/{axis}",
             rr.EncodedImage(contents=encode_heat_map(whole[:, :, i]), media_type="image/png", draw_order=-20.0),
         )
-        labels = _tau_labels(surface.tau_s, height) + _time_labels(surface, height) + _bar_labels(height)
+        labels = _tau_labels(allan_history.tau_s, height) + _time_labels(allan_history, height) + _bar_labels(height)
         log(f"{path}/{axis}/labels", label_points(labels))
         log(f"{path}/{axis}/scale", _bar(height))
 
 
 def encode_heat_map(log_ratio: Floats) -> bytes:
-    """Return ln(deviation / median), shape [columns, m], as a PNG of COLUMNS pixels width with the longest τ on top."""
+    """Encode the logarithm of the deviation divided by the median, shape [columns, m], as a PNG image."""
     share = np.clip(np.nan_to_num(log_ratio) / np.log(COLOUR_SCALE_RATIO), -1.0, 1.0)
     shade = np.where(np.isfinite(log_ratio), np.rint(SHADES * (1.0 + share)), NO_VALUE_INDEX).astype(np.uint8)
     wide = shade[np.arange(COLUMNS) * len(log_ratio) // COLUMNS]
@@ -77,9 +76,11 @@ def encode_heat_map(log_ratio: Floats) -> bytes:
 
 
 def _palette() -> tuple[colours.Colour, ...]:
-    """Return the palette: blue below the median, dark at the median, vermilion above, black for missing values."""
-    below = [colours.blend(colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, colours.MINOR) for i in range(SHADES)]
-    above = [colours.blend(colours.AXIS_COLOURS["gx"], i / SHADES, colours.MINOR) for i in range(SHADES + 1)]
+    """Return blue below the median, vermilion above the median, and black for missing values."""
+    below = [
+        colours.blend_colours(colours.AXIS_COLOURS["gz"], (SHADES - i) / SHADES, colours.MINOR) for i in range(SHADES)
+    ]
+    above = [colours.blend_colours(colours.AXIS_COLOURS["gx"], i / SHADES, colours.MINOR) for i in range(SHADES + 1)]
     return (*below, *above, colours.BACKGROUND)
 
 
@@ -87,12 +88,11 @@ PALETTE: Final = _palette()
 
 
 def _rows(taus: int) -> int:
-    """Return the height of one τ [pixels]."""
+    """Return the height of one averaging time [pixels]."""
     return max(1, round(HEIGHT / max(taus, 1)))
 
 
 def _tau_labels(tau_s: Floats, height: int) -> list[tuple[float, float, str]]:
-    """Return labels at the powers of ten of τ, and the label of the unit."""
     log = np.log10(tau_s)
     powers = range(int(np.ceil(log[0])), int(np.floor(log[-1])) + 1)
     rows = np.interp(list(powers), log, (np.arange(log.size) + 0.5) / log.size)
@@ -101,13 +101,11 @@ def _tau_labels(tau_s: Floats, height: int) -> list[tuple[float, float, str]]:
 
 
 def _time_labels(surface: AllanHistory, height: int) -> list[tuple[float, float, str]]:
-    """Return labels with the time of day in UTC of the oldest and newest column."""
     at = ((12.0, surface.ends_s[0]), (COLUMNS - 1.0, surface.ends_s[-1]))
     return [(x, height + 6.0, format_utc(t)[-8:]) for x, t in at]
 
 
 def _bar_labels(height: int) -> list[tuple[float, float, str]]:
-    """Return the labels of the colour scale."""
     ends = zip(
         (2.0, height / 2.0, height - 2.0),
         (f"× {COLOUR_SCALE_RATIO:g}", "× 1", f"× {1 / COLOUR_SCALE_RATIO:g}"),
@@ -117,7 +115,6 @@ def _bar_labels(height: int) -> list[tuple[float, float, str]]:
 
 
 def _bar(height: int) -> rr.LineStrips2D:
-    """Return the colour scale as vertical strokes."""
     edges = np.linspace(height, 0.0, BAR_STEPS + 1)
     tints = [PALETTE[round(i * 2 * SHADES / (BAR_STEPS - 1))] for i in range(BAR_STEPS)]
     strips = [np.array([[BAR_X, a], [BAR_X, b]]) for a, b in pairwise(edges)]

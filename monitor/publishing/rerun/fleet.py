@@ -1,9 +1,7 @@
-"""Viewer for the devices of many daemons: ``imu-monitor view``.
+"""Viewer for the devices of many daemons, ``imu-monitor view``.
 
-Messages from zenoh are drawn as a table of all devices and a list of all events. Devices with problems are at the top
-of the table. Selected devices also have samples, Allan plots and coefficients over time, as in the viewer of a daemon.
-Only for these devices, samples and Allan deviations are received. ``DeviceStates`` holds the state of the devices, and
-``RerunView`` draws in a separate thread.
+The viewer shows a table of all devices and a list of all events. Devices shown in detail also have samples, Allan plots
+and coefficients over time. Samples and Allan deviations are received only for devices shown in detail.
 """
 
 import threading
@@ -16,21 +14,21 @@ from drivers.zenoh.sample_message import decode_samples
 from monitor.common import topics
 from monitor.publishing.messages.message import decode_message
 from monitor.publishing.messages.results import AllanMessage, EventMessage, StatusMessage
-from monitor.publishing.remote_devices import DeviceStates, split_key
+from monitor.publishing.remote_devices import DeviceStates, split_device_and_topic
 from monitor.publishing.rerun.panel_text import fleet_text
 from monitor.publishing.rerun.queued_view import RerunView
 from monitor.publishing.result_kinds import DeviceTableText, SampleRows
 from monitor.publishing.terminal.watch import connection_note
-from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
+from monitor.publishing.zenoh.subscriber import ReceivedMessage, ZenohSubscriber
 
 RECEIVE_TIMEOUT_S: Final = 0.1
 TABLE_PERIOD_S: Final = 1.0
 MAX_ROWS: Final = 40
-"""Largest number of rows of the table, about one screen. Devices with the fewest problems are omitted."""
+"""Largest number of rows of the device table, about one screen."""
 
 
 def full_device_key(device: str, keyexpr: str) -> str:
-    """Return the full key of a device, whose key may be relative to the part of a key expression before any wildcard.
+    """Return the full key of a device whose key may be relative to a key expression.
 
     >>> full_device_key("nose", "imu/**"), full_device_key("fleet/a7/nose", "fleet/**")
     ('imu/nose', 'fleet/a7/nose')
@@ -59,7 +57,7 @@ class FleetView:
     subscriber
         Subscriber, including the topics of devices shown in detail.
     viewer
-        Viewer of the devices shown in detail, which are named by their keys.
+        Viewer of the devices shown in detail.
     detail
         Keys of the devices shown in detail.
     """
@@ -71,19 +69,19 @@ class FleetView:
         self.board = DeviceStates()
         self.malformed = 0  # number of messages of devices in detail that could not be decoded
 
-    def run(self, stop: threading.Event, tell: Callable[[str], None], seconds: float | None = None) -> None:
-        """Process messages until ``stop`` is set.
+    def run(self, stop: threading.Event, report: Callable[[str], None], duration_s: float | None = None) -> None:
+        """Process messages and draw the device table until ``stop`` is set.
 
         Parameters
         ----------
         stop
             Event that ends the method.
-        tell
-            Function that is called with the address of the page and a description of problems when one of them changes.
-        seconds
-            Longest duration [s]; None: no limit.
+        report
+            Function that receives the address of the page and the problems after each change.
+        duration_s
+            Longest duration [s], or None for no limit.
         """
-        end_s = None if seconds is None else time.monotonic() + seconds
+        end_s = None if duration_s is None else time.monotonic() + duration_s
         table_s, reported = 0.0, ""
         while not stop.is_set() and (end_s is None or time.monotonic() < end_s):
             for message in self._subscriber.take(RECEIVE_TIMEOUT_S):
@@ -94,18 +92,18 @@ class FleetView:
             table_s = now_s
             self.draw_device_table(time.time(), now_s)
             page = self._viewer.url if self._viewer.url.startswith("http") else ""
-            report = "; ".join(part for part in (page, self._problems()) if part)
-            if report != reported:
-                reported = report
-                tell(report)
+            text = "; ".join(part for part in (page, self._problems()) if part)
+            if text != reported:
+                reported = text
+                report(text)
 
-    def process_message(self, message: Message) -> None:
-        """Update the table with a message, and the viewer if the device is shown in detail."""
+    def process_message(self, message: ReceivedMessage) -> None:
+        """Update the device table from a message, and draw the results of a device shown in detail."""
         if message.payload is None:
-            self.board.set_token(message.key, message.there)
+            self.board.set_liveliness_token(message.key, message.token_exists)
             return
         decoded = self.board.process_message(message.key, message.payload)
-        device, topic = split_key(message.key) or ("", topics.ALIVE)
+        device, topic = split_device_and_topic(message.key) or ("", topics.ALIVE)
         if isinstance(decoded, EventMessage) and decoded.t is not None:
             self._viewer.put(device, decoded.t, decoded.to_event())
         elif device not in self._detail:
@@ -129,25 +127,23 @@ class FleetView:
         now_s
             Current time on the clock of the messages [s].
         """
-        devices = self.board.devices(now_s)
+        devices = self.board.sorted_devices(now_s)
         note = connection_note(self.board, self._subscriber)
         self._viewer.put("", wall_s, DeviceTableText(fleet_text(devices, now_s, MAX_ROWS, note)))
 
     def _show(self, device: str, topic: topics.Topic, payload: bytes) -> None:
-        """Pass samples or Allan deviations to the viewer."""
         if topic is topics.SAMPLES:
             rows = decode_samples(payload).block
             unix_s = rows.t_ns / 1e9
             if unix_s.size:
                 self._viewer.put(device, float(unix_s[-1]), SampleRows(unix_s, rows.values, rows.temperature_c))
         elif topic is topics.ALLAN:
-            message, known = decode_message(AllanMessage, payload), self.board.coefficients(device)
+            message, known = decode_message(AllanMessage, payload), self.board.device_coefficients(device)
             if known is not None:
                 estimate = message.to_estimate(known.coefficients, known.k_or_r)
                 self._viewer.put(device, estimate.t_ns / 1e9, estimate)
 
     def _problems(self) -> str:
-        """Return the problems of the viewer and of the subscriber."""
         viewer = self._viewer.state
         problems = [] if viewer in ("ok", "starting") else [f"viewer: {viewer}"]
         if self._subscriber.state != "ok":

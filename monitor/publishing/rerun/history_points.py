@@ -1,7 +1,7 @@
-"""Points that the viewer draws for stored history. The module does no I/O.
+"""Points that the viewer draws for the stored history of a device.
 
-Each bucket has a point for its last value with the interval, at the end of the bucket. An extreme outside this interval
-has an additional point. A minimum is drawn after one third of the bucket, a maximum after two thirds.
+Each time bucket has a point at the end of the bucket for the last value, with the interval of the value. An extreme
+outside the interval has an additional point.
 """
 
 import numpy as np
@@ -11,30 +11,30 @@ from monitor.history.history_table import ColumnStatistics, HistoryTable
 from monitor.publishing.plots.style import omit_wide_intervals
 
 
-def history_points(past: HistoryTable, course: ColumnStatistics, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
-    """Return the Unix times [m] of the points, and their value, lo and hi [m, 3].
+def history_points(past: HistoryTable, column: ColumnStatistics, lo: Floats, hi: Floats) -> tuple[Floats, Floats]:
+    """Return Unix times, shape [m], and values with interval ends, shape [m, 3], of the points to draw.
 
-    A row of NaN marks each gap and the end, so that the line is interrupted there.
+    A row of NaN interrupts the line at the end and where buckets are missing.
 
     Parameters
     ----------
     past
         History that contains the p buckets.
-    course
+    column
         Statistics of a number in each bucket.
     lo, hi
         Ends of the interval of each last value, shape [p]; NaN if there is none.
     """
     start_s, width_s = past.start_s.astype(np.float64), past.width_s.astype(np.float64)
     newest_s = start_s + width_s
-    lo, hi = omit_wide_intervals(course.last, lo, hi)
-    ends = [np.fmin(lo, course.last), np.fmax(hi, course.last)]
-    parts = [_rows(newest_s, course.last, lo, hi, np.isfinite(course.last))]
-    parts.append(_rows(start_s + width_s / 3.0, course.low, lo, hi, course.low < ends[0]))
-    parts.append(_rows(start_s + width_s / 1.5, course.high, lo, hi, course.high > ends[1]))
+    lo, hi = omit_wide_intervals(column.last, lo, hi)
+    ends = [np.fmin(lo, column.last), np.fmax(hi, column.last)]
+    parts = [_rows(newest_s, column.last, lo, hi, np.isfinite(column.last))]
+    parts.append(_rows(start_s + width_s / 3.0, column.low, lo, hi, column.low < ends[0]))
+    parts.append(_rows(start_s + width_s / 1.5, column.high, lo, hi, column.high > ends[1]))
     missing = np.full(start_s.size, np.nan)
     broken = np.append(past.start_s[1:] > past.end_s[:-1], True)
-    broken |= ~np.isfinite(course.last)
+    broken |= ~np.isfinite(column.last)
     parts.append(_rows(newest_s + 1e-3, missing, missing, missing, broken))
     table = np.concatenate(parts)
     table = table[np.argsort(table[:, 0], kind="stable")]
@@ -44,5 +44,5 @@ def history_points(past: HistoryTable, course: ColumnStatistics, lo: Floats, hi:
 def _rows(
     t_s: Floats, value: Floats, lo: Floats, hi: Floats, there: "np.ndarray[tuple[int], np.dtype[np.bool_]]"
 ) -> Floats:
-    """Return the rows for which ``there`` is True, as time, value, lo and hi, shape [rows, 4]."""
+    """Return the selected points as rows of time, value and interval ends, shape [rows, 4]."""
     return np.column_stack([t_s, value, lo, hi])[there]

@@ -1,7 +1,4 @@
-"""Text of the panels of the viewer as Markdown: health, current noise, and tables of devices.
-
-The functions do no I/O, so the text can be tested without a viewer.
-"""
+"""Text of the viewer panels as Markdown, with health, noise coefficients and tables of devices."""
 
 import math
 import re
@@ -42,7 +39,7 @@ STATE_TEXTS: Final = {
 
 
 def health_text(device: str, health: Health, about: str = "") -> str:
-    """Return the health panel of one device.
+    """Return the health panel of one device as Markdown.
 
     Parameters
     ----------
@@ -85,12 +82,12 @@ def overview_text(healths: Mapping[str, Health]) -> str:
 
 
 def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: str = "") -> str:
-    """Return a table of many devices, below a line with the number of devices in each state.
+    """Return a table of many devices and the number of devices in each state.
 
     Parameters
     ----------
     devices
-        Devices in the order of their rows.
+        Devices in the order of the rows.
     now_s
         Current time on the clock of the messages [s].
     rows
@@ -112,10 +109,9 @@ def fleet_text(devices: Sequence[RemoteDevice], now_s: float, rows: int, note: s
 
 
 def _fleet_row(one: RemoteDevice, now_s: float) -> str:
-    """Return the row of one device in the table of many devices."""
     state, status = one.state(now_s), one.status
     name = _escape_cell(one.key)
-    state_text = f"**{state.upper()}**" if one.rank(now_s) == 0 else _escape_cell(state)
+    state_text = f"**{state.upper()}**" if one.display_rank(now_s) == 0 else _escape_cell(state)
     noise = [
         "" if one.coefficients is None else format_coefficient(one.coefficients.coefficients, "N", axis).value
         for axis in FLEET_AXES
@@ -123,7 +119,7 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
     if status is None:
         return f"| **{name}** | {state_text} | | | | | {' | '.join(noise)} | no data yet |"
     rate = format_sample_rate(status.rate_hz)
-    problems = _escape_cell(one.problems()) or (
+    problems = _escape_cell(one.describe_problems()) or (
         f"no data for {now_s - one.last_message_s:.1f} s" if state in ("gone", "silent") else ""
     )
     counts = f"{status.received:,} | {status.lost:,} | {status.bad:,}"
@@ -131,12 +127,12 @@ def _fleet_row(one: RemoteDevice, now_s: float) -> str:
 
 
 def _escape_cell(text: str) -> str:
-    """Escape text of another process, so that the text cannot end a table cell or form a link or an image."""
+    """Escape text of another process, which could otherwise end a table cell or form a link."""
     return re.sub(r"([\\`*_\[\]<>!|#])", r"\\\1", remove_control_characters(text))
 
 
 def noise_text(estimate: Estimate) -> str:
-    """Return the tables of Q, N, B, K and R, one for each kind of sensor of the device."""
+    """Return tables of Q, N, B, K and R for each kind of sensor."""
     present = [axis for _, axis in measured_axes(estimate.curve)]
     tables = [_noise_table(estimate, kind) for kind in KINDS if set(axes_of(kind)) & set(present)]
     if not tables:
@@ -147,7 +143,7 @@ def noise_text(estimate: Estimate) -> str:
 
 
 def drift_text(update: DriftUpdate) -> str:
-    """Return a table of the drift models of the gyroscopes and the drift that is currently removed."""
+    """Return a table of the drift models of the gyroscopes and the currently removed drift."""
     unit = DEVIATION_UNITS["gyro"]
     rows = ["| axis | drift now | model | φ₁ | φ₂ | θ₁ |", "|---|---|---|---|---|---|"]
     for at, axis in enumerate(axes_of("gyro")):
@@ -171,12 +167,11 @@ def drift_text(update: DriftUpdate) -> str:
 
 
 def _coefficients_in_model(model: ArmaModel) -> tuple[bool, bool, bool]:
-    """Return which of φ₁, φ₂ and θ₁ are part of the model."""
+    """Return flags that state whether φ₁, φ₂ and θ₁ are part of the ARMA model."""
     return model.order[0] > 0, model.order[0] > 1, model.order[1] > 0
 
 
 def _noise_table(estimate: Estimate, kind: Kind) -> str:
-    """Return the table of the coefficients of all axes of one kind of sensor."""
     axes = axes_of(kind)
     lines = [f"| {KIND_NAMES[kind]} | {' | '.join(axes)} |", "|:--|" + "--:|" * len(axes)]
     for symbol in SYMBOLS:

@@ -1,14 +1,11 @@
-"""Live view in Rerun. Results from the main loop of the service are drawn in a separate thread.
+"""Live view in Rerun, which draws results of the main loop in a separate thread.
 
-``put`` adds a result to a bounded queue and returns at once. The thread opens the viewer, draws new data five times a
-second, and checks once a second that the data have reached the viewer. If the viewer does not answer, the state is
-``stalled``: drawing waits, the queue drops its oldest entries, and ``state`` reports their number. If the viewer is
-missing, cannot start or was closed, ``state`` gives the reason and the attempt is repeated. No exception reaches the
-main loop.
+``put`` adds a result to a bounded queue and returns at once. If the viewer does not answer, ``state`` reports
+``stalled`` and the queue drops the oldest results. If the viewer is missing, cannot start or was closed, ``state``
+reports the reason and the thread repeats the attempt.
 
-Three properties of Rerun determine this design. A logging call blocks without limit if the viewer does not read. The
-exit handler of Rerun may block in the same way and is therefore removed. Freeing a stream may also block, so streams
-are never freed (see ``sinks``). The import of Rerun takes half a second and is done in the thread.
+A logging call of Rerun blocks without limit if the viewer does not read. The exit handler of Rerun may also block and
+is therefore removed. The import of Rerun takes half a second and is therefore done in the thread.
 """
 
 import importlib
@@ -23,19 +20,19 @@ from typing import TYPE_CHECKING, Any, Final
 from monitor.history.history_table import HistoryTable
 from monitor.publishing.bounded_queue import BoundedQueue
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerClosed, ViewerError, ViewerSettings
-from monitor.publishing.result_kinds import RESULT_KINDS, Drawing, TimedResult, kind_of
+from monitor.publishing.result_kinds import RESULT_KINDS, DrawingRule, TimedResult, kind_of
 
 if TYPE_CHECKING:
-    from monitor.publishing.rerun.sinks import Output, ViewerProcess
+    from monitor.publishing.rerun.sinks import RerunOutput, ViewerProcess
     from monitor.publishing.rerun.viewer_content import Scene
 
-BACKLOG_BYTES: Final = 16_000_000  # about 25 s of 16 devices at 1 kHz with six axes
+BACKLOG_BYTES: Final = 16_000_000  # holds about 25 s of samples of 16 six-axis devices at 1 kHz
 CONFIRM_PERIOD_S: Final = 1.0  # interval between checks that drawn data have reached the viewer
-PATIENCE_S: Final = 1.0  # timeout of this check
-STALL_TIMEOUT_S: Final = 2.0  # a viewer is stalled if one Rerun call takes longer
+PATIENCE_S: Final = 1.0  # timeout of a check for delivery
+STALL_TIMEOUT_S: Final = 2.0  # longest duration of a Rerun call before the viewer is stalled
 RETRY_S: Final = (2.0, 5.0, 15.0, 30.0)
-PLOTS_PER_S: Final = 8.0  # rate of Allan plots, shared by all devices; at most one per second and device
-MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window that closes sooner does not work on this host
+PLOTS_PER_S: Final = 8.0  # total rate of Allan plots of all devices
+MIN_WINDOW_LIFETIME_S: Final = 10.0  # a window with a shorter lifetime does not work on this host
 MISSING: Final = 'rerun-sdk is not installed: pip install "imu-monitor[viewer]"'
 
 HistorySource = Callable[[str], HistoryTable | None]
@@ -43,7 +40,7 @@ HistorySource = Callable[[str], HistoryTable | None]
 
 
 class RerunView:
-    """Viewer of all devices. Only one thread may use it. Every call returns at once.
+    """Viewer of all devices. Every call returns at once, and only one thread may use the viewer.
 
     Parameters
     ----------
@@ -52,9 +49,9 @@ class RerunView:
     devices
         Devices to show in detail.
     history_source
-        Function that returns the stored history of a device. The thread of the viewer calls this function.
+        Function that returns the stored history of a device. The viewer thread calls the function.
     fleet
-        True if further devices are shown only in a ``DeviceTableText``.
+        True if the device table also contains devices that are not shown in detail.
     """
 
     def __init__(
@@ -87,7 +84,7 @@ class RerunView:
         return self._phase
 
     def start(self) -> None:
-        """Start the thread. Errors are reported in ``state`` and the attempt is repeated."""
+        """Start the thread of the viewer."""
         if self._settings.mode == "none" or self._thread is not None:
             return
         self._phase = "starting"
@@ -95,11 +92,11 @@ class RerunView:
         self._thread.start()
 
     def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
-        """Set the devices to show in detail. A device must be set before its first result is passed."""
+        """Set the devices to show in detail. Call this method before the first result of a new device."""
         self._devices = tuple(devices)
 
     def put(self, device: str, unix_s: float, result: Any) -> None:
-        """Draw a result.
+        """Queue a result to be drawn.
 
         Parameters
         ----------
@@ -123,14 +120,13 @@ class RerunView:
         thread.join(0.75 * timeout_s)
         child = self._child
         if thread.is_alive() and child is not None:
-            child.kill()  # ends the wait of the thread for a viewer that does not respond
+            child.kill()  # unblocks the thread if the viewer does not respond
         thread.join(0.25 * timeout_s)
         self._phase = "closed"
 
     # ---- methods of the thread ----
 
     def _run(self) -> None:
-        """Open the viewer and draw until closed. Reopen the viewer after a failure."""
         settings, attempt = self._settings, 0
         while not self._closing.is_set():
             started = time.monotonic()
@@ -144,14 +140,14 @@ class RerunView:
                 self._phase = str(trouble)
             except ImportError as missing:
                 self._phase = MISSING if missing.name in ("rerun", "rerun_cli", "rerun_bindings") else str(missing)
-            except Exception as error:  # noqa: BLE001 - reported in state; a drawing error must not end the view
+            except Exception as error:  # noqa: BLE001 - the state reports the error, and the view continues
                 self._phase = f"{type(error).__name__}: {error}"
             settings, attempt = self._wait_and_select_mode(settings, started, attempt)
 
     def _wait_and_select_mode(
         self, settings: ViewerSettings, started: float, attempt: int
     ) -> tuple[ViewerSettings, int]:
-        """Wait before the next attempt. If a window does not work on this host, use the web page instead."""
+        """Wait before the next attempt, and select the web page if windows fail on this host."""
         self._stalled, self._inside_since, self.url = False, None, ""
         lived_s = time.monotonic() - started
         if self._closing.is_set():
@@ -163,7 +159,6 @@ class RerunView:
         return settings, attempt
 
     def _show(self, settings: ViewerSettings) -> None:
-        """Open a viewer and draw until the viewer ends."""
         from monitor.publishing.rerun import sinks
         from monitor.publishing.rerun import viewer_content as rerun_scene
 
@@ -176,8 +171,7 @@ class RerunView:
             self._child = None
             output.close()
 
-    def _send_layout(self, output: "Output", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
-        """Send the layout for the devices and create their entities."""
+    def _send_layout(self, output: "RerunOutput", scene: "Scene", devices: Sequence[DeviceInfo]) -> None:
         from monitor.publishing.rerun import blueprint
 
         layout = blueprint.blueprint(devices, self._fleet)
@@ -186,24 +180,22 @@ class RerunView:
         self._phase = f"ok, but {output.note}" if output.note else "ok"
 
     def _draw_history(self, scene: "Scene", device: str) -> None:
-        """Draw the stored history of a device before its live data."""
         self._inside_since = None  # a slow disk must not count as a stalled viewer
         past = self._history_source(device)
         self._inside_since = time.monotonic()
         if past is not None:
             scene.draw_history(device, past)
 
-    def _draw(self, output: "Output", scene: "Scene") -> None:
-        """Draw new data until closed. Raise ViewerError if the viewer has ended."""
+    def _draw(self, output: "RerunOutput", scene: "Scene") -> None:
         waiting = _WaitingResults()
         shown: tuple[DeviceInfo, ...] | None = None
         begun: set[str] = set()
         checked = time.monotonic()
         while True:
             closing = self._closing.is_set()
-            waiting.add(
+            waiting.add_results(
                 self._backlog.take(0.0)
-            )  # before the devices are read, so that the device of each result is known
+            )  # taken before the devices are read, so that the device of each result is known
             self._inside_since = time.monotonic()
             if self._devices is not shown:
                 shown = self._devices
@@ -212,7 +204,7 @@ class RerunView:
                 for device in [one.name for one in shown if one.name not in begun]:
                     begun.add(device)
                     self._draw_history(scene, device)
-            waiting.draw(scene, everything=closing)
+            waiting.draw_due_results(scene, draw_all=closing)
             now = time.monotonic()
             if closing or now - checked > CONFIRM_PERIOD_S:
                 self._confirm(output)
@@ -223,8 +215,8 @@ class RerunView:
             output.check_viewer()
             self._closing.wait(output.flush_every_s)
 
-    def _confirm(self, output: "Output") -> None:
-        """Wait until all drawn data have reached the viewer. This limits the data held by Rerun to one second."""
+    def _confirm(self, output: "RerunOutput") -> None:
+        """Wait until the viewer has received all drawn data, which limits the memory use of Rerun."""
         while not output.confirm_delivery(PATIENCE_S):
             self._stalled = not self._closing.is_set()
             output.check_viewer()
@@ -234,36 +226,32 @@ class RerunView:
 
 
 class _WaitingResults:
-    """Results that wait for their next drawing."""
-
     def __init__(self) -> None:
         self.period_factor = 1.0  # factor for the periods of drawings whose rate the devices share
-        self._waiting: dict[Drawing, dict[str, list[TimedResult]]] = {
+        self._waiting: dict[DrawingRule, dict[str, list[TimedResult]]] = {
             drawing: {} for kind in RESULT_KINDS for drawing in kind.drawings
         }
-        self._drawn_s: dict[tuple[Drawing, str], float] = {}  # monotonic time of the last drawing of a device [s]
+        self._drawn_s: dict[tuple[DrawingRule, str], float] = {}  # monotonic time of the last drawing of a device [s]
 
-    def add(self, results: Sequence[tuple[str, float, Any]]) -> None:
-        """Add results, given by device, Unix time [s] and result."""
+    def add_results(self, results: Sequence[tuple[str, float, Any]]) -> None:
         for device, unix_s, result in results:
             for drawing in kind_of(result).drawings:
                 drawing.merge(self._waiting[drawing].setdefault(device, []), (unix_s, result))
 
-    def draw(self, scene: "Scene", everything: bool) -> None:
-        """Draw the results whose period has passed, or all results if ``everything`` is True."""
+    def draw_due_results(self, scene: "Scene", draw_all: bool) -> None:
         for drawing, devices in self._waiting.items():
             period_s = drawing.period_s * (self.period_factor if drawing.shares_rate else 1.0)
             for device in list(devices):
                 now_s = time.monotonic()
-                if everything or now_s - self._drawn_s.get((drawing, device), float("-inf")) >= period_s:
+                if draw_all or now_s - self._drawn_s.get((drawing, device), float("-inf")) >= period_s:
                     self._drawn_s[drawing, device] = now_s
                     scene.draw(device, drawing.panel, devices.pop(device))
 
 
 def _load_rerun() -> None:
-    """Import Rerun and remove its exit handler, which waits without limit for a viewer that does not answer.
+    """Import Rerun and remove the exit handler of Rerun, which may block without limit.
 
-    Rerun reads RUST_LOG at import. By default its log would report every closed viewer as an error of this process.
+    Rerun reads RUST_LOG at import and would otherwise report every closed viewer as an error.
     """
     given = os.environ.get("RUST_LOG")
     os.environ["RUST_LOG"] = given or "off"

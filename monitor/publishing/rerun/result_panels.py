@@ -1,6 +1,6 @@
-"""Panels of the Rerun viewer. Each panel draws one kind of result of one device.
+"""Panels of the Rerun viewer, each of which draws one kind of result of one device.
 
-The kinds of results are listed in ``monitor.publishing.result_kinds``. Importing this module imports Rerun.
+``monitor.publishing.result_kinds`` lists the kinds of results. Importing this module imports Rerun.
 """
 
 from collections.abc import Sequence
@@ -37,7 +37,7 @@ from monitor.publishing.rerun import history_points as past_points
 from monitor.publishing.rerun.allan_history_table import AllanHistory
 from monitor.publishing.rerun.decimation import average_buckets, decimate_extremes
 from monitor.publishing.rerun.panel_text import drift_text, health_text, noise_text, overview_text
-from monitor.publishing.rerun.shared_views import RAW_SAMPLES_S, markdown, temperature_view, time_series_view
+from monitor.publishing.rerun.shared_views import RAW_SAMPLES_S, markdown_document, temperature_view, time_series_view
 from monitor.publishing.rerun.viewer_settings import DeviceInfo
 
 if TYPE_CHECKING:
@@ -46,8 +46,7 @@ if TYPE_CHECKING:
 
 TEMPERATURES_PER_S: Final = 5.0
 MAX_INTERMEDIATE_POINTS: Final = 20
-"""Number of points between two estimates if the estimator provides coefficients for every sample. More points could not
-be distinguished and would overload the viewer."""
+"""Largest number of points between two estimates. More points would overload the viewer."""
 MAX_PAST_EVENTS: Final = 200
 """Largest number of stored events that are shown."""
 WARNING_EVENTS: Final = frozenset({
@@ -64,7 +63,7 @@ WARNING_EVENTS: Final = frozenset({
 
 
 class Panel:
-    """Part of the viewer that draws one kind of result of one device.
+    """Base class of the panels that draw one kind of result of one device.
 
     Parameters
     ----------
@@ -98,7 +97,7 @@ class Panel:
 
     @classmethod
     def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
-        """Return the layout of a separate tab, or None if the panel is part of another tab."""
+        """Return the layout of a separate tab, or None if the panel has no tab."""
         return None
 
     def entity_path(self, name: str) -> str:
@@ -106,20 +105,18 @@ class Panel:
         return f"{self.device}/{name}"
 
     def _style_lines(self, name: str, lines: Sequence[tuple[str, Colour, float]]) -> None:
-        """Log the name, colour and width of each time series of an entity."""
         names, line_colours, widths = zip(*lines, strict=True)
         self.scene.log(
             self.entity_path(name), rr.SeriesLines(colors=line_colours, widths=widths, names=names), static=True
         )
 
     def _style_samples(self, name: str, axes: Sequence[str]) -> None:
-        """Log the styles of the time series of samples."""
         for axis in axes:
             line = (f"{axis}, {SAMPLE_UNITS[sensor_kind(axis)].name}", colours.AXIS_COLOURS[axis], 1.0)
             self._style_lines(f"{name}/{axis}", [line])
 
     def _log_samples(self, name: str, axes: Sequence[str], results: "Sequence[SampleRows | CompensatedRows]") -> Floats:
-        """Log decimated time series of samples, and return the times of all samples."""
+        """Log decimated samples, and return the times of all samples."""
         times, values = np.concatenate([one.unix_s for one in results]), np.concatenate([one.values for one in results])
         for i, axis in enumerate(axes):
             t, y = decimate_extremes(times, values[:, i])
@@ -128,21 +125,20 @@ class Panel:
         return times
 
     def _log_text(self, name: str, unix_s: float, text: str) -> None:
-        """Log a Markdown text at a Unix time [s]."""
-        self.scene.set_time(unix_s)
-        self.scene.log(self.entity_path(name), markdown(text))
+        self.scene.set_log_time(unix_s)
+        self.scene.log(self.entity_path(name), markdown_document(text))
 
 
 class SamplesPanel(Panel):
-    """Time series of the temperature and of the samples, with at most 200 rows per second and axis."""
+    """Time series of temperature and decimated samples."""
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         self._style_samples("samples", AXES)
         self._style_lines("temperature", [("temperature, °C", colours.TEMPERATURE, 1.5)])
 
     def draw(self, unix_s: Floats, results: "Sequence[SampleRows]") -> None:
-        """Draw the results."""
+        """Draw samples."""
         times = self._log_samples("samples", AXES, results)
         temperature_c = np.concatenate([one.temperature_c for one in results])
         self.scene.log_scalars(
@@ -150,7 +146,7 @@ class SamplesPanel(Panel):
         )
 
     def draw_history(self, history: HistoryTable) -> None:
-        """Draw the stored history."""
+        """Draw the stored temperature."""
         temperature = history.column("temperature")
         if np.isfinite(temperature.last).any():
             at, values = past_points.history_points(history, temperature, temperature.last, temperature.last)
@@ -158,32 +154,32 @@ class SamplesPanel(Panel):
 
 
 class CompensatedPanel(Panel):
-    """Time series of the angular rates without drift, decimated like the samples."""
+    """Time series of the angular rates after drift removal, decimated for display."""
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         self._style_samples("compensated", axes_of("gyro"))
 
     def draw(self, unix_s: Floats, results: "Sequence[CompensatedRows]") -> None:
-        """Draw the results."""
+        """Draw compensated angular rates."""
         self._log_samples("compensated", axes_of("gyro"), results)
 
 
 class DriftPanel(Panel):
-    """Means at rest, predicted drift, innovations, and a table of the drift models."""
+    """Time series of the gyroscope drift, with a table of the drift models."""
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         unit = DEVIATION_UNITS["gyro"].name
         for axis in axes_of("gyro"):
-            colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
+            colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
             lines = [(f"{axis} at rest, {unit}", dim, 0.75), (f"{axis} expected", colours.TEXT, 1.5)]
             lines += [(f"{axis} 95 % low", colour, 1.0), (f"{axis} 95 % high", colour, 1.0)]
             self._style_lines(f"drift/{axis}", lines)
             self._style_lines(f"innovation/{axis}", [(f"{axis}, σ", colour, 1.0)])
 
     def draw(self, unix_s: Floats, results: Sequence[DriftUpdate]) -> None:
-        """Draw the results."""
+        """Draw updates of the drift models."""
         for i, axis in enumerate(axes_of("gyro")):
             expected = np.array([one.expected[i] for one in results])
             half = Z95 * np.array([one.error[i] for one in results])
@@ -197,7 +193,7 @@ class DriftPanel(Panel):
 
     @classmethod
     def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
-        """Return the tab if the device has results of this kind."""
+        """Return the drift tab if the drift of the device is compensated."""
         if not device.compensated:
             return None
         name = device.name
@@ -216,12 +212,12 @@ class DriftPanel(Panel):
 
 
 class ThermalPanel(Panel):
-    """Mean bias of each axis, and its one-step prediction with the interval that events are based on."""
+    """Mean bias of each axis, and the one-step prediction with the interval that triggers events."""
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         for axis in AXES:
-            colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
+            colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
             unit = DEVIATION_UNITS[sensor_kind(axis)].name
             lines = [(f"{axis} bias, {unit}", colour, 2.0), (f"{axis} expected", colours.TEXT, 1.0)]
             self._style_lines(
@@ -229,7 +225,7 @@ class ThermalPanel(Panel):
             )
 
     def draw(self, unix_s: Floats, results: Sequence[ThermalIntervalResult]) -> None:
-        """Draw the results."""
+        """Draw measured and predicted biases."""
         for axis in AXES:
             rows = np.array([self._row(one.axes.get(axis)) for one in results])
             if np.isfinite(rows).any():
@@ -238,14 +234,14 @@ class ThermalPanel(Panel):
 
     @staticmethod
     def _row(one: PredictedAxisInterval | None) -> tuple[float, float, float, float]:
-        """Return measured bias, predicted bias, and the ends of its interval."""
+        """Return the measured bias, the predicted bias and the ends of the prediction interval."""
         if one is None or one.one_step is None:
             return (np.nan if one is None else one.bias), np.nan, np.nan, np.nan
         return one.bias, one.one_step.bias, one.one_step.lo, one.one_step.hi
 
     @classmethod
     def tab_layout(cls, device: DeviceInfo) -> rrb.Container | None:
-        """Return the tab if the device has results of this kind."""
+        """Return the thermal tab if the bias of the device is predicted from temperature."""
         if not device.has_thermal:
             return None
         columns = []
@@ -258,18 +254,18 @@ class ThermalPanel(Panel):
 
 
 class GapPanel(Panel):
-    """Gap between measurement and noise model over time. The next Allan plot also draws the model."""
+    """Time series of the difference between measurement and noise model."""
 
     newest: ModelGap | None = None
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         for axis in AXES:
             self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", colours.AXIS_COLOURS[axis], 1.5)])
-        self._style_lines("gap/threshold", [("threshold", colours.blend(colours.TEXT, 0.6), 1.0)])
+        self._style_lines("gap/threshold", [("threshold", colours.blend_colours(colours.TEXT, 0.6), 1.0)])
 
     def draw(self, unix_s: Floats, results: Sequence[ModelGap]) -> None:
-        """Draw the results."""
+        """Draw comparisons with the noise model."""
         self.newest = results[-1]
         highest = [max((axis.threshold for axis in one.axes.values()), default=np.nan) for one in results]
         self.scene.log_scalars(self.entity_path("gap/threshold"), unix_s, np.array(highest))
@@ -280,7 +276,7 @@ class GapPanel(Panel):
 
 
 class AllanPanel(Panel):
-    """Allan plots, the table of coefficients, and the heat map of the Allan deviation over time."""
+    """Allan plots, tables of coefficients, and heat maps of the Allan deviation over time."""
 
     def __init__(self, scene: "Scene", device: str) -> None:
         super().__init__(scene, device)
@@ -288,21 +284,21 @@ class AllanPanel(Panel):
         self._history = AllanHistory()
 
     def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
-        """Draw the results."""
+        """Draw the newest estimate."""
         at_s, estimate = float(unix_s[-1]), results[-1]
         self._log_text("coefficients", at_s, noise_text(estimate))
-        self._plot.draw(estimate, self.scene.panel(self.device, GapPanel).newest)
+        self._plot.draw(estimate, self.scene.get_or_create_panel(self.device, GapPanel).newest)
         if self._history.add_estimate(at_s, estimate):
             dynamic_heat_map.draw_heat_maps(self.scene.log, self.entity_path("dynamic"), self._history)
 
 
 class CoefficientsPanel(Panel):
-    """Time series of the coefficients. Only the points of an estimate have intervals."""
+    """Time series of the noise coefficients with intervals."""
 
     def log_styles(self) -> None:
-        """Log the styles of the lines."""
+        """Log the names, colours and widths of the lines."""
         for axis in AXES:
-            colour, dim = colours.AXIS_COLOURS[axis], colours.blend(colours.AXIS_COLOURS[axis], 0.45)
+            colour, dim = colours.AXIS_COLOURS[axis], colours.blend_colours(colours.AXIS_COLOURS[axis], 0.45)
             for symbol in SYMBOLS:
                 unit = COEFFICIENT_UNITS[sensor_kind(axis)][symbol].name
                 lines = [(f"{axis}, {unit}", colour, 2.0), (f"{axis} 95 % low", dim, 0.75)]
@@ -313,7 +309,7 @@ class CoefficientsPanel(Panel):
                 self.scene.log(self.entity_path(f"coefficients/{symbol}/{axis}/changed"), mark, static=True)
 
     def draw(self, unix_s: Floats, results: Sequence[Estimate]) -> None:
-        """Draw the results."""
+        """Draw the coefficients of estimates."""
         parts = [_points_until(at_s, estimate) for at_s, estimate in zip(unix_s.tolist(), results, strict=True)]
         times, values = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
         for row, symbol in enumerate(SYMBOLS):
@@ -322,7 +318,7 @@ class CoefficientsPanel(Panel):
                     self.log_coefficient(symbol, axis, times, values[:, row, column])
 
     def draw_history(self, history: HistoryTable) -> None:
-        """Draw the stored history."""
+        """Draw the stored coefficients."""
         for symbol in SYMBOLS:
             for axis in history.axes():
                 value, lo, hi = (history.column(f"{axis}.{symbol}{end}") for end in ("", ".lo", ".hi"))
@@ -331,7 +327,7 @@ class CoefficientsPanel(Panel):
                     self.log_coefficient(symbol, axis, at, values)
 
     def log_coefficient(self, symbol: str, axis: str, unix_s: Floats, values: Floats, name: str = "") -> None:
-        """Log a coefficient over time.
+        """Log a noise coefficient over time.
 
         Parameters
         ----------
@@ -342,7 +338,7 @@ class CoefficientsPanel(Panel):
         unix_s
             Unix times [s], shape [n].
         values
-            Values, shape [n], or values with the ends of their intervals, shape [n, 3]; SI.
+            Values, shape [n], or values with interval ends, shape [n, 3], in SI units.
         name
             End of the name of the entity.
         """
@@ -351,14 +347,14 @@ class CoefficientsPanel(Panel):
 
 
 class EventsPanel(Panel):
-    """Log of the events of a device and of all devices. A diamond marks the new value of a changed coefficient."""
+    """Log of events. A diamond marks the new value of a changed coefficient."""
 
     def draw(self, unix_s: Floats, results: Sequence[Event]) -> None:
-        """Draw the results."""
+        """Log events and mark changed coefficients."""
         for at_s, event in zip(unix_s.tolist(), results, strict=True):
             level = "ERROR" if event.kind == "link_lost" else "WARN" if event.kind in WARNING_EVENTS else "INFO"
-            clock_time = format_utc(at_s)[-8:]  # the date column of the viewer is too narrow for the time
-            self.scene.set_time(at_s)
+            clock_time = format_utc(at_s)[-8:]  # the time column of the viewer is too narrow for the time of day
+            self.scene.set_log_time(at_s)
             if self.scene.fleet or len(self.scene.devices) > 1:
                 line = rr.TextLog(f"{clock_time}  {self.device}: {event.text}", level=level)
                 self.scene.log("overview/events", line)
@@ -367,16 +363,15 @@ class EventsPanel(Panel):
                 self._mark_changes(at_s, event)
 
     def draw_history(self, history: HistoryTable) -> None:
-        """Draw the stored history."""
+        """Log the stored events."""
         for one in history.events[-MAX_PAST_EVENTS:]:
-            text = f"{format_utc(one.t_s)[:10]}: {one.text}"  # a log line otherwise shows only the time of day
+            text = f"{format_utc(one.t_s)[:10]}: {one.text}"  # a log line shows only the time of day
             self.draw(np.array([one.t_s]), [Event(one.kind, round(one.t_s * 1e9), text, one.axis, one.what)])
 
     def _mark_changes(self, unix_s: float, event: Event) -> None:
-        """Mark the new values of changed coefficients."""
         if event.axis is None:
             return
-        coefficients = self.scene.panel(self.device, CoefficientsPanel)
+        coefficients = self.scene.get_or_create_panel(self.device, CoefficientsPanel)
         for symbol, sides in event.values.items():
             if symbol in SYMBOLS and "after" in sides:
                 at, after = np.array([unix_s]), np.array([sides["after"]])
@@ -384,28 +379,30 @@ class EventsPanel(Panel):
 
 
 class HealthPanel(Panel):
-    """Health of the device, and the table of all devices."""
+    """Health of the device. The panel also updates the table of all devices."""
 
     def draw(self, unix_s: Floats, results: Sequence[Health]) -> None:
-        """Draw the results."""
+        """Draw the newest health of the device."""
         at_s, health, devices = float(unix_s[-1]), results[-1], self.scene.devices
         if self.device in devices:
             self.scene.healths[self.device] = health
         about = devices[self.device].about if self.device in devices else ""
         self._log_text("status", at_s, health_text(self.device, health, about))
         if len(devices) > 1 and not self.scene.fleet:
-            self.scene.panel("", DeviceTablePanel).log_device_table(at_s, overview_text(self.scene.healths))
+            self.scene.get_or_create_panel("", DeviceTablePanel).log_device_table(
+                at_s, overview_text(self.scene.healths)
+            )
 
 
 class DeviceTablePanel(Panel):
     """Table of all devices."""
 
     def draw(self, unix_s: Floats, results: "Sequence[DeviceTableText]") -> None:
-        """Draw the results."""
+        """Draw the newest table of devices."""
         self.log_device_table(float(unix_s[-1]), results[-1].text)
 
     def log_device_table(self, unix_s: float, text: str) -> None:
-        """Log the table.
+        """Log the table of devices.
 
         Parameters
         ----------
@@ -414,14 +411,14 @@ class DeviceTablePanel(Panel):
         text
             Table as Markdown.
         """
-        self.scene.set_time(unix_s)
-        self.scene.log("overview", markdown(text))
+        self.scene.set_log_time(unix_s)
+        self.scene.log("overview", markdown_document(text))
 
 
 def _points_until(unix_s: float, estimate: Estimate) -> tuple[Floats, Floats]:
-    """Return times [n] and coefficients with interval ends [n, 5, 6, 3] since the previous estimate.
+    """Return times [n] and coefficients [n, 5, 6, 3] since the previous estimate.
 
-    Only the newest coefficients have intervals.
+    Only the newest coefficients have confidence intervals.
     """
     c, history = estimate.coefficients, estimate.history
     newest = np.stack([c.value, *omit_wide_intervals(c.value, c.lo, c.hi)], axis=-1)

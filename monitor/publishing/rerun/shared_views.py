@@ -1,4 +1,4 @@
-"""Parts of a Rerun layout that several panels and reports use. Importing this module imports Rerun."""
+"""Views of a Rerun layout that several panels and reports use. Importing this module imports Rerun."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
@@ -23,7 +23,7 @@ def time_series_view(
     legend: bool = False,
     styles: Mapping[Any, rr.SeriesLines] | None = None,
 ) -> rrb.TimeSeriesView:
-    """Return a view of time series up to the cursor.
+    """Return a view of time series that ends at the time cursor.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ def time_series_view(
 
 
 def drawing_view(origin: str, name: str, contents: Any, x_range: Sequence[float], y_range: Sequence[float]) -> rrb.View:
-    """Return a view of a drawing in chart units.
+    """Return a view of a two-dimensional drawing in chart units.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def drawing_view(origin: str, name: str, contents: Any, x_range: Sequence[float]
 
 
 def collapsed_blueprint(root: rrb.Container, timeline: str) -> rrb.Blueprint:
-    """Return a layout with collapsed panels around ``root``, which follows a timeline."""
+    """Return a layout with collapsed side panels and the given timeline."""
     return rrb.Blueprint(
         root,
         rrb.BlueprintPanel(state="collapsed"),
@@ -85,7 +85,7 @@ def collapsed_blueprint(root: rrb.Container, timeline: str) -> rrb.Blueprint:
     )
 
 
-def markdown(text: str) -> rr.TextDocument:
+def markdown_document(text: str) -> rr.TextDocument:
     """Return a Markdown document."""
     return rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
 
@@ -96,12 +96,11 @@ def temperature_view(device: str) -> rrb.TimeSeriesView:
 
 
 def _before_cursor(seconds: float) -> rrb.TimeAxis:
-    """Return a time axis of the last seconds, with space on the right for a tick label at the cursor."""
+    """Return a time axis of the last seconds, with space for a tick label at the cursor."""
     first, last = (rr.TimeRangeBoundary.cursor_relative(seconds=s) for s in (-seconds, HALF_LABEL_SHARE * seconds))
     return rrb.TimeAxis(view_range=rr.TimeRange(first, last))
 
 
 def _until_cursor() -> rrb.TimeAxis:
-    """Return a time axis from the beginning to the cursor."""
     now = rr.TimeRangeBoundary.cursor_relative()
     return rrb.TimeAxis(view_range=rr.TimeRange(rr.TimeRangeBoundary.infinite(), now))

@@ -1,13 +1,11 @@
-"""Outputs of a Rerun stream: a viewer window, a page in the browser, or a file.
+"""Outputs of a Rerun stream, which are a viewer window, a web page or a file.
 
-``open_output`` returns an ``Output``: a Rerun stream and the child process that belongs to it. The message of a
-``ViewerError`` states the problem in one line, and the caller repeats the attempt later. The viewer program is started
-directly, because its Python wrapper would leave the program running when killed. The program listens on the loopback
-interface only, and usage statistics are off. For the daemon, a window and a page are both a Rerun server in a separate
-process. The data of the viewer therefore do not use the memory of the daemon. Importing this module imports Rerun.
+A window and a web page use a Rerun server in a separate process, so that viewer data do not use the memory of the
+daemon. The viewer program is started directly, because the Python wrapper would leave the program running when killed.
+The program listens only on the loopback interface and sends no usage statistics.
 
-Rerun raises no error for a port that is in use, so ports are checked first. If a Rerun server listens on the port, this
-server is used instead of a new window. Any other listener is an error. The web page uses the next free port.
+Rerun raises no error for a port in use, so ports are checked first. A window joins a Rerun server that already listens
+on the port. If the port of the web page is in use, the next free port is used. Importing this module imports Rerun.
 """
 
 import contextlib
@@ -38,11 +36,11 @@ from monitor.publishing.rerun.viewer_settings import ViewerClosed, ViewerError, 
 
 LOOPBACK: Final = "127.0.0.1"
 APPLICATION: Final = "imu-monitor"
-START_TIMEOUT_S: Final = 20.0  # a 300 MB program may start from a slow disk
+START_TIMEOUT_S: Final = 20.0  # the program of 300 MB may start from a slow disk
 PORTS_TRIED: Final = 20
 CLOSED: Final = "viewer was closed: start `rerun` to open it again"
-PROGRAM_MIB: Final = 256  # memory of the program itself; an empty viewer window uses 125 to 170 MB
-LIVE_FLUSH_PERIOD_S: Final = 0.2  # appears continuous; each chunk costs about 1 kB in addition to the data
+PROGRAM_MIB: Final = 256  # memory of the viewer without data; an empty window uses 125 to 170 MB
+LIVE_FLUSH_PERIOD_S: Final = 0.2  # each chunk costs about 1 kB in addition to the data
 PROBE_METHOD: Final = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadTables"
 
 
@@ -52,13 +50,13 @@ def has_desktop() -> bool:
 
 
 class ViewerProcess:
-    """Viewer process and the last line of its log."""
+    """Process of the viewer program, with access to the last log line."""
 
     def __init__(self, arguments: list[str]) -> None:
         self._log: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115 - closed with the child
         quiet = {"RERUN_ANALYTICS": "0", "RERUN_APP_ONLY": "true", "NO_COLOR": "1", "RUST_LOG": "warn"}
         self._process = subprocess.Popen(
-            [*_death_signal_prefix(), str(viewer_program()), *arguments],
+            [*_death_signal_prefix(), str(viewer_program_path()), *arguments],
             stdin=subprocess.DEVNULL,
             stdout=self._log,
             stderr=self._log,
@@ -71,20 +69,22 @@ class ViewerProcess:
         return self._process.pid
 
     def exit_reason(self) -> str | None:
-        """Return why the process has ended, or None if the process is running."""
+        """Return the reason why the process has ended, or None if the process is running."""
         status = self._process.poll()
         return None if status is None else f"viewer ended ({status}): {self._last_log_line()}"
 
     def exited_normally(self) -> bool:
-        """Return True if the process ended normally, as after its window was closed."""
+        """Return True if the process ended normally, for example because a user closed the window."""
         return self._process.poll() == 0
 
-    def end(self, patience_s: float = 0.5) -> None:
-        """Terminate the process. Kill it after ``patience_s`` seconds, because a stopped process ignores SIGTERM."""
+    def terminate(self, timeout_s: float = 0.5) -> None:
+        """Terminate the process. Kill the process after ``timeout_s`` seconds, because a stopped process ignores
+        SIGTERM.
+        """
         with contextlib.suppress(OSError):
             self._process.terminate()
         try:
-            self._process.wait(patience_s)
+            self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait(5.0)
@@ -95,26 +95,25 @@ class ViewerProcess:
         self._process.kill()
 
     def _last_log_line(self) -> str:
-        """Return the last line of the viewer's log."""
         self._log.seek(0)
         lines = self._log.read()[-2000:].decode(errors="replace").strip().splitlines()
         return lines[-1].strip()[:200] if lines else "no message"
 
 
 @dataclass
-class Output:
-    """Open viewer or file."""
+class RerunOutput:
+    """Rerun stream with the viewer process or the file that receives the data."""
 
     stream: rr.RecordingStream
     flush_every_s: float
     url: str = ""  # address of the page or of the Rerun server
     child: ViewerProcess | None = None
     port: int | None = None  # port of the Rerun server; None for a file
-    note: str = ""  # configured ports that were in use, and their replacements
+    note: str = ""  # configured ports that were in use, and the replacement ports
     lock: IO[bytes] | None = None  # lock against other processes that write the file
 
     def check_viewer(self) -> None:
-        """Check that the viewer is still open.
+        """Raise an exception if the viewer has ended.
 
         Raises
         ------
@@ -131,22 +130,22 @@ class Output:
         if trouble is not None:
             raise ViewerError(trouble)
 
-    def confirm_delivery(self, patience_s: float) -> bool:
-        """Return True if all logged data were sent within ``patience_s`` seconds and the viewer answers.
+    def confirm_delivery(self, timeout_s: float) -> bool:
+        """Return True if the viewer has received all logged data within ``timeout_s`` seconds.
 
-        Sending alone is not sufficient, because the sockets of a stopped viewer accept two more megabytes.
+        A completed send does not prove delivery, because the sockets of a stopped viewer accept two more megabytes.
         """
         try:
-            self.stream.flush(timeout_sec=patience_s)
+            self.stream.flush(timeout_sec=timeout_s)
         except RuntimeError:  # raised by Rerun after a timeout and for a lost connection
             return False
-        return self.port is None or _grpc_call(self.port, "/imu.monitor/Ping", patience_s) is not None
+        return self.port is None or _grpc_call(self.port, "/imu.monitor/Ping", timeout_s) is not None
 
     def close(self) -> None:
-        """Complete the file, or end the viewer process that belongs to this output."""
+        """Complete the file, or end the viewer process."""
         try:
             if self.child is not None:
-                self.child.end()
+                self.child.terminate()
             if self.port is None:
                 self.stream.disconnect()
         finally:
@@ -154,7 +153,7 @@ class Output:
                 self.lock.close()
 
 
-def viewer_program() -> Path:
+def viewer_program_path() -> Path:
     """Return the path of the viewer program in the package ``rerun_cli``."""
     folder = Path(rerun_cli.__file__).parent
     names = ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun")
@@ -165,32 +164,32 @@ def viewer_program() -> Path:
 
 
 def _death_signal_prefix() -> list[str]:
-    """Return a command prefix that ends a program when the thread that started it ends (Linux only).
+    """Return a command prefix that ends a program when the starting thread ends (Linux only).
 
-    Without the program ``setpriv`` (util-linux), a viewer outlives a killed daemon.
+    Without the program ``setpriv`` (util-linux), the viewer outlives a killed daemon.
     """
     setpriv = shutil.which("setpriv") if sys.platform == "linux" else None
     return [] if setpriv is None else [setpriv, "--pdeathsig", "TERM", "--"]
 
 
 def is_listening(port: int) -> bool:
-    """Return True if a program accepts connections on this port of the loopback interface."""
+    """Return True if a program accepts connections on a port of the loopback interface."""
     with contextlib.suppress(OSError), socket.create_connection((LOOPBACK, port), 0.5):
         return True
     return False
 
 
-def is_rerun(port: int) -> bool:
+def is_rerun_server(port: int) -> bool:
     """Return True if a Rerun server answers on the port.
 
-    Other gRPC servers answer a call of the Rerun service with "unimplemented" (status 12).
+    Other gRPC servers answer a Rerun call with "unimplemented" (status 12).
     """
     reply = _grpc_call(port, PROBE_METHOD, 1.0)
     return reply is not None and "grpc" in reply.get("content-type", "") and reply.get("grpc-status") != "12"
 
 
 def _grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
-    """Return the headers of the reply to an empty gRPC call on the loopback interface, or None without a reply."""
+    """Return the headers of the reply to an empty gRPC call, or None without a reply."""
     connection = http.client.HTTPConnection(LOOPBACK, port, timeout=timeout_s)
     headers = {"content-type": "application/grpc-web+proto", "x-grpc-web": "1"}
     try:
@@ -202,14 +201,14 @@ def _grpc_call(port: int, path: str, timeout_s: float) -> dict[str, str] | None:
         connection.close()
 
 
-def free_port(wanted: int, taken: int | None = None) -> int:
-    """Return the first free port from ``wanted`` on.
+def find_free_port(first_port: int, skipped_port: int | None = None) -> int:
+    """Return the first free port, starting at a given port.
 
     Parameters
     ----------
-    wanted
+    first_port
         First port to try.
-    taken
+    skipped_port
         Port to skip.
 
     Raises
@@ -217,14 +216,13 @@ def free_port(wanted: int, taken: int | None = None) -> int:
     ViewerError
         If PORTS_TRIED ports are in use.
     """
-    for port in range(wanted, min(wanted + PORTS_TRIED, 65536)):
-        if port != taken and _bindable(port):
+    for port in range(first_port, min(first_port + PORTS_TRIED, 65536)):
+        if port != skipped_port and _bindable(port):
             return port
-    raise ViewerError(f"cannot listen on {wanted} to {wanted + PORTS_TRIED - 1}: all busy")
+    raise ViewerError(f"cannot listen on {first_port} to {first_port + PORTS_TRIED - 1}: all busy")
 
 
 def _bindable(port: int) -> bool:
-    """Return True if the port can be bound."""
     with socket.socket() as probe:
         if os.name == "posix":
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -235,8 +233,8 @@ def _bindable(port: int) -> bool:
     return True
 
 
-def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
-    """Open the output that the settings select, and wait until it listens.
+def open_output(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
+    """Open the output that the settings select, and wait until the viewer listens.
 
     Parameters
     ----------
@@ -244,7 +242,7 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
         Settings of the viewer.
     recording_id
         Identifier of the recording in Rerun.
-    given_up
+    should_stop
         Function that returns True to stop waiting.
 
     Raises
@@ -257,12 +255,11 @@ def open_output(settings: ViewerSettings, recording_id: str, given_up: Callable[
     if settings.mode.endswith(".rrd"):
         return _open_file(Path(settings.mode), recording_id)
     if settings.mode in ("native", "join") or (settings.mode == "auto" and has_desktop()):
-        return _open_native(settings, recording_id, given_up)
-    return _open_web(settings, recording_id, given_up)
+        return _open_native(settings, recording_id, should_stop)
+    return _open_web(settings, recording_id, should_stop)
 
 
-def _open_file(path: Path, recording_id: str) -> Output:
-    """Open and lock a file."""
+def _open_file(path: Path, recording_id: str) -> RerunOutput:
     try:
         if path.exists():
             check_regular(path)  # opening a FIFO would block until a reader opens it
@@ -280,19 +277,18 @@ def _open_file(path: Path, recording_id: str) -> Output:
             raise ViewerError(f"cannot lock {path}: {error.strerror}") from error
     try:
         stream = _stream(recording_id)
-        # A footer would keep an entry for every chunk in memory while the daemon runs.
+        # A footer would need memory for every chunk while the daemon runs.
         stream.set_sinks(rr.FileSink(path, write_footer=False))
     except BaseException:
         lock.close()
         raise
-    return Output(stream, flush_every_s=1.0, lock=lock)
+    return RerunOutput(stream, flush_every_s=1.0, lock=lock)
 
 
-def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
-    """Join the Rerun server on the port, or open a window."""
+def _open_native(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
     port = settings.port
     if is_listening(port):
-        if not is_rerun(port):
+        if not is_rerun_server(port):
             raise ViewerError(f"cannot listen on {port}: busy")
         return _connected(port, recording_id)
     if settings.mode == "join":
@@ -304,19 +300,18 @@ def _open_native(settings: ViewerSettings, recording_id: str, given_up: Callable
         *("--memory-limit", _add_program_memory(settings.memory), "--server-memory-limit", "64MiB"),
         *("--hide-welcome-screen", "--expect-data-soon"),
     ])  # fmt: skip
-    _wait_for(port, child, given_up)
+    _wait_for(port, child, should_stop)
     return _connected(port, recording_id, child=child)
 
 
-def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[], bool]) -> Output:
-    """Start a Rerun server with a web page, and open the page if there is a desktop."""
-    port = free_port(settings.port)
-    web_port = free_port(settings.web_port, taken=port)
+def _open_web(settings: ViewerSettings, recording_id: str, should_stop: Callable[[], bool]) -> RerunOutput:
+    port = find_free_port(settings.port)
+    web_port = find_free_port(settings.web_port, skipped_port=port)
     child = ViewerProcess([
         *("--serve-web", "--bind", LOOPBACK, "--port", str(port), "--web-viewer-port", str(web_port)),
         *("--server-memory-limit", settings.memory),
     ])  # fmt: skip
-    _wait_for(port, child, given_up)
+    _wait_for(port, child, should_stop)
     output = _connected(port, recording_id, child=child)
     moved = {settings.port: port, settings.web_port: web_port}
     output.note = ", ".join(f"port {old} is busy: {new} is used" for old, new in moved.items() if old != new)
@@ -327,7 +322,7 @@ def _open_web(settings: ViewerSettings, recording_id: str, given_up: Callable[[]
 
 
 def _add_program_memory(memory: str) -> str:
-    """Return the memory limit of a viewer window: the limit for data plus PROGRAM_MIB. A percentage is not changed.
+    """Return the memory limit of a viewer window, which is the limit for data plus PROGRAM_MIB.
 
     >>> _add_program_memory("256MiB"), _add_program_memory("1GiB"), _add_program_memory("25%")
     ('512MiB', '1280MiB', '25%')
@@ -344,19 +339,17 @@ def server_url(port: int) -> str:
     return f"rerun+http://{LOOPBACK}:{port}/proxy"
 
 
-def _connected(port: int, recording_id: str, child: ViewerProcess | None = None) -> Output:
-    """Return an output that is connected to a Rerun server."""
+def _connected(port: int, recording_id: str, child: ViewerProcess | None = None) -> RerunOutput:
     stream = _stream(recording_id)
     stream.set_sinks(rr.GrpcSink(server_url(port)))
-    return Output(stream, LIVE_FLUSH_PERIOD_S, server_url(port), child, port)
+    return RerunOutput(stream, LIVE_FLUSH_PERIOD_S, server_url(port), child, port)
 
 
 def _stream(recording_id: str) -> rr.RecordingStream:
-    """Create a stream whose only timeline is ``sample_time`` and which is never freed.
+    """Create a Rerun stream that is never freed.
 
-    Freeing a stream waits for its viewer and holds a lock that all streams of the process need. If the viewer ended
-    meanwhile, the next viewer and the exit of the process would be blocked. The additional reference costs a few
-    kilobytes for each opened viewer.
+    Freeing a stream waits for the viewer while holding a lock that all streams need. If the viewer has ended, the next
+    viewer and the exit of the process would block. The leak costs a few kilobytes for each opened viewer.
     """
     stream = rr.RecordingStream(APPLICATION, recording_id=recording_id)
     ctypes.pythonapi.Py_IncRef(ctypes.py_object(stream))
@@ -365,16 +358,16 @@ def _stream(recording_id: str) -> rr.RecordingStream:
     return stream
 
 
-def _wait_for(port: int, child: ViewerProcess, given_up: Callable[[], bool]) -> None:
-    """Wait until the viewer listens. If the viewer does not listen in time, end it and raise ViewerError."""
+def _wait_for(port: int, child: ViewerProcess, should_stop: Callable[[], bool]) -> None:
+    """Wait until the viewer listens. Terminate the viewer and raise ViewerError after a timeout."""
     end = time.monotonic() + START_TIMEOUT_S
-    while time.monotonic() < end and not given_up():
+    while time.monotonic() < end and not should_stop():
         trouble = child.exit_reason()
         if trouble is not None:
-            child.end()
+            child.terminate()
             raise ViewerError(trouble)
         if is_listening(port):
             return
         time.sleep(0.05)
-    child.end()
+    child.terminate()
     raise ViewerError(f"the viewer did not listen on port {port} within {START_TIMEOUT_S:.0f} s")

@@ -1,8 +1,7 @@
-"""Content of the Rerun viewer: the panels of all devices, which log their results as entities of one stream.
+"""Content of the Rerun viewer, which consists of panels that log results to one stream.
 
-Results are logged as columns and drawings under the paths listed in the README, on the timeline ``sample_time``. A call
-may block in Rerun while the viewer does not read. Only the thread of the viewer may therefore call this module.
-Importing this module imports Rerun, which takes half a second.
+Only the thread of the viewer may call this module, because a call may block while the viewer does not read. Importing
+this module imports Rerun.
 """
 
 from collections.abc import Sequence
@@ -28,14 +27,14 @@ PANELS: tuple[type[Panel], ...] = tuple(
 
 
 class Scene:
-    """Panels of all devices in one Rerun stream. The class is not thread-safe, and its methods may block.
+    """Panels of all devices in one Rerun stream. The class is not thread-safe, and methods may block.
 
     Parameters
     ----------
     stream
         Stream of the viewer.
     fleet
-        True if further devices have only a row in the table of all devices.
+        True if the device table also contains devices that are not shown in detail.
     """
 
     def __init__(self, stream: rr.RecordingStream, fleet: bool = False) -> None:
@@ -46,15 +45,15 @@ class Scene:
         self._panels: dict[tuple[str, type[Panel]], Panel] = {}
 
     def set_devices(self, devices: Sequence[DeviceInfo]) -> None:
-        """Set the devices to show. Later data of a removed device are still drawn."""
+        """Set the devices to show."""
         self.devices = {one.name: one for one in devices}
         self.healths = {name: health for name, health in self.healths.items() if name in self.devices}
         for name in self.devices:
             for kind in PANELS:
-                self.panel(name, kind).log_styles()
+                self.get_or_create_panel(name, kind).log_styles()
 
-    def panel(self, device: str, kind: type[P]) -> P:
-        """Return a panel of a device. Create the panel if it does not exist.
+    def get_or_create_panel(self, device: str, kind: type[P]) -> P:
+        """Return a panel of a device, and create the panel if it does not exist.
 
         Parameters
         ----------
@@ -69,7 +68,7 @@ class Scene:
         return found
 
     def draw(self, device: str, panel: str, results: Sequence[TimedResult]) -> None:
-        """Draw results of a device.
+        """Draw results of a device in a panel.
 
         Parameters
         ----------
@@ -78,15 +77,15 @@ class Scene:
         panel
             Name of the class of the panel.
         results
-            At least one result with its Unix time [s], in order of time.
+            At least one result with Unix time [s], in order of time.
         """
         kind: type[Panel] = getattr(panels, panel)
-        self.panel(device, kind).draw(np.array([unix_s for unix_s, _ in results]), [one for _, one in results])
+        self.get_or_create_panel(device, kind).draw(
+            np.array([unix_s for unix_s, _ in results]), [one for _, one in results]
+        )
 
     def draw_history(self, device: str, history: HistoryTable) -> None:
-        """Draw the stored history of a device.
-
-        A line has a gap where buckets are missing. After the last bucket, live data form a separate line.
+        """Draw the stored history of a device, separated from later live data.
 
         Parameters
         ----------
@@ -96,9 +95,9 @@ class Scene:
             The history.
         """
         for kind in PANELS:
-            self.panel(device, kind).draw_history(history)
+            self.get_or_create_panel(device, kind).draw_history(history)
 
-    def set_time(self, unix_s: float) -> None:
+    def set_log_time(self, unix_s: float) -> None:
         """Set the Unix time [s] of the following log calls."""
         self._stream.set_time(TIMELINE, timestamp=_timestamps(np.array([unix_s]))[0])
 
@@ -134,5 +133,4 @@ class Scene:
 
 
 def _timestamps(unix_s: Floats) -> "np.ndarray[tuple[int, ...], np.dtype[np.datetime64]]":
-    """Convert Unix times in seconds to nanosecond timestamps."""
     return np.round(unix_s * 1e9).astype("datetime64[ns]")

@@ -1,24 +1,24 @@
-"""Settings and errors of the viewer, and descriptions of its devices. This module does not import Rerun."""
+"""Settings and errors of the viewer, and descriptions of devices. This module does not import Rerun."""
 
 from dataclasses import dataclass
 
 
 class ViewerError(Exception):
-    """The viewer cannot be opened or has ended. The message is one line for the user."""
+    """Error of a viewer that cannot be opened or has ended."""
 
 
 class ViewerClosed(ViewerError):
-    """A user has closed the window, so the program must not open it again."""
+    """Error of a window that a user has closed and that must not be opened again."""
 
 
 @dataclass(frozen=True, slots=True)
 class ViewerSettings:
     """Settings of the viewer."""
 
-    mode: str = "auto"  # auto, native, web, none, a path that ends in .rrd, or join to use only an open viewer
+    mode: str = "auto"  # auto, native, web, none, join (use an open viewer) or a path with the suffix .rrd
     port: int = 9876  # port of the Rerun server on the loopback interface
     web_port: int = 9090  # port of the web page on the loopback interface
-    memory: str = "256MiB"  # memory for past data in the viewer; the oldest data are dropped first
+    memory: str = "256MiB"  # memory limit for data in the viewer, which drops the oldest data first
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,5 +28,5 @@ class DeviceInfo:
     name: str
     about: str = ""  # short description: decoder, link, port
     has_model: bool = False  # True if the device is compared with a noise model
-    has_thermal: bool = False  # True if the bias of the device is predicted from its temperature
+    has_thermal: bool = False  # True if the bias of the device is predicted from temperature
     compensated: bool = False  # True if the gyroscope drift of the device is compensated

@@ -1,4 +1,4 @@
-"""Tables of the coefficients of one device with their intervals, for ``analyze`` and for ``watch``."""
+"""Tables of the noise coefficients of one device with intervals, for ``analyze`` and ``watch``."""
 
 from collections.abc import Collection
 from typing import Final
@@ -20,46 +20,47 @@ from monitor.publishing.remote_devices import DeviceCoefficients
 from monitor.publishing.terminal.tables import WidthDependentTable, plain_table
 
 K_OR_R: Final = "K or R"
-"""Text for K and R if the data do not show which of the two is present."""
+"""Text for K and R if the data cannot distinguish K from R."""
 
 
 def analysis_table(estimate: Estimate, axes_of_temperature: Collection[str] = ()) -> RenderableType:
-    """Return the table of coefficients with intervals for ``analyze``.
+    """Return the table of noise coefficients with intervals for ``analyze``.
 
     Parameters
     ----------
     estimate
         The estimate.
     axes_of_temperature
-        Axes to mark because temperature explains most of their slow variance.
+        Axes to mark, on which temperature explains most of the slow variance.
     """
     return Group(*coefficient_tables(DeviceCoefficients.from_estimate(estimate), axes_of_temperature))
 
 
-def coefficient_tables(known: DeviceCoefficients, axes_of_temperature: Collection[str] = ()) -> list[RenderableType]:
-    """Return a legend and a table for each kind of sensor, with a row for each axis and a column for each coefficient.
+def coefficient_tables(
+    coefficients: DeviceCoefficients, axes_of_temperature: Collection[str] = ()
+) -> list[RenderableType]:
+    """Return a legend, and a table of noise coefficients for each kind of sensor.
 
     Parameters
     ----------
-    known
+    coefficients
         Coefficients of the device.
     axes_of_temperature
-        Axes to mark because temperature explains most of their slow variance.
+        Axes to mark, on which temperature explains most of the slow variance.
     """
-    time_text = "" if known.filled_s is None else f"last {format_duration(known.filled_s)}; "
-    marks = f"; {K_OR_R}: one of them" if known.k_or_r else ""
+    time_text = "" if coefficients.filled_s is None else f"last {format_duration(coefficients.filled_s)}; "
+    marks = f"; {K_OR_R}: one of them" if coefficients.k_or_r else ""
     marks += f"; {TEMPERATURE_MARK} {TEMPERATURE_MEANS}" if axes_of_temperature else ""
     legend = Text(f"{time_text}[95 % interval]; ≤ bound; {NO_VALUE} too few data yet{marks}", style="dim")
     parts: list[RenderableType] = [legend]
     for kind in KINDS:
-        if set(axes_of(kind)) & set(known.axes):
-            wide, narrow = (_kind_table(known, kind, stacked, axes_of_temperature) for stacked in (False, True))
+        if set(axes_of(kind)) & set(coefficients.axes):
+            wide, narrow = (_kind_table(coefficients, kind, stacked, axes_of_temperature) for stacked in (False, True))
             parts.append(WidthDependentTable(wide, narrow))
     return parts
 
 
 def _kind_table(known: DeviceCoefficients, kind: Kind, stacked: bool, axes_of_temperature: Collection[str]) -> Table:
-    """Return the table of one kind of sensor. Intervals are below the values if ``stacked``, else beside the values."""
     table = plain_table(kind if stacked else KIND_NAMES[kind])
     for symbol in SYMBOLS:
         table.add_column(f"{symbol} {COEFFICIENT_UNITS[kind][symbol].name}", justify="right", no_wrap=True)
@@ -71,7 +72,6 @@ def _kind_table(known: DeviceCoefficients, kind: Kind, stacked: bool, axes_of_te
 
 
 def _cell(known: DeviceCoefficients, symbol: str, axis: str, separator: str) -> Text:
-    """Return value and interval of one coefficient, with K_OR_R if the coefficient is ambiguous."""
     one = format_coefficient(known.coefficients, symbol, axis)
     small = [f"[{one.interval}]"] if one.interval else []
     if axis in known.k_or_r and symbol in ("K", "R"):

@@ -1,4 +1,4 @@
-"""Results of drift compensation of a recording, as a table for the terminal and as JSON."""
+"""Results of the drift compensation of a recording, as a table for the terminal and as JSON."""
 
 from typing import Any, Final
 
@@ -20,7 +20,7 @@ ARMA_COEFFICIENT_NAMES: Final = ("phi1", "phi2", "theta1")
 
 
 def print_compensation(result: CompensationResult, console: Console) -> None:
-    """Print the results of the compensation.
+    """Print the results of a drift compensation.
 
     Parameters
     ----------
@@ -36,7 +36,7 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
         highlight=False,
     )
     rows = plain_table(
-        "axis", wrapped=("drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S))
+        "axis", wrapped_headers=("drift", "rms, °/h", "worst minute", *(f"{span / 60.0:.0f} min" for span in SPANS_S))
     )
     for axis, one in result.axes.items():
         pairs = [
@@ -58,7 +58,7 @@ def print_compensation(result: CompensationResult, console: Console) -> None:
 
 
 def encode_compensation(result: CompensationResult) -> bytes:
-    """Encode the results as JSON, in SI units."""
+    """Encode the results of a drift compensation as JSON, in SI units."""
     whole = {
         "schema": SCHEMA,
         "recording": result.recording,
@@ -76,7 +76,6 @@ def encode_compensation(result: CompensationResult) -> bytes:
 
 
 def _axis(at: int, one: AxisCompensation, result: CompensationResult) -> dict[str, Any]:
-    """Return the results of one axis, which is column ``at`` of the intervals."""
     each = result.intervals
     return {
         "model": None if one.model is None else _model(one.model),
@@ -95,7 +94,6 @@ def _axis(at: int, one: AxisCompensation, result: CompensationResult) -> dict[st
 
 
 def _model(model: ArmaModel) -> dict[str, Any]:
-    """Return the ARMA model with the intervals of its coefficients."""
     values = (*model.phi, model.theta)
     return {
         "order": list(model.order),
@@ -111,7 +109,6 @@ def _model(model: ArmaModel) -> dict[str, Any]:
 
 
 def _rest(one: RestScore) -> dict[str, Any]:
-    """Return the statistics at rest."""
     return {
         "deviation": one.rms,
         "worst_minute": one.worst_minute,
@@ -121,14 +118,12 @@ def _rest(one: RestScore) -> dict[str, Any]:
 
 
 def _format_pair(before: float, after: float) -> str:
-    """Format a value before and after compensation."""
     if not (np.isfinite(before) and np.isfinite(after)):
         return "—"
     return f"{format_number(UNIT.factor * before, 2)} → {format_number(UNIT.factor * after, 2)}"
 
 
 def _describe_exceptions(one: AxisCompensation, interval_s: float) -> str:
-    """Describe the rejected intervals and the steps of the bias."""
     parts = []
     if one.rejected_intervals:
         count = format_count(one.rejected_intervals, "interval")

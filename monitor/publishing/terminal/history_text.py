@@ -1,7 +1,6 @@
-"""History of a device as text for the terminal: tables of coefficients, sparklines and events.
+"""History of a device as text for the terminal, with tables, sparklines and events.
 
-A sparkline shows bucket means as characters of eight heights, and a dot where the device sent no data. The extremes are
-printed beside the sparkline. The only side effect is printing on the given console.
+A sparkline shows bucket means as characters of eight heights. A dot marks an interval in which the device sent no data.
 """
 
 import math
@@ -30,7 +29,7 @@ from monitor.history.history_table import ColumnStatistics, HistoryTable
 from monitor.publishing.terminal.tables import plain_table
 
 LETTERS: Final = ("N", "B", "K")
-"""Coefficients that are shown for all axes. For a single axis, all five are shown."""
+"""Coefficients that the table of all axes shows. The table of a single axis shows all five coefficients."""
 SPARKLINE_HEIGHTS: Final = "▁▂▃▄▅▆▇█"
 GAP: Final = "·"
 SPARKLINE_WIDTH: Final = 32
@@ -40,7 +39,7 @@ MAX_EVENTS: Final = 20
 
 
 def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str, ...], console: Console) -> None:
-    """Print a summary with one line for each axis and coefficient, then the status and the events.
+    """Print a summary of the history with one line for each axis and coefficient, the status and the events.
 
     Parameters
     ----------
@@ -64,7 +63,7 @@ def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str,
 
 
 def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], console: Console) -> None:
-    """Print one axis over time, with one line for each bucket and the extremes of each coefficient.
+    """Print the history of one axis with one line for each time bucket.
 
     Parameters
     ----------
@@ -97,7 +96,6 @@ def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], 
 
 
 def _print_events(past: HistoryTable, console: Console) -> None:
-    """Print the newest MAX_EVENTS events."""
     if not past.events:
         return
     shown = past.events[-MAX_EVENTS:]
@@ -111,7 +109,7 @@ def _print_events(past: HistoryTable, console: Console) -> None:
 
 
 def summary_line(past: HistoryTable) -> str:
-    """Return one line with device, time range, number of rows and number of samples."""
+    """Return one line with the device, the time range, the number of rows and the number of samples."""
     samples = int(past.counts[:, COUNTS.index("received")].sum())
     if not len(past):
         return f"{past.device}: no rows between {format_utc(past.span.start_s)} and {format_utc(past.span.end_s)} UTC"
@@ -126,7 +124,6 @@ def summary_line(past: HistoryTable) -> str:
 
 
 def _temperature_and_loss_lines(past: HistoryTable) -> list[str]:
-    """Return lines with temperature range, lost samples, and the time during which the device was not running."""
     lines = []
     temperature = past.column("temperature")
     if temperature.n.any():
@@ -143,8 +140,8 @@ def _temperature_and_loss_lines(past: HistoryTable) -> list[str]:
     return lines
 
 
-def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int = SPARKLINE_WIDTH) -> str:
-    """Return values between two times as text. Each character shows the mean of a time interval.
+def sparkline(values: Floats, t_s: Floats, range_s: tuple[float, float], width: int = SPARKLINE_WIDTH) -> str:
+    """Return values between two times as text, with one character for the mean of each time interval.
 
     >>> steps = np.arange(8.0)
     >>> sparkline(steps, 60.0 * steps, (0.0, 480.0), 8)
@@ -152,21 +149,21 @@ def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int =
 
     Parameters
     ----------
-    last
+    values
         Values, shape [p]; NaN if missing.
     t_s
         Times of the values [s], shape [p].
-    span
+    range_s
         Start and end of the sparkline [s].
     width
         Number of characters.
     """
-    there = np.isfinite(last)
-    if not there.any() or span[1] <= span[0]:
+    there = np.isfinite(values)
+    if not there.any() or range_s[1] <= range_s[0]:
         return GAP * width
-    at = np.clip(((t_s - span[0]) / (span[1] - span[0]) * width).astype(np.int64), 0, width - 1)[there]
+    at = np.clip(((t_s - range_s[0]) / (range_s[1] - range_s[0]) * width).astype(np.int64), 0, width - 1)[there]
     count = np.bincount(at, minlength=width)
-    means = np.bincount(at, last[there], width)[count > 0] / count[count > 0]
+    means = np.bincount(at, values[there], width)[count > 0] / count[count > 0]
     low, wide = means.min(), np.ptp(means)
     heights = ((means - low) / wide if wide > 0.0 else np.full(means.size, 0.5)) * len(SPARKLINE_HEIGHTS)
     marks = iter([SPARKLINE_HEIGHTS[min(int(one), len(SPARKLINE_HEIGHTS) - 1)] for one in heights])
@@ -174,7 +171,6 @@ def sparkline(last: Floats, t_s: Floats, span: tuple[float, float], width: int =
 
 
 def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str, ...]) -> Table:
-    """Return a table with first, last, lowest and highest value and a sparkline for each axis and coefficient."""
     table = plain_table(KIND_NAMES[kind])
     for name in ("first", "last", "lowest", "highest"):
         table.add_column(name, justify="right", no_wrap=True)
@@ -195,7 +191,6 @@ def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str
 
 
 def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
-    """Return the cells of a coefficient without estimates: the last upper bound and two dashes."""
     bound, unit = past.column(f"{axis}.{symbol}.bound"), unit_of(symbol, axis)
     there = bound.last[np.isfinite(bound.last)]
     if not there.size:
@@ -204,7 +199,6 @@ def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
 
 
 def _cell(past: HistoryTable, axis: str, symbol: str, p: int) -> str:
-    """Format a coefficient in one bucket: the last value with the extremes if they differ, or the upper bound."""
     column, unit = past.column(f"{axis}.{symbol}"), unit_of(symbol, axis)
     low, high, last = (float(part[p]) * unit.factor for part in (column.low, column.high, column.last))
     if math.isfinite(last):
@@ -215,5 +209,4 @@ def _cell(past: HistoryTable, axis: str, symbol: str, p: int) -> str:
 
 
 def _extremes(column: ColumnStatistics) -> tuple[float, float]:
-    """Return the minimum and maximum over all buckets."""
     return float(np.nanmin(column.low)), float(np.nanmax(column.high))

@@ -1,9 +1,8 @@
-"""Live table in the terminal: one row per device, devices with problems first.
+"""Live table of devices in the terminal, sorted by problems.
 
-The input is the state of the devices, from zenoh (``watch``) or from this process (``run``, ``demo``). The functions
-return objects of the package rich, which adapt to the width of the terminal. The most detailed layout that fits is
-used. At 160 columns, a device has one line with three digits. At 100 columns, it has one line with two digits. Below
-that, it has three lines, one per axis. Each state has a word and a symbol in addition to its colour.
+The functions return objects of the package rich. The most detailed layout that fits the terminal is used. A device has
+one line at 100 columns or more, and three lines, one for each axis, below 100 columns. Each state has a word and a
+symbol in addition to the colour.
 """
 
 import time
@@ -33,11 +32,11 @@ from monitor.publishing.messages.message import remove_control_characters
 from monitor.publishing.messages.results import EventMessage
 from monitor.publishing.remote_devices import MAX_DEVICES, MAX_EVENTS, DeviceStates, RemoteDevice
 from monitor.publishing.terminal.coefficient_tables import coefficient_tables
-from monitor.publishing.terminal.tables import plain_table, table_width
+from monitor.publishing.terminal.tables import plain_table, unwrapped_table_width
 
 MAX_PROBLEM_LINES: Final = 6
 HEADER_LINES: Final = 6
-"""Number of lines for the summary, the note, the head of the table and blank lines."""
+"""Number of lines for the summary, the note, the table header and blank lines."""
 MIN_ROWS: Final = 3
 TABLE_COEFFICIENTS: Final[tuple[tuple[Kind, str], ...]] = (("gyro", "N"), ("gyro", "B"), ("accel", "N"))
 STATES: Final = {
@@ -54,23 +53,27 @@ UNKNOWN_STATE_STYLE: Final = ("?", "yellow")
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """Level of detail of the table."""
+class DeviceTableLayout:
+    """Level of detail of the device table."""
 
     digits: int
     full_counts: bool
-    stacked: bool  # True if each axis has a line of its own
+    stacked: bool  # True if each axis has a separate line
     gap: int  # number of blanks between columns
 
 
-LAYOUTS: Final = (Layout(3, True, False, 2), Layout(3, False, False, 1), Layout(2, False, False, 1))
-NARROW_LAYOUT: Final = Layout(3, False, True, 1)
+LAYOUTS: Final = (
+    DeviceTableLayout(3, True, False, 2),
+    DeviceTableLayout(3, False, False, 1),
+    DeviceTableLayout(2, False, False, 1),
+)
+NARROW_LAYOUT: Final = DeviceTableLayout(3, False, True, 1)
 
 
 class LiveTable:
-    """Renderer of the table for a ``QueuedWriter``. The table is redrawn on a terminal, and otherwise printed once.
+    """Renderer of the device table for a ``QueuedWriter``.
 
-    Only the thread of the writer may call ``render``. The rich console formats text and writes nothing.
+    On a terminal, the table is redrawn in place. Otherwise, the table is printed once.
 
     Parameters
     ----------
@@ -86,18 +89,18 @@ class LiveTable:
         self._live: Live | None = None
         self._ended = False
 
-    def render(self, log_lines: Sequence[str], last: bool) -> str:
-        """Return the text and control codes that print log lines above the table and redraw the table.
+    def render(self, log_lines: Sequence[str], is_last: bool) -> str:
+        """Return text and control codes that print log lines and redraw the table.
 
         Parameters
         ----------
         log_lines : sequence of str
             Lines of the log, with colours as ANSI codes.
-        last : bool
+        is_last : bool
             True to show the cursor again and print the final table.
         """
         with self._console.capture() as captured:
-            if self.states is not None and self._live is None and self._console.is_terminal and not last:
+            if self.states is not None and self._live is None and self._console.is_terminal and not is_last:
                 live = Live(
                     console=self._console,
                     auto_refresh=False,
@@ -109,9 +112,9 @@ class LiveTable:
                 self._live = live
             if log_lines:
                 self._console.print(Text.from_ansi("".join(log_lines)))
-            if not last and self._live is not None and self.states is not None:
+            if not is_last and self._live is not None and self.states is not None:
                 self._live.update(device_table(self.states, time.monotonic()), refresh=True)
-            if last and not self._ended:
+            if is_last and not self._ended:
                 self._ended = True
                 if self._live is not None:
                     self._live.stop()
@@ -121,7 +124,7 @@ class LiveTable:
 
 
 def device_table(states: DeviceStates, now_s: float) -> RenderableType:
-    """Return summary, table of devices, problems, coefficients of a single device, and events.
+    """Return the summary, the device table, problems and events. A single device also has a table of coefficients.
 
     Parameters
     ----------
@@ -130,7 +133,7 @@ def device_table(states: DeviceStates, now_s: float) -> RenderableType:
     now_s
         Current time on the clock of the messages [s].
     """
-    devices, events = states.devices(now_s), states.newest_events()
+    devices, events = states.sorted_devices(now_s), states.newest_events()
     names = _display_names([*(one.key for one in devices), *(key for key, _ in events)])
     parts: list[RenderableType] = [_summary(states, devices, now_s)]
     if devices:
@@ -150,26 +153,24 @@ class _FittedDeviceRows:
         self._now_s = now_s
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield the table, and a line with the number of devices that are not shown."""
         for layout in (*LAYOUTS, NARROW_LAYOUT):
             count = self._visible_rows(layout, console)
             table = _device_rows(self._devices[:count], self._now_s, layout)
-            if layout is NARROW_LAYOUT or table_width(table, console, options) <= options.max_width:
+            if layout is NARROW_LAYOUT or unwrapped_table_width(table, console, options) <= options.max_width:
                 break
         yield table
         if len(self._devices) > count:
             yield Text(f"… and {len(self._devices) - count} more with fewer problems", style="dim")
 
-    def _visible_rows(self, layout: Layout, console: Console) -> int:
-        """Return the number of rows that are shown; all rows if the output is not a terminal."""
+    def _visible_rows(self, layout: DeviceTableLayout, console: Console) -> int:
+        """Return the number of visible rows, which is not limited outside a terminal."""
         if not console.is_terminal:
             return len(self._devices)
         lines = console.size.height - MAX_EVENTS - MAX_PROBLEM_LINES - HEADER_LINES
         return max(lines // (3 if layout.stacked else 1), MIN_ROWS)
 
 
-def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) -> Table:
-    """Return the table of devices in the given layout."""
+def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: DeviceTableLayout) -> Table:
     table = plain_table("device", "state", gap=layout.gap)
     shown = [pair for pair in TABLE_COEFFICIENTS if any(_measures(one, pair[0]) for one in devices)]
     columns = [_coefficient_column(devices, kind, symbol, layout) for kind, symbol in shown]
@@ -187,13 +188,12 @@ def _device_rows(devices: Sequence[RemoteDevice], now_s: float, layout: Layout) 
 
 
 def _display_names(keys: Sequence[str]) -> dict[str, str]:
-    """Return the displayed name of each key: the last part if all keys share one prefix, else the whole key."""
+    """Return the last part of each device key, or the whole keys if the prefixes differ."""
     short = len({key.rpartition("/")[0] for key in keys}) == 1
     return {key: remove_control_characters(key.rpartition("/")[2] if short else key) for key in keys}
 
 
 def _summary(states: DeviceStates, devices: list[RemoteDevice], now_s: float) -> Text:
-    """Return the number of devices in each state, and the note."""
     line = Text("imu-monitor", style="bold")
     line.append(f"  {format_count(len(devices), 'device')}", style="not bold")
     for state, count in Counter(one.state(now_s) for one in devices).items():
@@ -211,13 +211,11 @@ def _summary(states: DeviceStates, devices: list[RemoteDevice], now_s: float) ->
 
 
 def _state_cell(state: str) -> Text:
-    """Return the symbol and name of a state in its colour."""
     symbol, colour = STATES.get(state, UNKNOWN_STATE_STYLE)
     return Text(f"{symbol} {state}", style=colour)
 
 
-def _count_cells(one: RemoteDevice, layout: Layout) -> list[Text]:
-    """Return the cells of the rate and of the sample counters."""
+def _count_cells(one: RemoteDevice, layout: DeviceTableLayout) -> list[Text]:
     if one.status is None:
         return [Text(NO_VALUE, style="dim")] * 4
     rate = NO_VALUE if one.status.rate_hz is None else format_number(one.status.rate_hz, 4)
@@ -227,20 +225,17 @@ def _count_cells(one: RemoteDevice, layout: Layout) -> list[Text]:
 
 
 def _latency_cell(one: RemoteDevice) -> Text:
-    """Return the cell of the 99th percentile of the latency [ms]."""
     p99_s = None if one.status is None else one.status.latency.p99
     return Text(NO_VALUE, style="dim") if p99_s is None else Text(format_number(p99_s * 1e3, 2))
 
 
 def _measures(one: RemoteDevice, kind: Kind) -> bool:
-    """Return True if the device measures an axis of this kind."""
     return one.coefficients is not None and bool(set(axes_of(kind)) & set(one.coefficients.axes))
 
 
 def _coefficient_column(
-    devices: Sequence[RemoteDevice], kind: Kind, symbol: str, layout: Layout
+    devices: Sequence[RemoteDevice], kind: Kind, symbol: str, layout: DeviceTableLayout
 ) -> tuple[Text, list[Text]]:
-    """Return the header and cells of one coefficient on three axes. Values are aligned between rows."""
     axes = axes_of(kind)
     rows = [[_value(one, symbol, axis, layout.digits) for axis in axes] for one in devices]
     head = f"{symbol} {COEFFICIENT_UNITS[kind][symbol].name}"
@@ -254,23 +249,20 @@ def _coefficient_column(
 
 
 def _value(one: RemoteDevice, symbol: str, axis: str, digits: int) -> str:
-    """Format a coefficient as a value, as an upper bound, as a dash without estimate, or blank if not measured."""
     if one.coefficients is None or axis not in one.coefficients.axes:
         return ""
     return format_coefficient(one.coefficients.coefficients, symbol, axis, digits).value.replace("≤ ", "≤")
 
 
 def _with_blank_line(lines: Sequence[RenderableType]) -> list[RenderableType]:
-    """Return the lines with an empty line above, or nothing if there are no lines."""
     return [Text(), *lines] if lines else []
 
 
 def _problem_lines(devices: Sequence[RemoteDevice], now_s: float) -> list[Text]:
-    """Return one line for each device with problems."""
     names = _display_names([one.key for one in devices])
     lines = []
     for one in devices:
-        if problems := one.problems():
+        if problems := one.describe_problems():
             symbol, colour = STATES.get(one.state(now_s), UNKNOWN_STATE_STYLE)
             symbol = "!" if symbol == "●" else symbol
             lines.append(Text.assemble((f"{symbol} {names[one.key]}  ", colour), problems))
@@ -281,12 +273,11 @@ def _problem_lines(devices: Sequence[RemoteDevice], now_s: float) -> list[Text]:
 
 
 def _event_line(name: str, event: EventMessage) -> Text:
-    """Return the line of an event."""
     return Text.assemble((f"{_local_time(event.t or 0.0)}  ", "dim"), (f"{name}  ", "bold"), event.text)
 
 
 def _local_time(unix_s: float) -> str:
-    """Format the local time of day, or seconds if the time of a recording is not a valid date."""
+    """Format the local time of day, or the seconds if the time is not a valid date."""
     try:
         return f"{datetime.fromtimestamp(unix_s).astimezone():%H:%M:%S}"
     except (ValueError, OverflowError, OSError):

@@ -1,12 +1,11 @@
-"""Text output to a terminal, a pipe or a file by a separate thread, so that no other thread waits for the reader.
+"""Text output to a terminal, a pipe or a file in a separate thread, so that a blocked output delays no other thread.
 
-A write blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) and while no program reads a pipe. A write
-fails while a disk is full. ``QueuedWriter`` accepts lines on a bounded queue that drops its oldest lines, and can
-redraw a frame (a table) periodically. Lost lines and frames are counted and reported in ``state``.
-``QueuedWriter.close`` returns after a deadline.
+A write blocks while a terminal is stopped (Ctrl-S, a suspended remote shell) or no program reads a pipe.
+``QueuedWriter`` queues lines, drops the oldest lines of a full queue, and can redraw a table periodically. ``state``
+reports the number of lost lines and frames.
 
-The thread writes to the file descriptor and not to the Python stream. A blocked write to ``sys.stdout`` would hold the
-lock of the stream, and the interpreter aborts at exit if it cannot take this lock.
+The thread writes to the file descriptor, because a blocked write to ``sys.stdout`` holds the lock of the stream. The
+interpreter aborts at exit if this lock is held.
 """
 
 import contextlib
@@ -26,36 +25,35 @@ from monitor.publishing.bounded_queue import BoundedQueue
 MAX_QUEUED_CHARACTERS: Final = 256 * 1024
 """Maximum length of the queued text, about 2000 log lines."""
 CHUNK_BYTES: Final = 1024
-"""Length of one write call. It is small, so that a slow terminal can be distinguished from a blocked terminal."""
+"""Length of one write call, which is short to distinguish a slow terminal from a blocked terminal."""
 BLOCKED_S: Final = 2.0
-"""Duration above which a write is considered blocked."""
+"""Longest duration of a write call that is not considered blocked [s]."""
 FRAME_DELAY_S: Final = 0.05
-"""Delay before a frame is drawn, so that results published together appear in one frame."""
+"""Delay before a frame is drawn, which combines simultaneous results in one frame [s]."""
 IDLE_WAIT_S: Final = 1.0
 CLOSE_S: Final = 2.0
 
 Render = Callable[[Sequence[str], bool], str]
-"""Function that returns the text to write, given the queued lines and True for the last call."""
+"""Function that converts queued lines to text. The second argument is True for the last call."""
 
 
 class QueuedWriter:
-    """Thread that writes text to a stream which may block.
+    """Thread that writes text to a stream without blocking the caller.
 
     Parameters
     ----------
     stream : TextIO or None
-        Destination. Text for a stream without a file descriptor is written directly. None discards the text.
+        Destination. Text for a stream without a file descriptor is written by the caller. None discards the text.
     place : str
         Name of the destination in messages, such as "standard error".
     render : callable, optional
-        Converts the queued lines to the text that is written. It runs in the thread. By default, lines are joined.
+        Function that converts queued lines to text in the thread. By default, lines are joined.
     period_s : float, optional
-        Interval in seconds at which ``render`` is called without queued lines. By default, ``render`` is called only
-        for lines.
+        Interval [s] between calls of ``render`` without queued lines. By default, ``render`` is called only for lines.
     limit : int
         Number of queued characters above which the oldest entries are dropped. The newest entry is always kept.
     tell : callable, optional
-        Function that receives a sentence about dropped lines as soon as text can be written again.
+        Function that receives a report of dropped lines when the destination accepts text again.
     """
 
     def __init__(
@@ -78,10 +76,10 @@ class QueuedWriter:
         self._lost_lines = 0  # number of lines taken from the queue but not written
         self._told_lines = 0  # number of dropped lines that were reported through tell
         self._lost_frames = 0
-        self._reason = ""  # why the newest lines were lost
+        self._reason = ""  # reason for the loss of the newest lines
         self._write_since_s: float | None = None  # monotonic time at which the current write call began
         self._closing = threading.Event()
-        self._given_up = False  # True if the thread did not end in time
+        self._given_up = False  # True if the thread did not end before the timeout
         self._thread = threading.Thread(target=self._run, name=f"writer of {place}", daemon=True)
 
     def __enter__(self) -> "QueuedWriter":
@@ -118,22 +116,21 @@ class QueuedWriter:
         """Queue whole lines and return at once."""
         self._queue.push(text, len(text))
 
-    def redraw(self) -> None:
-        """Call ``render`` soon, without waiting for the end of the period."""
+    def request_redraw(self) -> None:
+        """Request a call of ``render`` before the end of the period."""
         self._queue.wake()
 
-    def finish(self, stop: threading.Event) -> None:
-        """Write all queued text. Wait until the text is written or ``stop`` is set."""
+    def finish_writing(self, stop: threading.Event) -> None:
+        """End the thread, and wait until all queued text is written or ``stop`` is set."""
         self._begin_closing()
         while self._thread.is_alive() and not stop.is_set():
             self._thread.join(0.1)
 
     def close(self, timeout_s: float = CLOSE_S) -> bool:
-        """Write all queued text and end the thread.
+        """Write all queued text and end the thread. Return False if the destination is still blocked after
+        ``timeout_s``.
 
-        If the destination is still blocked after the deadline, its descriptor is replaced with the null device, so that
-        the interpreter cannot block on it at exit. Return False if the destination was still blocked after
-        ``timeout_s`` seconds.
+        A blocked descriptor is replaced with the null device, so that the interpreter cannot block at exit.
         """
         self._begin_closing()
         if self._thread.is_alive() and not self._given_up:
@@ -146,9 +143,8 @@ class QueuedWriter:
     # --- methods of the thread
 
     def _run(self) -> None:
-        """Write queued lines and frames until the writer is closed."""
         while True:
-            closing = self._closing.is_set()  # read before the queue, so that lines queued before close() are written
+            closing = self._closing.is_set()  # read before the queue, so that lines before close() are written
             lines = self._queue.take(0.0 if closing else self._period_s or IDLE_WAIT_S)
             if self._period_s is not None and not closing:
                 self._closing.wait(FRAME_DELAY_S)
@@ -160,7 +156,6 @@ class QueuedWriter:
                 return
 
     def _process_batch(self, lines: list[str], last: bool) -> None:
-        """Render and write one batch of lines."""
         if not lines and not last and self._period_s is None:
             return
         dropped = self._dropped_lines()
@@ -179,15 +174,13 @@ class QueuedWriter:
             self._write_since_s = None
 
     def _rendered(self, lines: list[str], last: bool) -> tuple[str, Exception | None]:
-        """Return the rendered text, or the plain lines and the error of the rendering."""
         try:
             return self._render(lines, last), None
-        except Exception as error:  # noqa: BLE001 - a frame that cannot be drawn must not end the log; shown in state
+        except Exception as error:  # noqa: BLE001 - the state reports the error, and the log continues
             self._lost_frames += 1
             return "".join(lines), error
 
     def _write(self, text: str) -> None:
-        """Write the text in chunks, and count the frames that are lost while the destination is blocked."""
         if self._stream is None or not text:
             return
         self._write_since_s = time.monotonic()
@@ -208,7 +201,7 @@ class QueuedWriter:
             self._write_since_s = time.monotonic()
 
     def _tell_dropped(self, dropped: int) -> None:
-        """Report dropped lines. The queue has space for the report, because it has just been emptied."""
+        """Report dropped lines. The queue was just emptied and has space for the report."""
         count = dropped - self._told_lines
         if count and self._tell is not None:
             self._told_lines = dropped
@@ -220,27 +213,24 @@ class QueuedWriter:
     # --- counting
 
     def _blocked_s(self) -> float:
-        """Return the duration of a blocked write call [s], or 0 if no call is blocked."""
+        """Return the duration of the blocked write call [s], or 0 if no call is blocked."""
         since_s = self._write_since_s
         blocked_s = 0.0 if since_s is None else time.monotonic() - since_s
         return blocked_s if blocked_s >= BLOCKED_S else 0.0
 
     def _frames_in(self, blocked_s: float) -> int:
-        """Return the number of frames that are lost in this time."""
         return 0 if self._period_s is None else int(blocked_s / self._period_s)
 
     def _dropped_lines(self) -> int:
-        """Return the number of lines that were dropped or could not be written."""
         return self._queue.dropped + self._lost_lines
 
     def _begin_closing(self) -> None:
-        """Make the thread write the remaining lines and end."""
         self._closing.set()
-        self._queue.push("", 0)  # unlike wake(), an entry is not lost if the thread does not wait yet
+        self._queue.push("", 0)  # unlike wake(), an entry also reaches a thread that does not wait yet
 
 
 class QueuedLines(io.TextIOBase):
-    """Text stream that passes whole lines to a ``QueuedWriter``. It replaces ``sys.stderr``."""
+    """Text stream that passes whole lines to a ``QueuedWriter`` and replaces ``sys.stderr``."""
 
     def __init__(self, writer: QueuedWriter, terminal: bool) -> None:
         self._writer = writer
@@ -249,7 +239,7 @@ class QueuedLines(io.TextIOBase):
         self._lock = threading.RLock()  # a warning during garbage collection may call write() again
 
     def write(self, text: str) -> int:
-        """Queue the complete lines and return at once."""
+        """Queue complete lines and return at once."""
         with self._lock:
             *lines, self._partial = (self._partial + text).split("\n")
             if len(self._partial) > MAX_QUEUED_CHARACTERS:
@@ -264,7 +254,7 @@ class QueuedLines(io.TextIOBase):
 
 
 def descriptor_of(stream: TextIO | None) -> int | None:
-    """Return the file descriptor of a stream, or None for a stream without descriptor."""
+    """Return the file descriptor of a stream, or None if the stream has no descriptor."""
     try:
         descriptor = -1 if stream is None else stream.fileno()
     except (OSError, ValueError):
@@ -273,7 +263,7 @@ def descriptor_of(stream: TextIO | None) -> int | None:
 
 
 def redirect_to_null_device(stream: TextIO | None) -> None:
-    """Redirect the descriptor of a stream to the null device, so that no later write can block."""
+    """Redirect the file descriptor of a stream to the null device, so that later writes cannot block."""
     descriptor = descriptor_of(stream)
     if descriptor is not None:
         with (
@@ -301,7 +291,6 @@ def can_write(descriptor: int | None, timeout_s: float = 0.0) -> bool:
 
 
 def _reason(error: Exception) -> str:
-    """Return the text of an error for a message."""
     if isinstance(error, OSError):
         return error.strerror or errno.errorcode.get(error.errno or 0, str(error))
     return f"{type(error).__name__}: {error}"

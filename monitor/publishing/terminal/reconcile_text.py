@@ -1,10 +1,8 @@
-"""Result of a reconciliation as text for the terminal: summary, table of axes and steps, and unexplained differences.
+"""Result of a reconciliation as text for the terminal.
 
-Lines are rich text for any width, and long lines wrap inside their column. Each result has a symbol and a word in
-addition to its colour. Sentences and units come from ``reconcile_sentences``.
-
-For several recordings, the text is a table of axes and recordings, followed by a list of the effects that all
-recordings show and a list of the effects that only some recordings show.
+The text contains a summary, a table of axes and steps, and the unexplained differences. Each result has a symbol and a
+word in addition to the colour. The comparison of several recordings is a table of axes and recordings with lists of
+noise effects.
 """
 
 from typing import Final
@@ -31,7 +29,7 @@ RESULT_STYLES: Final = {
 """Symbol and colour of each result."""
 
 
-def print_report(r: Reconciliation, console: Console) -> None:
+def print_reconciliation(r: Reconciliation, console: Console) -> None:
     """Print the result of a reconciliation.
 
     Parameters
@@ -48,7 +46,6 @@ def print_report(r: Reconciliation, console: Console) -> None:
 
 
 def _axes_table(r: Reconciliation) -> RenderableType:
-    """Return a table with the result, the steps and the unexplained differences of each axis."""
     rows = plain_table("axis", "verdict")
     for head in ("gap", "conf."):
         rows.add_column(head, justify="right", no_wrap=True)
@@ -59,7 +56,6 @@ def _axes_table(r: Reconciliation) -> RenderableType:
 
 
 def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
-    """Add the lines of an axis to the table. The first line has the name of the axis."""
     lines = [_step(r, result.axis, step) for step in result.steps]
     lines += [
         ("", "", Text(f"left over: {words.describe_gap(one, result.axis)}", style="yellow")) for one in result.left_over
@@ -73,7 +69,6 @@ def _add(rows: Table, r: Reconciliation, result: AxisResult) -> None:
 
 
 def _step(r: Reconciliation, axis: str, step: AddedOrResizedEffect) -> tuple[str, str, Text]:
-    """Return the gap, confidence and description of one step."""
     what = Text.assemble(f"{step.kind} ", words.describe_step(step, axis, r.baseline))
     what.highlight_words([words.readable_name(step.effect)], "bold")
     gap = f"{words.format_gap(step.before.gap)} → {words.format_gap(step.after.gap)}"
@@ -81,7 +76,6 @@ def _step(r: Reconciliation, axis: str, step: AddedOrResizedEffect) -> tuple[str
 
 
 def _verdict(verdict: str) -> Text:
-    """Return the symbol and the word for a result, in the colour of the result."""
     sign, style = RESULT_STYLES[verdict]
     return Text(f"{sign} {words.RESULT_TEXTS[verdict]}", style=style)
 
@@ -106,7 +100,6 @@ def print_comparison(c: Comparison, console: Console) -> None:
 
 
 def _axes_by_runs(c: Comparison) -> Table:
-    """Return a table of the results by axis and recording."""
     rows = plain_table("axis")
     for run in c.runs:
         rows.add_column(Text(run.name), overflow="fold")
@@ -116,8 +109,7 @@ def _axes_by_runs(c: Comparison) -> Table:
 
 
 def _cell(result: AxisResult | None) -> Text:
-    """Return the cell of one axis in one recording."""
-    said = Text(comparison_sentences.count_findings(result), style="dim")
+    said = Text(comparison_sentences.describe_finding_counts(result), style="dim")
     return (
         said
         if result is None
@@ -128,7 +120,6 @@ def _cell(result: AxisResult | None) -> Text:
 
 
 def _lines(found: list[tuple[str, Text]]) -> Table:
-    """Return a table of axes and lines."""
     rows = plain_table(show_header=False)
     rows.add_column(no_wrap=True, style="bold")
     rows.add_column(overflow="fold")
@@ -138,20 +129,19 @@ def _lines(found: list[tuple[str, Text]]) -> Table:
 
 
 def _common(c: Comparison) -> list[tuple[str, Text]]:
-    """Return axis and text of each effect that all recordings show."""
     found = []
     for axis, one in c.axes.items():
         for seen in one.common:
             said = _effect(c, axis, seen)
             said.append(
-                f"; {comparison_sentences.describe_agreement(seen)}", style="yellow" if seen.consistent is False else ""
+                f"; {comparison_sentences.describe_size_agreement(seen)}",
+                style="yellow" if seen.consistent is False else "",
             )
             found.append((axis, said))
     return found
 
 
 def _single(c: Comparison) -> list[tuple[str, Text]]:
-    """Return the effects that only some recordings show, with reasons for their absence in the others."""
     found = []
     for axis, seen in [(axis, seen) for axis, one in c.axes.items() for seen in one.single]:
         said = _effect(c, axis, seen)
@@ -165,7 +155,6 @@ def _single(c: Comparison) -> list[tuple[str, Text]]:
 
 
 def _effect(c: Comparison, axis: str, seen: MatchedEffect) -> Text:
-    """Return the description of an effect, with its name in bold."""
     said = Text(f"{seen.kind} {words.describe_step(seen.pooled_step(), axis, c.baseline)}")
     said.highlight_words([words.readable_name(seen.effect)], "bold")
     return said

@@ -1,4 +1,4 @@
-"""Helpers for tables in the terminal."""
+"""Functions and classes for tables in the terminal."""
 
 from collections.abc import Iterable, Sequence
 
@@ -8,24 +8,24 @@ from rich.table import Table
 UNLIMITED_WIDTH = 10_000
 
 
-def plain_table(*heads: str, wrapped: Sequence[str] = (), gap: int = 2, show_header: bool = True) -> Table:
+def plain_table(*headers: str, wrapped_headers: Sequence[str] = (), gap: int = 2, show_header: bool = True) -> Table:
     """Return an empty table without borders.
 
     Parameters
     ----------
-    *heads
-        Headers of the first columns. Their cells are not wrapped.
-    wrapped
-        Headers of the next columns. Their cells may be wrapped.
+    *headers
+        Headers of the first columns, without line wrapping.
+    wrapped_headers
+        Headers of the next columns, with line wrapping.
     gap
         Number of blanks between columns.
     show_header
         False to omit the headers.
     """
     table = Table(box=None, padding=(0, gap, 0, 0), pad_edge=False, header_style="bold", show_header=show_header)
-    for head in heads:
+    for head in headers:
         table.add_column(head, no_wrap=True)
-    for head in wrapped:
+    for head in wrapped_headers:
         table.add_column(head)
     return table
 
@@ -36,8 +36,8 @@ def print_notes(notes: Iterable[str], console: Console) -> None:
         console.print(f"note: {note}", markup=False, highlight=False, soft_wrap=True)
 
 
-def table_width(table: Table, console: Console, options: ConsoleOptions) -> int:
-    """Return the width that a table needs without wrapping.
+def unwrapped_table_width(table: Table, console: Console, options: ConsoleOptions) -> int:
+    """Return the width that a table needs without wrapped lines.
 
     Parameters
     ----------
@@ -50,12 +50,11 @@ def table_width(table: Table, console: Console, options: ConsoleOptions) -> int:
 
 
 class WidthDependentTable:
-    """Pair of tables. The wide table is shown if it fits the terminal, and the narrow table otherwise."""
+    """Pair of tables, of which the wide table is shown if the wide table fits the terminal."""
 
     def __init__(self, wide: Table, narrow: Table) -> None:
         self._wide = wide
         self._narrow = narrow
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
-        """Yield one of the two tables."""
-        yield self._wide if table_width(self._wide, console, options) <= options.max_width else self._narrow
+        yield self._wide if unwrapped_table_width(self._wide, console, options) <= options.max_width else self._narrow

@@ -23,20 +23,22 @@ ONE_WAY: Final = "temperature only rose or only fell, so neither a time lag nor 
 DRIFT_WITH_TIME: Final = "temperature only rose or only fell, so a drift with time would look the same"
 
 
-def print_thermal_fit(study: ThermalFitReport, console: Console) -> None:
+def print_thermal_fit(report: ThermalFitReport, console: Console) -> None:
     """Print the results of a thermal model fit.
 
     Parameters
     ----------
-    study
+    report
         The fitted models.
     console
         Destination.
     """
-    console.print(_summary_line(study.recording, study.interval_s, study.means), highlight=False)
-    if study.fits:
-        rows = plain_table("axis", "model", wrapped=("per °C", "late by", "loop", "leaves", "explains", "validated"))
-        for axis, one in study.fits.items():
+    console.print(_summary_line(report.recording, report.interval_s, report.means), highlight=False)
+    if report.fits:
+        rows = plain_table(
+            "axis", "model", wrapped_headers=("per °C", "late by", "loop", "leaves", "explains", "validated")
+        )
+        for axis, one in report.fits.items():
             rows.add_row(axis, *_fit_row(axis, one))
         console.print(Padding(rows, (1, 0)))
         console.print(
@@ -45,47 +47,50 @@ def print_thermal_fit(study: ThermalFitReport, console: Console) -> None:
             "(and its ratio to that of a cubic).",
             style="dim",
         )
-    one_way = [axis for axis, one in study.fits.items() if not one.temperature_rose_and_fell]
-    notes = (*study.notes, *notes_on_hysteresis(study), *([ONE_WAY] if one_way else []))
-    _print_notes(study.refused, notes, console)
+    one_way = [axis for axis, one in report.fits.items() if not one.temperature_rose_and_fell]
+    notes = (*report.notes, *notes_on_hysteresis(report), *([ONE_WAY] if one_way else []))
+    _print_notes(report.refused, notes, console)
 
 
-def print_thermal_prediction(outlook: ThermalPredictionReport, console: Console) -> None:
-    """Print the predictions of thermal models for a recording, and their errors.
+def print_thermal_prediction(report: ThermalPredictionReport, console: Console) -> None:
+    """Print the predictions of thermal models for a recording and the prediction errors.
 
     Parameters
     ----------
-    outlook
+    report
         The predictions.
     console
         Destination.
     """
-    console.print(_summary_line(outlook.recording, outlook.interval_s, outlook.means), highlight=False)
-    if outlook.judged:
+    console.print(_summary_line(report.recording, report.interval_s, report.means), highlight=False)
+    if report.judged:
         rows = plain_table(
-            "axis", wrapped=("rms alone", "multi-step", "offset out", "one-step", "offset", "within 95 %")
+            "axis", wrapped_headers=("rms alone", "multi-step", "offset out", "one-step", "offset", "within 95 %")
         )
-        for axis, one in outlook.judged.items():
+        for axis, one in report.judged.items():
             each = (one.rms_about_mean, one.rms, one.rms_without_offset, one.rms_one_step, one.offset)
             rows.add_row(axis, *(_format_deviation(axis, x) for x in each), f"{100.0 * one.coverage:.0f} %")
         console.print(Padding(rows, (1, 0)))
-    _print_notes(outlook.refused, outlook.notes, console)
+    _print_notes(report.refused, report.notes, console)
 
 
-def temperature_notes(found: TemperatureRemoval) -> list[str]:
-    """Return a sentence for each axis on which temperature explains most of the slow variance, or much of K or R."""
+def temperature_notes(removal: TemperatureRemoval) -> list[str]:
+    """Return a note for each axis on which temperature explains much of the slow variance, or of K or R."""
     notes = []
-    for axis, one in found.dependences.items():
+    for axis, one in removal.dependences.items():
         fallen = [
             f"{letter} falls from {before.value} to {after.value} {after.unit} ({100.0 * share:.0f} % of its variance)"
             for letter in SLOW_LETTERS
-            if found.has_decreased_significantly(letter, axis)
-            and (share := found.variance_share(letter, axis)) is not None
+            if removal.has_decreased_significantly(letter, axis)
+            and (share := removal.variance_share(letter, axis)) is not None
             for before, after in [
-                (format_coefficient(found.before, letter, axis), format_coefficient(found.coefficients, letter, axis))
+                (
+                    format_coefficient(removal.before, letter, axis),
+                    format_coefficient(removal.coefficients, letter, axis),
+                )
             ]
         ]
-        without = f"without temperature ({found.models.get(axis, '')}), {' and '.join(fallen)}" if fallen else ""
+        without = f"without temperature ({removal.models.get(axis, '')}), {' and '.join(fallen)}" if fallen else ""
         if one.explains_most:
             share_text = f"{math.floor(100.0 * one.share):d} %"
             notes.append(
@@ -99,20 +104,20 @@ def temperature_notes(found: TemperatureRemoval) -> list[str]:
     return notes
 
 
-def notes_on_hysteresis(study: ThermalFitReport) -> list[str]:
-    """Return a sentence for each axis on which the bias differs significantly between heating and cooling."""
+def notes_on_hysteresis(report: ThermalFitReport) -> list[str]:
+    """Return a note for each axis on which the bias differs significantly between heating and cooling."""
     return [
         f"{axis}: at one temperature the bias differs between heating and cooling by up to "
         f"{format_rate(axis, one.hysteresis)} (hysteresis or a lag, p = {one.hysteresis_p:.1g})"
-        for axis, one in study.fits.items()
+        for axis, one in report.fits.items()
         if one.hysteresis and one.hysteresis_p is not None
     ]
 
 
-def encode_thermal_fit(study: ThermalFitReport) -> bytes:
+def encode_thermal_fit(report: ThermalFitReport) -> bytes:
     """Encode the results of a thermal model fit as JSON, in SI units."""
     axes: dict[str, Any] = {}
-    for axis, one in study.fits.items():
+    for axis, one in report.fits.items():
         model = one.model
         axes[axis] = {
             "model": model.shape.name,
@@ -130,21 +135,20 @@ def encode_thermal_fit(study: ThermalFitReport) -> bytes:
                 {"model": each.shape.name, "aicc": each.aicc, "rms": each.rms, "validated": each.validated}
                 for each in one.candidates
             ],
-            "temperature": study.means[axis].temperature_c,
-            "bias": study.means[axis].bias,
-            "error": study.means[axis].error,
+            "temperature": report.means[axis].temperature_c,
+            "bias": report.means[axis].bias,
+            "error": report.means[axis].error,
         }
-    return _json(FIT_SCHEMA, study.recording, study.interval_s, axes, study.refused, study.notes)
+    return _json(FIT_SCHEMA, report.recording, report.interval_s, axes, report.refused, report.notes)
 
 
-def encode_thermal_prediction(outlook: ThermalPredictionReport) -> bytes:
-    """Encode predictions and measured means as JSON, in SI units."""
-    axes = {axis: _prediction_of_axis(outlook.means[axis], one) for axis, one in outlook.judged.items()}
-    return _json(PREDICT_SCHEMA, outlook.recording, outlook.interval_s, axes, outlook.refused, outlook.notes)
+def encode_thermal_prediction(report: ThermalPredictionReport) -> bytes:
+    """Encode thermal predictions and measured interval means as JSON, in SI units."""
+    axes = {axis: _prediction_of_axis(report.means[axis], one) for axis, one in report.judged.items()}
+    return _json(PREDICT_SCHEMA, report.recording, report.interval_s, axes, report.refused, report.notes)
 
 
 def _prediction_of_axis(means: IntervalMeans, one: ComparisonWithMeans) -> dict[str, Any]:
-    """Return the prediction errors and the predicted and measured bias of one axis."""
     return {
         "rms": one.rms,
         "rms_offset_out": one.rms_without_offset,
@@ -162,7 +166,6 @@ def _prediction_of_axis(means: IntervalMeans, one: ComparisonWithMeans) -> dict[
 def _json(
     schema: str, recording: str, interval_s: float, axes: dict[str, Any], refused: Any, notes: tuple[str, ...]
 ) -> bytes:
-    """Encode the common keys and the results of the axes."""
     whole = {
         "schema": schema,
         "recording": recording,
@@ -175,7 +178,6 @@ def _json(
 
 
 def _summary_line(recording: str, interval_s: float, means: Any) -> str:
-    """Return one line with the recording, the number and length of the intervals, and the temperature range."""
     first: IntervalMeans = next(iter(means.values()))
     count = first.bias.size
     warmth = first.temperature_c
@@ -184,7 +186,6 @@ def _summary_line(recording: str, interval_s: float, means: Any) -> str:
 
 
 def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
-    """Return the cells of one fitted axis."""
     model, best = one.model, one.candidates[0]
     cubic = next((each.validated for each in one.candidates if each.shape == ThermalModelForm(3, ())), None)
     return (
@@ -199,12 +200,10 @@ def _fit_row(axis: str, one: ThermalFit) -> tuple[str, ...]:
 
 
 def _format_deviation(axis: str, si: float) -> str:
-    """Format a rate or an acceleration in the unit of the axis."""
     return DEVIATION_UNITS[sensor_kind(axis)].text(si)
 
 
 def _print_notes(refused: Any, notes: tuple[str, ...], console: Console) -> None:
-    """Print the reasons for axes without a model, and the notes."""
     for axis, reason in refused.items():
         console.print(f"{axis}: {reason}", highlight=False, soft_wrap=True)
     print_notes(notes, console)

@@ -1,4 +1,4 @@
-"""``imu-monitor watch``: the table of all devices that daemons publish over zenoh."""
+"""Command ``imu-monitor watch``, which shows a table of all devices that daemons publish over zenoh."""
 
 import contextlib
 import threading
@@ -18,7 +18,7 @@ REFRESH_PERIOD_S: Final = 0.5
 PLAIN_PERIOD_S: Final = 1.0
 """Interval between two tables if the output is not a terminal."""
 SILENCE_NOTE_S: Final = 5.0
-"""Time without any message after which a note is shown, because access control refuses silently."""
+"""Time without messages before a note is shown [s], because access control gives no error."""
 STDOUT: Final = "standard output"
 
 
@@ -30,9 +30,9 @@ def watch(
     once_s: float | None = None,
     file: Path | None = None,
 ) -> None:
-    """Show the table until ``stop`` is set or Ctrl-C is pressed.
+    """Show the table of devices until ``stop`` is set or Ctrl-C is pressed.
 
-    The table is written by a separate thread. A blocked terminal or pipe delays neither messages nor the exit.
+    A separate thread writes the table, so that a blocked terminal or pipe delays neither messages nor the exit.
 
     Parameters
     ----------
@@ -45,14 +45,14 @@ def watch(
     console
         Console that formats the table.
     once_s
-        Time to collect messages [s], after which the table is printed once. By default, the table is updated.
+        Time to collect messages [s] before the table is printed once. By default, the table is updated.
     file
         Configuration file of zenoh.
 
     Raises
     ------
     ConfigError
-        If zenoh rejects the key expression, an endpoint or the file with certificates and passwords.
+        If zenoh rejects the key expression, an endpoint or the configuration file.
     OSError
         If standard output cannot be written.
     """
@@ -67,12 +67,12 @@ def watch(
             stop.wait(once_s)
             _receive_messages(states, subscriber)
             with QueuedWriter(stream, STDOUT, LiveTable(console, states).render) as writer:
-                writer.finish(stop)
+                writer.finish_writing(stop)
         elif console.is_terminal:
             with QueuedWriter(stream, STDOUT, LiveTable(console, states).render, REFRESH_PERIOD_S) as writer:
                 while not stop.wait(REFRESH_PERIOD_S) and writer.error is None:
                     _receive_messages(states, subscriber)
-                    writer.redraw()
+                    writer.request_redraw()
         else:
             with QueuedWriter(stream, STDOUT, limit=1) as writer:  # at most one table is queued
                 while not stop.wait(PLAIN_PERIOD_S) and writer.error is None:
@@ -83,17 +83,16 @@ def watch(
 
 
 def _receive_messages(states: DeviceStates, subscriber: ZenohSubscriber) -> None:
-    """Process all received messages, and update the note about the connection."""
     for message in subscriber.take(0.0):
         if message.payload is None:
-            states.set_token(message.key, message.there)
+            states.set_liveliness_token(message.key, message.token_exists)
         else:
             states.process_message(message.key, message.payload)
     states.note = connection_note(states, subscriber)
 
 
 def connection_note(states: DeviceStates, subscriber: ZenohSubscriber) -> str:
-    """Return a description of the problems of the connection to the daemons, or "" if there are none.
+    """Describe the problems of the connection to the daemons. Return an empty string if there are none.
 
     Parameters
     ----------
@@ -104,7 +103,11 @@ def connection_note(states: DeviceStates, subscriber: ZenohSubscriber) -> str:
     """
     state, dropped = subscriber.state, subscriber.dropped
     notes = [state] if state != "ok" else []
-    if state == "ok" and subscriber.all_connected_s > SILENCE_NOTE_S and not states.devices(time.monotonic()):
+    if (
+        state == "ok"
+        and subscriber.all_connected_duration_s > SILENCE_NOTE_S
+        and not states.sorted_devices(time.monotonic())
+    ):
         notes.append("connected, but no messages: no daemon is there, or access control refuses them")
     notes += [f"{dropped:,} messages dropped: this computer is too slow"] if dropped else []
     return "; ".join(notes)

@@ -1,7 +1,7 @@
-"""Client that queries other daemons for their stored histories over zenoh, for ``imu-monitor history --connect``.
+"""Client that queries daemons for stored histories over zenoh, for ``imu-monitor history --connect``.
 
-Each query opens a separate session that connects only to the given endpoint. Replies that are not history messages are
-ignored. If there is no valid reply, the reason is raised as an error.
+Each query opens a separate session that connects only to the given endpoint. Invalid replies are ignored. Without any
+valid reply, the query raises an error with the reason.
 """
 
 import json
@@ -32,7 +32,7 @@ def query_histories(
     Parameters
     ----------
     endpoint
-        Endpoint of a daemon or router. By default, the first endpoint in the file, or else the default endpoint.
+        Endpoint of a daemon or router. By default, the first endpoint in the file is used, or the default endpoint.
     device
         Name of the device; ``*`` for all devices.
     parameters
@@ -45,9 +45,9 @@ def query_histories(
     Raises
     ------
     ConfigError
-        If the endpoint, the file or the query is not valid.
+        If the endpoint, the configuration file or the query is invalid.
     LinkUnavailable
-        If no daemon is reachable, accepts the connection or replies.
+        If no daemon can be reached, or if no daemon accepts the connection or replies.
     NotReady
         If the time range contains no results.
     """
@@ -80,7 +80,6 @@ def query_histories(
 
 
 def _error_of_reply(error: Any) -> Exception:
-    """Convert an error reply of a daemon into an exception."""
     try:
         reply = json.loads(bytes(error.payload))
         text, status = remove_control_characters(str(reply["error"])[:500]), reply.get("exit")

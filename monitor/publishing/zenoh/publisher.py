@@ -1,14 +1,12 @@
-"""Publisher of results over zenoh: the topics of ``monitor.common.topics``, liveliness tokens and commands.
+"""Publisher of results over zenoh, with liveliness tokens, commands and history queries.
 
-By default the session is closed to other hosts: a peer without scouting listens only on the loopback
-interface. If the port is in use, the session listens on a free port and reports it. If the session cannot be opened for
-another reason, the attempt is repeated. Until the session is open, ``state`` reports the reason and messages are
-dropped. The processing of samples continues. ``put`` never waits, because zenoh queues outgoing messages and drops the
-messages of a slow subscriber. Advanced publishers keep the last values for late subscribers. Plain subscribers are not
-affected.
+By default, the session is a peer without scouting that listens only on the loopback interface. If the port is in use,
+the session listens on a free port. If the session cannot be opened for another reason, the publisher repeats the
+attempt. Messages are dropped until the session is open. ``put`` never waits, because zenoh queues outgoing messages and
+drops the messages of a slow subscriber. Advanced publishers keep the last values for late subscribers.
 
-Each device has a thread that answers queries of ``history``, because an answer requires reading a file. A second thread
-takes commands from a queryable and passes them through a queue to the main loop of the service, which answers them.
+Each device has a thread that answers history queries, because an answer requires reading a file. A second thread passes
+commands to the main loop of the service.
 """
 
 import atexit
@@ -45,12 +43,12 @@ if TYPE_CHECKING:
 MAX_QUEUED_QUERIES: Final = 64
 """Capacity of the queue of commands and of each channel of queries."""
 DUPLICATE_REPORT_S: Final = 10.0
-"""Another program that publishes under the same key is reported for this time after its last message [s]."""
+"""Time for which another program with the same key is reported after the last message [s]."""
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Query on ``command/<verb>``. It must be answered exactly once, with ``reply_result`` or ``reply_refusal``."""
+    """Query on ``command/<verb>``. Each command must be answered exactly once with a result or a refusal."""
 
     device: str
     verb: str
@@ -59,8 +57,8 @@ class Command:
 
 
 HistoryFunction = Callable[[str, str], bytes]
-"""Function that returns the payload with the history of a device, given the name of the device and the parameters of a
-selector. The function raises ImuError if there is no history."""
+"""Function that returns the encoded history, given a device name and selector parameters. Without a history, the
+function raises ImuError."""
 
 
 class ZenohPublisher(RetriedSession):
@@ -73,7 +71,7 @@ class ZenohPublisher(RetriedSession):
     devices
         Names of the devices.
     read_history
-        Function that answers queries of ``history``; None if no history is stored.
+        Function that answers history queries, or None if no history is stored.
     """
 
     def __init__(
@@ -87,15 +85,15 @@ class ZenohPublisher(RetriedSession):
         self.commands: queue.Queue[Command] = queue.Queue(MAX_QUEUED_QUERIES)
         self._devices = tuple(devices)
         self._alive: dict[str, bool] = dict.fromkeys(devices, False)
-        self._refusal = ""  # reason why the connection is refused, from the newest check
+        self._refusal = ""  # reason why the endpoints refuse the connection
         self._connect: tuple[str, ...] = settings.connect
         self._publishers: dict[str, zenoh.Publisher | AdvancedPublisher] = {}
         self._tokens: dict[str, Any] = {}
         self._queryables: dict[str, list[Any]] = {}
         self._duplicates = _DuplicatePublishers(settings.prefix)
-        # The thread that opens the session declares all devices. The main loop adds and removes devices.
+        # The opening thread and the main loop both declare devices.
         self._declaring = threading.Lock()
-        self._token_lock = threading.Lock()  # both threads declare liveliness tokens
+        self._token_lock = threading.Lock()  # the opening thread and the main loop declare liveliness tokens
 
     @property
     def state(self) -> str:
@@ -114,12 +112,12 @@ class ZenohPublisher(RetriedSession):
         """Open the session in a separate thread, unless the mode is ``none``."""
         if self.settings.mode == "none":
             return
-        # A thread that still receives from zenoh while the interpreter exits would abort the process.
+        # A thread that receives from zenoh at exit would abort the process.
         atexit.register(self.close)
         super().start()
 
     def put(self, topic: topics.Topic, device: str, payload: bytes) -> None:
-        """Publish a message. The message is dropped if there is no session.
+        """Publish a message. The message is dropped if no session is open.
 
         Parameters
         ----------
@@ -142,8 +140,8 @@ class ZenohPublisher(RetriedSession):
         else:
             self._unsent = ""
 
-    def put_key(self, key: str, payload: bytes) -> str:
-        """Publish JSON under a key that the user has chosen. Return "" or the reason why the text was not sent.
+    def publish_json_return_error(self, key: str, payload: bytes) -> str:
+        """Publish JSON under a user-defined key. Return the reason for a failure, or an empty string after success.
 
         Parameters
         ----------
@@ -163,22 +161,22 @@ class ZenohPublisher(RetriedSession):
             return f"not sent: zenoh: {format_zenoh_error(error)}"
         return ""
 
-    def set_alive(self, device: str, flowing: bool) -> None:
+    def set_alive(self, device: str, samples_arrive: bool) -> None:
         """Declare or remove the liveliness token of a device.
 
         Parameters
         ----------
         device
             Name of the device.
-        flowing
+        samples_arrive
             True if samples of the device arrive.
         """
-        if self._alive[device] != flowing:
-            self._alive[device] = flowing
+        if self._alive[device] != samples_arrive:
+            self._alive[device] = samples_arrive
             self._update_token(device)
 
     def add_device(self, device: str) -> None:
-        """Add a device and declare its keys."""
+        """Add a device and declare the zenoh keys of the device."""
         with self._declaring:
             self._devices += (device,)
             self._alive[device] = False
@@ -187,7 +185,7 @@ class ZenohPublisher(RetriedSession):
                     self._declare(self._session, device)
 
     def remove_device(self, device: str) -> None:
-        """Remove a device and undeclare its keys."""
+        """Remove a device and undeclare the zenoh keys of the device."""
         self.set_alive(device, False)
         with self._declaring, contextlib.suppress(*zenoh_errors()):  # the session may be closing
             self._devices = tuple(one for one in self._devices if one != device)
@@ -199,14 +197,13 @@ class ZenohPublisher(RetriedSession):
                 one.undeclare()
 
     def close(self) -> None:
-        """Close the session, which removes all liveliness tokens, and stop the threads."""
+        """Close the session, remove all liveliness tokens and stop the threads."""
         atexit.unregister(self.close)
         super().close()
 
     # --- opening of the session
 
     def _open_session(self) -> None:
-        """Open the session and declare all devices."""
         session, state = self._open_on_free_port()
         with self._declaring:
             self._session = session
@@ -215,23 +212,20 @@ class ZenohPublisher(RetriedSession):
             self._session_state = state
 
     def _report_failure(self, error: Exception) -> None:
-        """Store the reason why the session could not be opened."""
         self._session_state = f"{self._find_refusal() or format_zenoh_error(error)}; trying again"
 
     def _monitor_connection(self) -> None:
-        """Check at intervals why the connection is refused."""
         while self._connect and not self.closing.wait(REFUSAL_CHECK_S):
             session = self._session
             self._refusal = self._find_refusal() if session is not None and is_unconnected(session) else ""
 
     def _find_refusal(self) -> str:
-        """Return why the endpoints refuse the connection; "" if no program listens there."""
+        """Return why the endpoints refuse the connection, or an empty string if no program listens."""
         with contextlib.suppress(*zenoh_errors()):  # zenoh has already reported an invalid file
             return explain_refusals(self._connect, self._configuration(None))
         return ""
 
     def _close_session(self) -> None:
-        """Close the session and forget all declarations, which end with the session."""
         self._publishers, self._queryables = {}, {}
         self._duplicates.forget_devices()
         super()._close_session()
@@ -239,7 +233,6 @@ class ZenohPublisher(RetriedSession):
             self._tokens = {}
 
     def _declare(self, session: "zenoh.Session", device: str) -> None:
-        """Declare all keys of a device."""
         keys = {topic: topic.key(self.settings.prefix, device) for topic in topics.TOPICS}
         published = {topic: key for topic, key in keys.items() if topic.when not in ("presence", "query")}
         new = {key: self._publisher(session, topic, key) for topic, key in published.items()}
@@ -253,7 +246,7 @@ class ZenohPublisher(RetriedSession):
         self._update_token(device)
 
     def _open_on_free_port(self) -> tuple["zenoh.Session", str]:
-        """Open the session, on a free port if the configured port is in use; return the session and its state."""
+        """Open the session on a free port if the configured port is in use."""
         import zenoh
 
         listen = self.settings.listen
@@ -269,7 +262,7 @@ class ZenohPublisher(RetriedSession):
             return session, f"ok, but {', '.join(listen)} is busy: listening on {', '.join(free)}"
 
     def _configuration(self, listen: tuple[str, ...] | None) -> "zenoh.Config":
-        """Return the configuration of zenoh. Settings override the zenoh file, and the file overrides the defaults."""
+        """Merge the defaults, the zenoh file and the settings, in increasing precedence."""
         own = self.settings
         keys: dict[str, Any] = {
             "mode": own.mode,
@@ -282,12 +275,12 @@ class ZenohPublisher(RetriedSession):
     def _publisher(
         self, session: "zenoh.Session", topic: topics.Topic, key: str
     ) -> "zenoh.Publisher | AdvancedPublisher":
-        """Declare the publisher of a key, which is an advanced publisher if the topic keeps values."""
+        """Declare an advanced publisher if the topic keeps values for late subscribers."""
         import zenoh
         from zenoh import ext
 
         encoding, drop = zenoh.Encoding(topic.encoding), zenoh.CongestionControl.DROP
-        express = topic.when != "batches"  # results are sent at once; batches of samples may share a packet
+        express = topic.when != "batches"  # results are sent immediately; batches of samples may share a packet
         if not topic.kept:
             return session.declare_publisher(key, encoding=encoding, congestion_control=drop, express=express)
         return ext.declare_advanced_publisher(
@@ -303,12 +296,11 @@ class ZenohPublisher(RetriedSession):
     # --- liveliness and commands
 
     def _update_token(self, device: str) -> None:
-        """Declare the liveliness token of a device if samples arrive, and remove it otherwise."""
         session = self._session
         if session is None:
             return
         key = topics.ALIVE.key(self.settings.prefix, device)
-        # An error here means that the session is closing, which removes the token.
+        # An error means that the session is closing, which also removes the token.
         with self._token_lock, contextlib.suppress(*zenoh_errors()):
             if self._alive[device] and device not in self._tokens:
                 self._tokens[device] = session.liveliness().declare_token(key)
@@ -318,7 +310,6 @@ class ZenohPublisher(RetriedSession):
     def _declare_queryable(
         self, session: "zenoh.Session", device: str, key: str, process: Callable[[Any], None]
     ) -> None:
-        """Declare a queryable of a device and start the thread that processes queries."""
         import zenoh
 
         queryable = session.declare_queryable(key, zenoh.handlers.FifoChannel(MAX_QUEUED_QUERIES))
@@ -326,7 +317,6 @@ class ZenohPublisher(RetriedSession):
         self._queryables.setdefault(device, []).append(queryable)
 
     def _answer_history(self, device: str, read_history: HistoryFunction, query: Any) -> None:
-        """Answer a query of ``history``."""
         reply_result, _ = _reply_functions(query, topics.HISTORY.key(self.settings.prefix, device))
         with contextlib.suppress(*zenoh_errors()):  # the session may have been closed meanwhile
             try:
@@ -337,9 +327,8 @@ class ZenohPublisher(RetriedSession):
                 reply_result(payload)
 
     def _queue_command(self, device: str, query: Any) -> None:
-        """Pass a command to the queue."""
         verb = str(query.key_expr).rsplit("/", 1)[-1]
-        key = f"{self.settings.prefix}/{device}/command/{verb}"  # the query itself may select several devices
+        key = f"{self.settings.prefix}/{device}/command/{verb}"  # the key of the query may select several devices
         command = Command(device, verb, *_reply_functions(query, key))
         try:
             self.commands.put_nowait(command)
@@ -348,11 +337,7 @@ class ZenohPublisher(RetriedSession):
 
 
 class _DuplicatePublishers:
-    """Detector of other sessions that publish the status of a device under the same key.
-
-    If two programs publish under one key, a subscriber receives a mixture of messages, and both programs execute a
-    command.
-    """
+    """Detector of other programs that publish the status of a device under the same key."""
 
     def __init__(self, prefix: str) -> None:
         self._prefix = prefix
@@ -360,7 +345,6 @@ class _DuplicatePublishers:
         self._heard_s: dict[str, float] = {}
 
     def watch_other_publishers(self, session: "zenoh.Session", device: str) -> None:
-        """Subscribe to the status messages that other sessions publish for a device."""
         import zenoh
 
         key = topics.STATUS.key(self._prefix, device)
@@ -369,18 +353,16 @@ class _DuplicatePublishers:
         self._subscribers = {**self._subscribers, device: one}
 
     def forget_device(self, device: str) -> list[Any]:
-        """Forget a device; return the subscribers to undeclare."""
         self._heard_s.pop(device, None)
         removed = [one for name, one in self._subscribers.items() if name == device]
         self._subscribers = {name: one for name, one in self._subscribers.items() if name != device}
         return removed
 
     def forget_devices(self) -> None:
-        """Forget all devices; their subscribers are closed with the session."""
         self._subscribers, self._heard_s = {}, {}
 
     def duplicate_publisher_message(self, now_s: float) -> str:
-        """Return a message if another program published a device's status within DUPLICATE_REPORT_S; else ""."""
+        """Return a warning if another program published the status of a device within DUPLICATE_REPORT_S."""
         for device, one in self._subscribers.items():
             with contextlib.suppress(*zenoh_errors()):  # the session is being closed
                 if one.handler.try_recv() is not None:
@@ -392,7 +374,7 @@ class _DuplicatePublishers:
 
 
 def _reply_functions(query: Any, key: str) -> tuple[Callable[[bytes], None], Callable[[str], None]]:
-    """Return functions that end a query with a result or with an error."""
+    """Return functions that answer a query with a result or with an error."""
     import zenoh
 
     def reply_result(payload: bytes) -> None:
@@ -407,7 +389,7 @@ def _reply_functions(query: Any, key: str) -> tuple[Callable[[bytes], None], Cal
 
 
 def _reply_error(query: Any, error: ImuError) -> None:
-    """End a query with an error message and the exit status that a command would have."""
+    """Reply with an error message and the exit status of the corresponding command."""
     import zenoh
 
     status = 3 if isinstance(error, NotReady) else 2 if isinstance(error, ConfigError) else 1
@@ -417,7 +399,7 @@ def _reply_error(query: Any, error: ImuError) -> None:
 
 
 def _free_port(endpoint: str) -> str:
-    """Return the endpoint with a free port. Endpoints other than tcp/host:port are not changed."""
+    """Replace the port of a TCP endpoint with a free port. Other endpoints are not changed."""
     match = re.fullmatch(r"tcp/\[?([^\]]+?)\]?:\d+", endpoint)
     if match is None:
         return endpoint

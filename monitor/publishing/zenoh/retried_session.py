@@ -1,7 +1,7 @@
-"""zenoh session that is opened in a separate thread, so that an unreachable router delays nothing.
+"""zenoh session that is opened in a separate thread, so that an unreachable router does not block the caller.
 
-A failed attempt is repeated. Messages are received by threads from channels of zenoh, because a Python callback that is
-still registered at exit would block the process.
+Threads receive messages from zenoh channels, because a Python callback that is registered at exit would block the
+process.
 """
 
 import threading
@@ -13,16 +13,16 @@ if TYPE_CHECKING:
     import zenoh
 
 REFUSAL_CHECK_S: Final = 3.0
-"""Interval between two checks of why an endpoint refuses the connection."""
+"""Interval between two checks of a refused connection [s]."""
 RETRY_S: Final = 1.0
 JOIN_TIMEOUT_S: Final = 2.0
 
 
 class RetriedSession:
-    """Base class of the publisher and of the sessions of the subscriber."""
+    """Base class of zenoh sessions that repeat failed attempts to connect."""
 
     close_timeout_s = 2.0
-    """Longest time that ``close`` waits for a session that is being opened [s]."""
+    """Longest time [s] that ``close`` waits for the opening of a session."""
 
     def __init__(self, name: str) -> None:
         self.closing = threading.Event()
@@ -35,14 +35,14 @@ class RetriedSession:
         self._opener.start()
 
     def close(self) -> None:
-        """Close the session and stop the threads."""
+        """Close the session and stop all threads."""
         self.closing.set()
         if self._opener.is_alive():
             self._opener.join(self.close_timeout_s)
         self._close_session()
 
     def _open_session(self) -> None:
-        """Open the session and declare its keys."""
+        """Open the session and declare all keys."""
         raise NotImplementedError
 
     def _report_failure(self, error: Exception) -> None:
@@ -50,11 +50,11 @@ class RetriedSession:
         raise NotImplementedError
 
     def _monitor_connection(self) -> None:
-        """Monitor the connection of the open session until the session is closed."""
+        """Monitor the connection until the session is closed."""
         raise NotImplementedError
 
     def _keep_open(self) -> None:
-        """Open the session and monitor its connection (runs in a thread)."""
+        """Open the session, repeat failed attempts and monitor the connection."""
         errors: tuple[type[Exception], ...] = (*zenoh_errors(), OSError)
         while not self.closing.is_set():
             try:
@@ -66,11 +66,10 @@ class RetriedSession:
             else:
                 break
         self._monitor_connection()
-        if self.closing.is_set():  # close() may have stopped waiting before the session was open
+        if self.closing.is_set():  # close() may have returned before the session was open
             self._close_session()
 
     def _close_session(self) -> None:
-        """Close the session, which also ends the threads that receive messages."""
         session, self._session = self._session, None
         if session is not None:
             session.close()  # type: ignore[no-untyped-call]
@@ -79,15 +78,13 @@ class RetriedSession:
             thread.join(JOIN_TIMEOUT_S)
 
     def _start_receiving(self, key: str, source: Any, process: Callable[[Any], None]) -> None:
-        """Start a thread that processes everything that a subscriber or a queryable receives."""
         args = (source, process)
         thread = threading.Thread(target=self._receive, args=args, name=f"zenoh {key}", daemon=True)
         thread.start()
         self._receivers = [*(one for one in self._receivers if one.is_alive()), thread]
 
     def _receive(self, source: Any, process: Callable[[Any], None]) -> None:
-        """Process everything that a source receives until the session is closed (runs in a thread)."""
-        handler = source.handler  # while a thread waits on the source itself, the source cannot be undeclared
+        handler = source.handler  # a source with a waiting thread could not be undeclared
         while not self.closing.is_set():
             try:
                 received = handler.recv()
@@ -98,7 +95,7 @@ class RetriedSession:
 
 @cache
 def zenoh_errors() -> tuple[type[Exception], ...]:
-    """Return the exceptions of zenoh, which is imported only when needed."""
+    """Return the exception classes of zenoh without importing zenoh at module level."""
     import zenoh
 
     return (zenoh.ZError,)

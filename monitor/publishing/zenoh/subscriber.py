@@ -1,15 +1,12 @@
-"""Subscriber to the results of other daemons over zenoh, as used by ``watch``.
+"""Subscriber to the results of other daemons over zenoh, for ``watch`` and ``view``.
 
-Each endpoint has a separate session in client mode, which neither listens nor scouts. Client mode is needed because a
-router does not forward data between two peers, and daemons are peers. Each endpoint needs a separate session because a
-client stays connected to the first endpoint that answers. A zenoh file may supply certificates, user and password. Raw
-samples and Allan deviations are most of the data. They are subscribed to only for devices that are shown in detail.
+Each endpoint has a separate session in client mode. Client mode is needed because a router does not forward data
+between two peers, and daemons are peers. A separate session is needed because a client stays connected to the first
+endpoint that answers. Samples and Allan deviations are received only for devices shown in detail.
 
-A late subscriber receives the last values and last events that daemons keep for this purpose. After a lost connection,
-the subscriber also receives the events that it missed. Each subscription has a ring buffer of zenoh that drops its
-oldest entries. A thread moves the entries to one common queue. ``take`` returns the messages of a topic in order of
-arrival and does not decode them. Memory is bounded: zenoh rejects messages above ``MAX_MESSAGE_BYTES``, and the queue
-drops its oldest entries.
+A late subscriber receives the last values and events that daemons keep. After a lost connection, the subscriber also
+receives missed events. Memory is bounded, because zenoh rejects messages above ``MAX_MESSAGE_BYTES`` and the queue
+drops the oldest messages.
 """
 
 import threading
@@ -45,22 +42,22 @@ DETAIL_TOPICS: Final = (topics.SAMPLES, topics.ALLAN, topics.GAP)
 RING_MESSAGES: Final = 4096
 BACKLOG_BYTES: Final = 16_000_000
 MAX_MESSAGE_BYTES: Final = 4_000_000
-"""Longest accepted message. The longest messages are sample batches of a fast replay; others have a few kilobytes."""
+"""Longest accepted message. The longest messages are sample batches of a fast replay."""
 CONNECTION_CHECK_S: Final = 0.25
 """Interval between two checks that an endpoint is still connected."""
 MAX_TOKENS: Final = 20_000
-"""Largest number of liveliness tokens that are remembered per endpoint."""
+"""Largest number of stored liveliness tokens for each endpoint."""
 MAX_REMEMBERED_MESSAGES: Final = 20_000
-"""Number of messages that are remembered to find duplicates; enough for two seconds of 1000 devices at 10 Hz."""
+"""Number of stored messages for the detection of duplicates, for two seconds of 1000 devices at 10 Hz."""
 
 
 @dataclass(frozen=True, slots=True)
-class Message:
-    """Received message, or the appearance or disappearance of a liveliness token."""
+class ReceivedMessage:
+    """Received message, or a change of a liveliness token."""
 
     key: str
     payload: bytes | None  # None for a liveliness token
-    there: bool = True  # False if a liveliness token has disappeared
+    token_exists: bool = True  # False if a liveliness token has disappeared
 
 
 class ZenohSubscriber:
@@ -71,16 +68,16 @@ class ZenohSubscriber:
     keyexpr
         Key expression that selects devices or topics, e.g. ``imu/**``, ``imu/bench-1``, ``*/*/status``.
     connect
-        Endpoints of daemons or routers. If empty, the endpoints of the file are used, or else the default endpoint.
+        Endpoints of daemons or routers. By default, the endpoints in the file or the default endpoint.
     file
-        Configuration file of zenoh for all other settings (TLS, user and password).
+        Configuration file of zenoh with TLS, user and password.
     detail
-        Keys of devices whose samples and curves are also received, e.g. ``imu/bench-1``.
+        Keys of devices with samples and Allan deviations, such as ``imu/bench-1``.
 
     Raises
     ------
     ConfigError
-        If zenoh rejects the key expression, an endpoint or the file, or other users may modify the file.
+        If zenoh rejects the key expression, an endpoint or the file, or if other users may modify the file.
     """
 
     def __init__(
@@ -93,14 +90,14 @@ class ZenohSubscriber:
         keys = {topic: topic_keys(keyexpr, topic) for topic in (*TOPICS, topics.ALIVE)}
         _check_keys(keyexpr, [key for part in keys.values() for key in part])
         keys |= {topic: tuple(f"{device}/{topic.name}" for device in detail) for topic in DETAIL_TOPICS}
-        self._backlog: BoundedQueue[Message] = BoundedQueue(BACKLOG_BYTES)
+        self._backlog: BoundedQueue[ReceivedMessage] = BoundedQueue(BACKLOG_BYTES)
         found = client_configurations(connect, file)
         self._duplicate_filter = _DuplicateFilter() if len(found) > 1 else None
         self._sessions = [_EndpointSession(endpoint, config, keys, self._push) for endpoint, config in found.items()]
 
     @property
     def dropped(self) -> int:
-        """Number of messages dropped because ``take`` was not called in time."""
+        """Number of messages that were dropped because ``take`` was not called in time."""
         return self._backlog.dropped
 
     @property
@@ -117,17 +114,17 @@ class ZenohSubscriber:
         return f"{there}; {reasons + '; ' if reasons else ''}trying the rest again"
 
     @property
-    def all_connected_s(self) -> float:
-        """Duration for which all endpoints have been connected [s]; 0 if any endpoint is not connected."""
-        return min(session.connected_s for session in self._sessions)
+    def all_connected_duration_s(self) -> float:
+        """Time [s] since all endpoints have been connected, or 0 if any endpoint is not connected."""
+        return min(session.connected_duration_s for session in self._sessions)
 
     def start(self) -> None:
         """Open the sessions in separate threads and return at once."""
         for session in self._sessions:
             session.start()
 
-    def take(self, timeout_s: float) -> list[Message]:
-        """Return the messages received since the last call. Wait up to ``timeout_s`` seconds for the first one."""
+    def take(self, timeout_s: float) -> list[ReceivedMessage]:
+        """Return all messages since the last call. Wait up to ``timeout_s`` seconds for the first message."""
         return self._backlog.take(timeout_s)
 
     def close(self) -> None:
@@ -138,21 +135,20 @@ class ZenohSubscriber:
             session.close()
         self._backlog.wake()
 
-    def _push(self, message: Message, stamp: str) -> None:
-        """Add a message to the queue unless the message is a duplicate."""
+    def _push(self, message: ReceivedMessage, stamp: str) -> None:
         if self._duplicate_filter is None or self._duplicate_filter.is_unseen(message.key, stamp):
             self._backlog.push(message, 100 + len(message.payload or b""))
 
 
 class _DuplicateFilter:
-    """Filter for messages that arrive over several endpoints, which have the same key and zenoh timestamp."""
+    """Filter for messages that several endpoints deliver, identified by key and zenoh timestamp."""
 
     def __init__(self) -> None:
         self._seen: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._lock = threading.Lock()
 
     def is_unseen(self, key: str, stamp: str) -> bool:
-        """Return True if the message has not been seen before or has no timestamp."""
+        """Return True if the message is new or has no timestamp."""
         if not stamp:
             return True
         with self._lock:
@@ -165,7 +161,7 @@ class _DuplicateFilter:
 
 
 class _EndpointSession(RetriedSession):
-    """Session with one endpoint, which passes all received messages and changes of liveliness tokens to a function."""
+    """Client session with one endpoint, which passes messages and token changes to a function."""
 
     close_timeout_s = 5.0
 
@@ -174,29 +170,27 @@ class _EndpointSession(RetriedSession):
         endpoint: str,
         config: "zenoh.Config",
         keys: Mapping[topics.Topic, Sequence[str]],
-        push: Callable[[Message, str], None],
+        push: Callable[[ReceivedMessage, str], None],
     ) -> None:
         self.endpoint = mask_secrets(endpoint)
         super().__init__(self.endpoint)
-        self.refusal = ""  # reason why the connection is refused, from the newest check; "" if no program listens there
+        self.refusal = ""  # reason why the endpoint refuses the connection; empty if no program listens
         self._endpoint, self._config, self._keys, self._push = endpoint, config, keys, push
         self._tokens: set[str] = set()  # keys of existing liveliness tokens
         self._since_s: float | None = None  # monotonic time at which the connection was established [s]
 
     @property
     def is_connected(self) -> bool:
-        """True if the session is open and connected."""
         session = self._session
         return session is not None and not is_unconnected(session)
 
     @property
-    def connected_s(self) -> float:
-        """Duration of the current connection [s]; 0 if the endpoint is not connected."""
+    def connected_duration_s(self) -> float:
+        """Duration of the current connection [s], or 0 without a connection."""
         since_s = self._since_s
         return 0.0 if since_s is None else time.monotonic() - since_s
 
     def _open_session(self) -> None:
-        """Open the session and subscribe to all keys."""
         import zenoh
 
         session = self._session = zenoh.open(self._config)
@@ -206,11 +200,10 @@ class _EndpointSession(RetriedSession):
                 self._start_receiving(key, _declare_subscriber(session, topic, key), process)
 
     def _report_failure(self, _error: Exception) -> None:
-        """Find the reason why the endpoint refuses the connection."""
         self.refusal = explain_refusal(self._endpoint, self._config)
 
     def _monitor_connection(self) -> None:
-        """Report lost tokens: zenoh reconnects by itself, but does not report the tokens of a lost endpoint."""
+        """Report lost liveliness tokens, which zenoh does not report for a lost endpoint."""
         checked_s = -REFUSAL_CHECK_S
         while not self.closing.wait(CONNECTION_CHECK_S):
             if self.is_connected:
@@ -218,30 +211,28 @@ class _EndpointSession(RetriedSession):
                 continue
             self._since_s = None
             while self._tokens:
-                self._push(Message(self._tokens.pop(), None, there=False), "")
+                self._push(ReceivedMessage(self._tokens.pop(), None, token_exists=False), "")
             if time.monotonic() - checked_s >= REFUSAL_CHECK_S:
                 self.refusal = explain_refusal(self._endpoint, self._config)
                 checked_s = time.monotonic()
 
     def _process_message(self, sample: Any) -> None:
-        """Pass on a message with its timestamp."""
         stamp = "" if sample.timestamp is None else str(sample.timestamp)
-        self._push(Message(str(sample.key_expr), bytes(sample.payload)), stamp)
+        self._push(ReceivedMessage(str(sample.key_expr), bytes(sample.payload)), stamp)
 
     def _process_token(self, sample: Any) -> None:
-        """Pass on the change of a liveliness token."""
         import zenoh
 
-        key, there = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
-        if not there:
+        key, exists = str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT
+        if not exists:
             self._tokens.discard(key)
         elif len(self._tokens) < MAX_TOKENS:
             self._tokens.add(key)
-        self._push(Message(key, None, there), "")
+        self._push(ReceivedMessage(key, None, exists), "")
 
 
 def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
-    """Return the key expressions of the messages of one topic that a key expression selects.
+    """Return the key expressions for the messages of one topic.
 
     A key expression that selects a device selects all topics of the device.
 
@@ -267,19 +258,19 @@ def topic_keys(keyexpr: str, topic: topics.Topic) -> tuple[str, ...]:
 
 
 def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str, "zenoh.Config"]:
-    """Return the zenoh configuration of a client session for each endpoint (see ``ZenohSubscriber``).
+    """Return the zenoh configuration of a client session for each endpoint.
 
     Parameters
     ----------
     connect
-        Endpoints. If empty, the endpoints of the file are used, or else the default endpoint of a daemon.
+        Endpoints of daemons or routers. By default, the endpoints in the file or the default endpoint.
     file
         Configuration file of zenoh.
 
     Raises
     ------
     ConfigError
-        If an endpoint or the file is not valid, or other users may modify the file.
+        If an endpoint or the file is invalid, or if other users may modify the file.
     """
     import zenoh
 
@@ -304,7 +295,7 @@ def client_configurations(connect: Sequence[str], file: Path | None) -> dict[str
 
 
 def _declare_subscriber(session: "zenoh.Session", topic: topics.Topic, key: str) -> Any:
-    """Subscribe to a key. The subscriber first receives the last messages that daemons keep."""
+    """Subscribe to a key and request the last messages that daemons keep."""
     import zenoh
     from zenoh import ext
 
@@ -318,7 +309,7 @@ def _declare_subscriber(session: "zenoh.Session", topic: topics.Topic, key: str)
 
 
 def _check_keys(keyexpr: str, keys: list[str]) -> None:
-    """Raise ConfigError if a key expression is not valid, or if no topic matches it."""
+    """Raise ConfigError if a key expression is invalid or matches no topic."""
     import zenoh
 
     try:

@@ -146,8 +146,8 @@ class Watcher:
             self.messages[topic] += 1
             self.bytes[topic] += len(message.payload or b"")
             if message.payload is None:
-                self.board.set_token(message.key, message.there)
-                if not message.there:
+                self.board.set_liveliness_token(message.key, message.token_exists)
+                if not message.token_exists:
                     self.gone_s[message.key] = time.monotonic()
             else:
                 self.board.process_message(message.key, message.payload)
@@ -164,7 +164,7 @@ class Watcher:
     def states(self) -> Counter[str]:
         """How many devices are in which state."""
         now_s = time.monotonic()
-        return Counter(one.state(now_s) for one in self.board.devices(now_s))
+        return Counter(one.state(now_s) for one in self.board.sorted_devices(now_s))
 
 
 def fleet(daemons: int, rate: float, publish: str, seconds: float) -> dict[str, Any]:

@@ -115,8 +115,8 @@ def queries(path: Path) -> None:
         span = TimeRange(held[1] - seconds, held[1])
         read_s = _timed(lambda span=span, asked=asked: _read(path, span, asked))  # type: ignore[misc]
         found = _read(path, span, asked)
-        said_s = _timed(lambda found=found, asked=asked: HistoryMessage.reply(found, asked, 0.0, 0).encode())  # type: ignore[misc]
-        size = len(HistoryMessage.reply(found, asked, 0.0, 0).encode())
+        said_s = _timed(lambda found=found, asked=asked: HistoryMessage.build_reply(found, asked, 0.0, 0).encode())  # type: ignore[misc]
+        size = len(HistoryMessage.build_reply(found, asked, 0.0, 0).encode())
         print(
             f"{name}: {len(found)} buckets of {found.step_s} s; {read_s * 1e3:.0f} ms to read, "
             f"{said_s * 1e3:.0f} ms to write as {size / 1e3:.0f} kB"

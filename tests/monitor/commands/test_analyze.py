@@ -70,7 +70,9 @@ def test_drift_that_was_temperature_is_told(tmp_path: Path) -> None:
     results = run_analysis(Request(tmp_path / "warm.npz"))
     (note,) = (one for one in results.analysis.notes if "follows its temperature" in one)
     assert note.startswith("gz follows its temperature")
-    written = json.loads(AnalysisMessage.of(results.analysis, temperature=results.without_temperature).encode())
+    written = json.loads(
+        AnalysisMessage.from_analysis(results.analysis, temperature=results.without_temperature).encode()
+    )
     gz = written["axes"]["gz"]["without_temperature"]
     assert set(gz) == {"model", "coefficients", "share"}
     assert written["axes"]["gz"]["temperature"]["share"] > 0.9
@@ -105,13 +107,13 @@ def test_axes_that_are_temperature_are_named_and_marked_whatever_the_status_of_k
     assert named == ["gy", "gz", "az"]
     if shape == "ramp":  # the case in which nothing was said of gy
         assert results.analysis.estimate.coefficients.status[SYMBOLS.index("K"), 1] != Status.ESTIMATED
-    written = AnalysisMessage.of(results.analysis, temperature=results.without_temperature).encode()
+    written = AnalysisMessage.from_analysis(results.analysis, temperature=results.without_temperature).encode()
     marks = {axis: one.get("temperature") for axis, one in json.loads(written)["axes"].items()}
     assert [axis for axis, one in marks.items() if one] == ["gy", "gz", "az"]
     assert set(marks["gy"]) == {"share", "p_value", "form", "one_way", "interval"}
     assert marks["gy"]["share"] > 0.95
     assert marks["gy"]["one_way"] == (shape == "heating")
-    warnings = exporters.from_analysis(written).warnings
+    warnings = exporters.from_analysis_json(written).warnings
     assert [one.split()[0] for one in warnings] == ["gy", "gz", "az"]
     study = thermal.fit_recording(path)
     if shape != "heating":

@@ -19,7 +19,7 @@ from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.estimation.detection.model_comparison import ModelGap
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import Status
-from monitor.publishing.messages.results import SlowStatistics
+from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings import loading as settings
 from monitor.settings.loading import Device, Driver
 from tests.support.loopback_link import LoopbackLink
@@ -49,7 +49,7 @@ class Caught:
             ThermalIntervalResult: self.thermals,
             DriftUpdate: self.drifts,
         }
-        if isinstance(result, SlowStatistics):
+        if isinstance(result, TotalAndHadamardCurves):
             self.totals.append((received, *result))
             self.total_times.append(unix_s)
         else:

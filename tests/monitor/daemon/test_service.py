@@ -240,7 +240,7 @@ record = false
     Service(loading.load(path), [told, TableOutput(board)]).run(60.0)
     with open_history(tmp_path / "kept" / FILE_NAME) as reader:
         kept = past.read_history(reader, "d", TimeRange(-math.inf, math.inf), step_s=60)
-    (known,) = board.devices(time.monotonic())
+    (known,) = board.sorted_devices(time.monotonic())
     assert known.coefficients is not None
     published = {Status(one) for estimate in told.all for one in estimate.coefficients.status.ravel().tolist()}
     assert told.all[-1].rate_hz == 100.0

@@ -8,14 +8,14 @@ import pytest
 from monitor.common import topics
 from monitor.publishing import remote_devices
 from monitor.publishing.messages.message import decode_message
-from monitor.publishing.messages.results import CoefficientsMessage, GapMessage, ResetReply, StatusMessage
+from monitor.publishing.messages.results import CoefficientsMessage, ModelGapMessage, ResetReply, StatusMessage
 from monitor.publishing.remote_devices import DeviceCoefficients, RemoteDevice
 from tests.monitor.publishing import made
 
 
 def test_coefficients_come_back_as_they_were() -> None:
     estimate = made.estimate(seconds=1000.0)
-    payload = CoefficientsMessage.of("a", 1.0, 0, estimate).encode()
+    payload = CoefficientsMessage.from_result("a", 1.0, 0, estimate).encode()
     found = DeviceCoefficients.from_message(decode_message(CoefficientsMessage, payload))
     for name in ("value", "lo", "hi", "status"):
         np.testing.assert_array_equal(getattr(found.coefficients, name), getattr(estimate.coefficients, name))
@@ -26,12 +26,12 @@ def test_coefficients_come_back_as_they_were() -> None:
 def test_what_is_seen_is_what_the_window_holds() -> None:
     """Not what came since the start: after a reset that is more."""
     estimate = dataclasses.replace(made.estimate(seconds=1800.0), samples=10_000_000)
-    payload = CoefficientsMessage.of("a", 1.0, 0, estimate).encode()
+    payload = CoefficientsMessage.from_result("a", 1.0, 0, estimate).encode()
     assert DeviceCoefficients.from_message(decode_message(CoefficientsMessage, payload)).filled_s == 1800.0
 
 
 def test_what_a_newer_daemon_adds_is_passed_over() -> None:
-    payload = StatusMessage.of("a", 1.0, 0, made.health()).encode()[:-1] + b',"novelty":[1,{"x":null}]}'
+    payload = StatusMessage.from_result("a", 1.0, 0, made.health()).encode()[:-1] + b',"novelty":[1,{"x":null}]}'
     assert decode_message(StatusMessage, payload).received == 360_000
     axes = b'{"gz":{"N":{"value":1e-4,"lo":1e-5,"hi":1e-3,"status":"estimated"},"Z":{"status":"new"}},"mx":{}}'
     payload = b'{"schema":"imu-monitor/coefficients/1","samples":5,"axes":' + axes + b"}"
@@ -41,7 +41,7 @@ def test_what_a_newer_daemon_adds_is_passed_over() -> None:
 
 
 def test_a_status_may_have_no_time_yet() -> None:
-    assert StatusMessage.decode(StatusMessage.of("a", None, 0, made.health()).encode()).t is None
+    assert StatusMessage.decode(StatusMessage.from_result("a", None, 0, made.health()).encode()).t is None
 
 
 @pytest.mark.parametrize(
@@ -52,9 +52,11 @@ def test_a_status_may_have_no_time_yet() -> None:
         b"[]",
         b"\xff\xfe",
         b"{}",
-        StatusMessage.of("a", 1.0, 0, made.health()).encode().replace(b"status/1", b"status/2"),
-        StatusMessage.of("a", 1.0, 0, made.health()).encode().replace(b'"received":360000', b'"received":"many"'),
-        ResetReply.of("a", 1.0, 5, "x").encode(),
+        StatusMessage.from_result("a", 1.0, 0, made.health()).encode().replace(b"status/1", b"status/2"),
+        StatusMessage.from_result("a", 1.0, 0, made.health())
+        .encode()
+        .replace(b'"received":360000', b'"received":"many"'),
+        ResetReply.from_result("a", 1.0, 5, "x").encode(),
     ],
 )
 def test_anything_else_is_a_value_error(payload: bytes) -> None:
@@ -63,13 +65,15 @@ def test_anything_else_is_a_value_error(payload: bytes) -> None:
 
 
 def test_a_status_word_of_a_coefficient_that_is_not_known() -> None:
-    payload = CoefficientsMessage.of("a", 1.0, 0, made.estimate()).encode().replace(b'"estimated"', b'"guessed"')
+    payload = (
+        CoefficientsMessage.from_result("a", 1.0, 0, made.estimate()).encode().replace(b'"estimated"', b'"guessed"')
+    )
     with pytest.raises(ValueError, match="guessed"):
         DeviceCoefficients.from_message(decode_message(CoefficientsMessage, payload))
 
 
 def device(**changed: object) -> RemoteDevice:
-    payload = StatusMessage.of("a", 1.0, 0, made.health(**changed)).encode()
+    payload = StatusMessage.from_result("a", 1.0, 0, made.health(**changed)).encode()
     return RemoteDevice("imu/a", 100.0, status=StatusMessage.decode(payload))
 
 
@@ -100,44 +104,46 @@ def test_nothing_known_but_its_presence() -> None:
 
 
 def test_ranks_and_words_of_trouble() -> None:
-    assert device(state="lost", text="no such port").rank(100.0) == 0
-    assert device(state="waiting").rank(100.0) == 1
-    assert device().rank(100.0) == 2
-    assert device(state="ended").rank(100.0) == 3
-    assert device().problems() == ""
-    assert device(outputs={"zenoh": "off", "viewer": "ok"}).problems() == ""
+    assert device(state="lost", text="no such port").display_rank(100.0) == 0
+    assert device(state="waiting").display_rank(100.0) == 1
+    assert device().display_rank(100.0) == 2
+    assert device(state="ended").display_rank(100.0) == 3
+    assert device().describe_problems() == ""
+    assert device(outputs={"zenoh": "off", "viewer": "ok"}).describe_problems() == ""
     stalled = device(outputs={"zenoh": "ok", "viewer": "stalled"}, text="odd", overflowed=1200)
-    assert stalled.rank(100.0) == 1
-    assert stalled.problems().startswith("odd; viewer: stalled; 1,200 samples overwritten")
+    assert stalled.display_rank(100.0) == 1
+    assert stalled.describe_problems().startswith("odd; viewer: stalled; 1,200 samples overwritten")
     elsewhere = device(outputs={"zenoh": "ok, but the port is busy"})
-    assert (elsewhere.rank(100.0), elsewhere.problems()) == (2, "zenoh: ok, but the port is busy")
+    assert (elsewhere.display_rank(100.0), elsewhere.describe_problems()) == (2, "zenoh: ok, but the port is busy")
 
 
 def test_a_topic_of_two_parts_and_keys_that_are_none() -> None:
-    assert remote_devices.split_key("a/b/c/command/reset") == ("a/b/c", topics.RESET)
-    assert remote_devices.split_key("status") is None
-    assert remote_devices.split_key("/status") is None
-    assert remote_devices.split_key("imu/bench-1/statuses") is None
+    assert remote_devices.split_device_and_topic("a/b/c/command/reset") == ("a/b/c", topics.RESET)
+    assert remote_devices.split_device_and_topic("status") is None
+    assert remote_devices.split_device_and_topic("/status") is None
+    assert remote_devices.split_device_and_topic("imu/bench-1/statuses") is None
 
 
 def test_disagreement_with_a_model_is_trouble_and_ranks_before_what_runs_well() -> None:
-    status = decode_message(StatusMessage, StatusMessage.of("a", 1.0, 0, made.health()).encode())
-    payload = GapMessage.of("a", 1.0, 0, made.look(scale=1.2, gz=False, gx=True)).encode()
+    status = decode_message(StatusMessage, StatusMessage.from_result("a", 1.0, 0, made.health()).encode())
+    payload = ModelGapMessage.from_result("a", 1.0, 0, made.look(scale=1.2, gz=False, gx=True)).encode()
     one = RemoteDevice("imu/a", 0.0, status)
-    assert one.rank(0.0) == 2
-    gap = decode_message(GapMessage, payload)
-    one.update(gap)
-    assert one.rank(0.0) == 1
+    assert one.display_rank(0.0) == 2
+    gap = decode_message(ModelGapMessage, payload)
+    one.update_from_message(gap)
+    assert one.display_rank(0.0) == 1
     found = gap.axes["gz"]
     lo, hi = found.where.tau
-    assert one.problems() == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
-    one.update(decode_message(GapMessage, GapMessage.of("a", 1.0, 0, made.look(gz=True)).encode()))
-    assert (one.rank(0.0), one.problems()) == (2, "")
+    assert one.describe_problems() == f"gz disagrees with its model: {found.gap:.3g} σ at τ {lo:.3g} to {hi:.3g} s"
+    one.update_from_message(
+        decode_message(ModelGapMessage, ModelGapMessage.from_result("a", 1.0, 0, made.look(gz=True)).encode())
+    )
+    assert (one.display_rank(0.0), one.describe_problems()) == (2, "")
 
 
 def test_a_limit_that_is_passed_is_trouble() -> None:
     one = device(crossed=("gz N",))
-    assert one.rank(100.0) == 1
-    assert one.problems() == "limits exceeded: gz N"
+    assert one.display_rank(100.0) == 1
+    assert one.describe_problems() == "limits exceeded: gz N"
     many = device(crossed=tuple(f"gz {i}" for i in range(100)))
-    assert many.problems() == "limits exceeded: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"
+    assert many.describe_problems() == "limits exceeded: gz 0, gz 1, gz 2, gz 3, gz 4, gz 5 and 94 more"

@@ -14,7 +14,7 @@ from monitor.publishing.result_kinds import (
     TimedResult,
     keep_all,
     keep_newest,
-    keep_spaced,
+    keep_newest_and_spaced,
     kind_of,
 )
 from tests.monitor.publishing import made
@@ -64,13 +64,13 @@ def test_results_that_wait_are_merged() -> None:
     times_s = (0.0, 0.3, 0.6, 0.9, 1.2, 1.5)
     assert merged(keep_all, times_s) == list(times_s)
     assert merged(keep_newest, times_s) == [1.5]
-    assert merged(keep_spaced, times_s) == [0.0, 0.9, 1.5]
+    assert merged(keep_newest_and_spaced, times_s) == [0.0, 0.9, 1.5]
 
 
 def test_no_value_of_a_single_sample_is_lost_when_estimates_are_merged() -> None:
     waiting: list[TimedResult] = []
     for i in range(3):
         history = PerSampleCoefficients(np.array([i]), np.full((1, 5, 6), float(i)))
-        keep_spaced(waiting, (0.1 * i, replace(made.estimate(), history=history)))
+        keep_newest_and_spaced(waiting, (0.1 * i, replace(made.estimate(), history=history)))
     assert [t_s for t_s, _ in waiting] == [0.0, pytest.approx(0.2)]
     assert waiting[-1][1].history.t_ns.tolist() == [1, 2]

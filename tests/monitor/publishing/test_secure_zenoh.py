@@ -109,7 +109,7 @@ def daemon(file: Path) -> Iterator[ZenohPublisher]:
 
     def work() -> None:
         while not ending.wait(0.1):
-            out.put(topics.STATUS, "nose", StatusMessage.of("nose", time.time(), 0, made.health()).encode())
+            out.put(topics.STATUS, "nose", StatusMessage.from_result("nose", time.time(), 0, made.health()).encode())
             while not out.commands.empty():
                 out.commands.get_nowait().reply_result(b'"done"')
 

@@ -29,12 +29,12 @@ with contextlib.closing(ZenohSubscriber("imu/**", [sys.argv[1]])) as arriving:
     while True:
         for message in arriving.take(0.2):
             if message.payload is None:
-                board.set_token(message.key, message.there)
+                board.set_liveliness_token(message.key, message.token_exists)
             else:
                 board.process_message(message.key, message.payload)
         now_s = time.monotonic()
-        states = [one.state(now_s) for one in board.devices(now_s)] or ["nobody"]
-        received = [one.status.received for one in board.devices(now_s) if one.status] or [0]
+        states = [one.state(now_s) for one in board.sorted_devices(now_s)] or ["nobody"]
+        received = [one.status.received for one in board.sorted_devices(now_s) if one.status] or [0]
         print(states[0], received[0], arriving.state, flush=True)
 """
 

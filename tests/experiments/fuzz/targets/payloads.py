@@ -15,7 +15,7 @@ from drivers.zenoh.sample_message import decode_samples, encode_samples
 from monitor.cli.shared import options
 from monitor.commands import thermal
 from monitor.common import topics
-from monitor.publishing.exporters import FORMATS, export, from_analysis
+from monitor.publishing.exporters import FORMATS, export, from_analysis_json
 from monitor.publishing.remote_devices import DeviceStates
 from monitor.publishing.terminal.live_table import device_table
 from monitor.publishing.zenoh.subscriber import ZenohSubscriber
@@ -135,7 +135,7 @@ def _analysis() -> Iterator[bytes]:
 def analysis(data: bytes) -> None:
     """What ``analyze --json`` wrote, exported in every format."""
     try:
-        noise = from_analysis(data)
+        noise = from_analysis_json(data)
     except ConfigError as error:
         one_line(error)
         return

@@ -97,7 +97,7 @@ def test_an_upper_bound_counts_under_a_lower_limit_and_never_above_an_upper_one(
     assert [(event.kind, event.sigma) for event in bound] == [("limit_crossed", None)]
     assert bound[0].values["N"]["limit"] == 1e-4
     assert bound[0].text == "gz angle random walk at most 0.172 °/√h is below 0.344 °/√h, its lower limit"
-    assert json.loads(EventMessage.of("d", 0.0, 1, bound[0]).encode())["what"]["N"]["value"] is None
+    assert json.loads(EventMessage.from_result("d", 0.0, 1, bound[0]).encode())["what"]["N"]["value"] is None
     back = told(both, [(100.0 + t, 1.5e-4) for t in range(100)])
     assert [event.kind for _, event in back] == ["limit_back"]
     high = LimitMonitor([N_ABOVE], None)

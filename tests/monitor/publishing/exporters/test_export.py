@@ -18,8 +18,8 @@ from monitor.publishing import exporters
 from monitor.publishing.exporters.kalman import (
     MARKOV_PEAK_AT,
     MARKOV_PEAK_RATIO,
-    bias_state_transition_matrix,
     process_noise_matrix,
+    state_transition_matrix,
 )
 
 MODEL = """
@@ -65,7 +65,7 @@ def analysed(status: str = "upper_bound") -> exporters.NoiseCoefficients:
         "notes": [],
         "axes": {axis: {"allan": {"tau": [0.01]}, "coefficients": terms} for axis, terms in axes.items()},
     }
-    return exporters.from_analysis(json.dumps(payload), "bench-1.json")
+    return exporters.from_analysis_json(json.dumps(payload), "bench-1.json")
 
 
 def yaml(text: str) -> dict[str, float | str]:
@@ -133,7 +133,9 @@ def test_kalibr_refuses_what_it_would_read_as_zero() -> None:
 
 
 def test_a_recording_that_does_not_say_enough_is_no_answer() -> None:
-    empty = exporters.from_analysis('{"schema": "imu-monitor/analyze/1", "samples": 3, "notes": ["few"], "axes": {}}')
+    empty = exporters.from_analysis_json(
+        '{"schema": "imu-monitor/analyze/1", "samples": 3, "notes": ["few"], "axes": {}}'
+    )
     with pytest.raises(NotReady, match="a longer recording is needed"):
         exporters.export(empty, "kalman")
     without_accelerometers = exporters.NoiseCoefficients({"gx": analysed().axes["gx"]}, 100.0, "", measured=True)
@@ -216,7 +218,7 @@ def test_discrete_noise_is_the_integral_of_the_continuous(dt: float) -> None:
     g = np.diag([n**2, k**2, 2 * sigma**2 / time])
     whole = expm(np.block([[-f, g], [np.zeros((3, 3)), f.T]]) * dt)
     phi = whole[3:, 3:].T
-    np.testing.assert_allclose(bias_state_transition_matrix(dt, time), phi, rtol=1e-10, atol=1e-15)
+    np.testing.assert_allclose(state_transition_matrix(dt, time), phi, rtol=1e-10, atol=1e-15)
     np.testing.assert_allclose(process_noise_matrix(dt, n, k, sigma, time), phi @ whole[:3, 3:], rtol=1e-8, atol=1e-20)
 
 
@@ -286,7 +288,7 @@ def test_a_wrong_request_is_said(form: str, inflation: float, options: dict[str,
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"schema": "imu-monitor/event/1", "axes": {}}', b"\xff\xfe"])
 def test_what_is_no_analysis_is_refused(text: str | bytes) -> None:
     with pytest.raises(ConfigError):
-        exporters.from_analysis(text)
+        exporters.from_analysis_json(text)
 
 
 @pytest.mark.parametrize("form", ["kalibr", "gyroparams", "kalman"])
@@ -295,10 +297,10 @@ def test_an_axis_whose_slow_part_is_temperature_is_warned_of(form: str) -> None:
     axis = {"coefficients": dict.fromkeys("NBK", one)}
     axes: dict[str, Any] = dict.fromkeys(("gx", "gy", "gz", "ax", "ay", "az"), axis)
     old = json.dumps({"schema": "imu-monitor/analyze/1", "rate": 100.0, "axes": axes})
-    assert "WARNING" not in exporters.export(exporters.from_analysis(old), form)
+    assert "WARNING" not in exporters.export(exporters.from_analysis_json(old), form)
     axes["gy"] = {**axis, "temperature": {"share": 0.987, "p_value": 1e-9, "form": "cubic", "later": 1}}
     new = json.dumps({"schema": "imu-monitor/analyze/1", "rate": 100.0, "axes": axes})
-    made = exporters.export(exporters.from_analysis(new), form)
+    made = exporters.export(exporters.from_analysis_json(new), form)
     mark = "%" if form == "gyroparams" else "#"
     [line] = [line for line in made.splitlines() if "WARNING" in line]
     assert line == (

@@ -33,12 +33,12 @@ from monitor.publishing.messages.results import (
     AllanMessage,
     CoefficientsMessage,
     EventMessage,
-    GapMessage,
+    ModelGapMessage,
     ResetReply,
-    SlowStatistics,
     StatusMessage,
     ThermalMessage,
-    TotalMessage,
+    TotalAndHadamardCurves,
+    TotalAndHadamardMessage,
 )
 
 EXAMPLES = Path(__file__).parent / "examples"
@@ -173,21 +173,23 @@ def messages() -> dict[str, Message | AnalysisMessage | FailedAnalysisMessage]:
     device, query = "bench-1", HistoryQuery(what=PARTS)
     waiting = Health("waiting", None, 0, 0, 0, 0, None, None, 1, {}, "", 0.5)
     return {
-        "allan": AllanMessage.of(device, UNIX_S, 0, estimate()),
-        "coefficients": CoefficientsMessage.of(device, UNIX_S, 0, estimate()),
-        "total": TotalMessage.of(device, UNIX_S, 360_000, SlowStatistics(*slow_curves())),
-        "gap": GapMessage.of(device, UNIX_S, 0, gap()),
-        "thermal": ThermalMessage.of(device, UNIX_S, 360_000, thermal()),
-        "event": EventMessage.of(device, UNIX_S, 7, event()),
-        "event_plain": EventMessage.of(device, UNIX_S, 7, Event("link_back", 0, "back")),
-        "status": StatusMessage.of(device, UNIX_S, 0, health()),
-        "status_before_the_first_sample": StatusMessage.of(device, None, 0, waiting),
-        "reset": ResetReply.of(device, UNIX_S, 7, "the window is empty"),
-        "history": HistoryMessage.reply(past(), query, UNIX_S, 7),
-        "history_of_one_coefficient": HistoryMessage.reply(
+        "allan": AllanMessage.from_result(device, UNIX_S, 0, estimate()),
+        "coefficients": CoefficientsMessage.from_result(device, UNIX_S, 0, estimate()),
+        "total": TotalAndHadamardMessage.from_result(device, UNIX_S, 360_000, TotalAndHadamardCurves(*slow_curves())),
+        "gap": ModelGapMessage.from_result(device, UNIX_S, 0, gap()),
+        "thermal": ThermalMessage.from_result(device, UNIX_S, 360_000, thermal()),
+        "event": EventMessage.from_result(device, UNIX_S, 7, event()),
+        "event_plain": EventMessage.from_result(device, UNIX_S, 7, Event("link_back", 0, "back")),
+        "status": StatusMessage.from_result(device, UNIX_S, 0, health()),
+        "status_before_the_first_sample": StatusMessage.from_result(device, None, 0, waiting),
+        "reset": ResetReply.from_result(device, UNIX_S, 7, "the window is empty"),
+        "history": HistoryMessage.build_reply(past(), query, UNIX_S, 7),
+        "history_of_one_coefficient": HistoryMessage.build_reply(
             past(), HistoryQuery(what=("coefficients",), axes=("gz",), symbols=("B", "N")), UNIX_S, 7
         ),
-        "analyze": AnalysisMessage.of(analysis()),
-        "analyze_with_all_curves": AnalysisMessage.of(analysis(), *slow_curves(), dynamic(), without_temperature()),
+        "analyze": AnalysisMessage.from_analysis(analysis()),
+        "analyze_with_all_curves": AnalysisMessage.from_analysis(
+            analysis(), *slow_curves(), dynamic(), without_temperature()
+        ),
         "analyze_failed": FailedAnalysisMessage(3, ["too few samples"]),
     }

@@ -13,14 +13,14 @@ from monitor.publishing.messages.results import (
     CoefficientsMessage,
     EventMessage,
     StatusMessage,
-    fitted_variance,
+    fitted_allan_variance,
 )
 from tests.monitor.publishing import made
 
 
 def through_messages(estimate: Estimate, **changed: object) -> Estimate:
-    allan = json.loads(AllanMessage.of("a", 1.76e9, 0, estimate).encode()) | changed
-    payload = CoefficientsMessage.of("a", 1.76e9, 0, estimate).encode()
+    allan = json.loads(AllanMessage.from_result("a", 1.76e9, 0, estimate).encode()) | changed
+    payload = CoefficientsMessage.from_result("a", 1.76e9, 0, estimate).encode()
     coefficients = decode_message(CoefficientsMessage, payload).to_coefficients()
     return decode_message(AllanMessage, json.dumps(allan).encode()).to_estimate(coefficients, frozenset())
 
@@ -44,7 +44,7 @@ def test_the_fitted_curve_is_that_of_the_standard() -> None:
     coefficients.value[:] = np.nan
     coefficients.value[1, 0] = 3.0
     coefficients.value[2, 1] = 2.0
-    fitted = fitted_variance(np.array([1.0, 9.0]), 1000.0, coefficients)
+    fitted = fitted_allan_variance(np.array([1.0, 9.0]), 1000.0, coefficients)
     assert fitted[:, 0] == pytest.approx([9.0, 1.0])
     assert fitted[:, 1] == pytest.approx([1.7651, 1.7651], rel=1e-4)
     assert np.isnan(fitted[:, 2:]).all()
@@ -61,10 +61,10 @@ def test_what_is_no_curve_is_refused(changed: dict[str, object]) -> None:
 
 def test_health_and_events() -> None:
     sent = made.health(text="viewer is slow")
-    got = StatusMessage.decode(StatusMessage.of("a", 1.0, 0, sent).encode()).to_health()
+    got = StatusMessage.decode(StatusMessage.from_result("a", 1.0, 0, sent).encode()).to_health()
     assert got.text == "viewer is slow"
     assert (got.received, got.uptime_s, got.memory_bytes) == (sent.received, sent.uptime_s, sent.memory_bytes)
     happened = Event("noise_changed", 10**18, "gz rose", "gz", {"N": {"before": 1.0, "after": 2.0}})
-    read = EventMessage.decode(EventMessage.of("a", 1e9, 5, happened).encode()).to_event()
+    read = EventMessage.decode(EventMessage.from_result("a", 1e9, 5, happened).encode()).to_event()
     assert (read.kind, read.axis, read.text, read.values) == ("noise_changed", "gz", "gz rose", happened.values)
     assert read.axis in AXES

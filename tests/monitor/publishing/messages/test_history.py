@@ -40,7 +40,7 @@ def made() -> HistoryTable:
 
 
 def test_the_layout_is_the_documented_one() -> None:
-    said = json.loads(HistoryMessage.reply(made(), ALL, T0 + 130.0, 7000).encode())
+    said = json.loads(HistoryMessage.build_reply(made(), ALL, T0 + 130.0, 7000).encode())
     assert (said["schema"], said["device"], said["t"], said["samples"]) == (
         "imu-monitor/history/1", "bench-1", T0 + 130.0, 7000,
     )  # fmt: skip
@@ -75,14 +75,14 @@ def test_the_layout_is_the_documented_one() -> None:
 
 def test_only_what_is_asked_for_is_said() -> None:
     asked = HistoryQuery(what=("coefficients",), axes=("gz",), symbols=("B", "N"))
-    said = json.loads(HistoryMessage.reply(made(), asked, T0, 1).encode())
+    said = json.loads(HistoryMessage.build_reply(made(), asked, T0, 1).encode())
     assert set(said) & {"deviations", "status", "events"} == set()
     assert {axis: list(letters) for axis, letters in said["axes"].items()} == {"gz": ["B", "N"]}
 
 
 def test_what_is_read_is_what_was_kept() -> None:
     kept = made()
-    found = decode_history(HistoryMessage.reply(kept, ALL, T0, 1).encode())
+    found = decode_history(HistoryMessage.build_reply(kept, ALL, T0, 1).encode())
     assert (found.device, found.span, found.step_s) == (kept.device, kept.span, kept.step_s)
     assert (found.events, found.events_in_all) == (kept.events, kept.events_in_all)
     np.testing.assert_array_equal(found.start_s, kept.start_s)
@@ -105,7 +105,7 @@ def test_a_bound_within_a_bucket_of_estimates_is_not_shown_as_its_interval() -> 
         rows.append(minutes.add_estimate(T0 + i, estimate(seconds=seconds)))
     row = merge_rows([one for one in (*rows, minutes.flush()) if one is not None], int(T0), 60)
     one = build_table("a", TimeRange(T0, T0 + 60.0), 60, [row], [], 0)
-    letter = json.loads(HistoryMessage.reply(one, ALL, T0, 1).encode())["axes"]["gz"]["B"]
+    letter = json.loads(HistoryMessage.build_reply(one, ALL, T0, 1).encode())["axes"]["gz"]["B"]
     assert (letter["status"], letter["n"]) == (["estimated"], [1])
     assert letter["lo"][0] < letter["value"][0] < letter["hi"][0]
 
@@ -113,7 +113,7 @@ def test_a_bound_within_a_bucket_of_estimates_is_not_shown_as_its_interval() -> 
 @settings(max_examples=60, deadline=None)
 @given(data=st.data())
 def test_any_payload_is_an_answer_or_a_value_error(data: st.DataObject) -> None:
-    said = json.loads(HistoryMessage.reply(made(), ALL, T0, 1).encode())
+    said = json.loads(HistoryMessage.build_reply(made(), ALL, T0, 1).encode())
     junk = st.sampled_from([None, [], {}, -1, 1e300, 10**30, "x", [None], [[1.0]], {"gz": 1}, [1.0, None, "x"]])
     for _ in range(data.draw(st.integers(1, 3))):
         at = said
@@ -133,7 +133,7 @@ def test_any_payload_is_an_answer_or_a_value_error(data: st.DataObject) -> None:
 
 def test_texts_of_strangers_do_not_steer_the_terminal() -> None:
     strange = replace(made(), device="a\x1b[31m", events=(replace(EVENT, text="b\x1b]0;c\x07", kind="k\n"),))
-    found = decode_history(HistoryMessage.reply(strange, ALL, T0, 1).encode())
+    found = decode_history(HistoryMessage.build_reply(strange, ALL, T0, 1).encode())
     assert (found.device, found.events[0].kind, found.events[0].text) == ("a [31m", "k ", "b ]0;c ")
 
 

@@ -20,13 +20,13 @@ from monitor.publishing.messages.results import (
     AllanMessage,
     CoefficientsMessage,
     EventMessage,
-    GapMessage,
+    ModelGapMessage,
     ReconcileReply,
     ResetReply,
-    SlowStatistics,
     StatusMessage,
     ThermalMessage,
-    TotalMessage,
+    TotalAndHadamardCurves,
+    TotalAndHadamardMessage,
 )
 from tests.monitor.publishing import made
 
@@ -50,14 +50,16 @@ def gyro_z_only() -> Any:
 
 
 ALL = {
-    topics.ALLAN: AllanMessage.of("bench-1", UNIX_S, 0, made.estimate()).encode(),
-    topics.COEFFICIENTS: CoefficientsMessage.of("bench-1", UNIX_S, 0, made.estimate()).encode(),
-    topics.TOTAL: TotalMessage.of("bench-1", UNIX_S, 360_000, SlowStatistics(*made.slow_curves())).encode(),
-    topics.GAP: GapMessage.of("bench-1", UNIX_S, 0, made.look(gz=False, gx=True)).encode(),
-    topics.THERMAL: ThermalMessage.of("bench-1", UNIX_S, 360_000, made.thermal_look()).encode(),
-    topics.EVENT: EventMessage.of("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back")).encode(),
-    topics.STATUS: StatusMessage.of("bench-1", UNIX_S, 0, made.health()).encode(),
-    topics.RESET: ResetReply.of("bench-1", UNIX_S, 360_000, "the window is empty").encode(),
+    topics.ALLAN: AllanMessage.from_result("bench-1", UNIX_S, 0, made.estimate()).encode(),
+    topics.COEFFICIENTS: CoefficientsMessage.from_result("bench-1", UNIX_S, 0, made.estimate()).encode(),
+    topics.TOTAL: TotalAndHadamardMessage.from_result(
+        "bench-1", UNIX_S, 360_000, TotalAndHadamardCurves(*made.slow_curves())
+    ).encode(),
+    topics.GAP: ModelGapMessage.from_result("bench-1", UNIX_S, 0, made.look(gz=False, gx=True)).encode(),
+    topics.THERMAL: ThermalMessage.from_result("bench-1", UNIX_S, 360_000, made.thermal_look()).encode(),
+    topics.EVENT: EventMessage.from_result("bench-1", UNIX_S, 360_000, Event("link_back", 0, "back")).encode(),
+    topics.STATUS: StatusMessage.from_result("bench-1", UNIX_S, 0, made.health()).encode(),
+    topics.RESET: ResetReply.from_result("bench-1", UNIX_S, 360_000, "the window is empty").encode(),
     topics.RECONCILE: ReconcileReply(device="bench-1", t=UNIX_S, samples=360_000).encode_report(
         {"schema": "x", "verdict": "agrees"}, 0, None
     ),
@@ -135,7 +137,7 @@ def test_thermal() -> None:
 
 def test_gap() -> None:
     look = made.look(made.estimate(seconds=600.0), scale=1.1, gz=False, gx=True)
-    found = parsed(GapMessage.of("a", UNIX_S, 0, look).encode())
+    found = parsed(ModelGapMessage.from_result("a", UNIX_S, 0, look).encode())
     assert (found["rate"], found["window"], found["filled"]) == (100.0, 3600.0, 600.0)
     assert found["tau"] == look.tau_s.tolist()
     assert list(found["axes"]) == list(AXES)
@@ -154,7 +156,7 @@ def test_gap() -> None:
 def test_where_a_model_knows_nothing_it_says_null() -> None:
     look = made.look(made.estimate(seconds=600.0))
     look.axes["gz"].z[0] = np.nan
-    assert parsed(GapMessage.of("a", UNIX_S, 0, look).encode())["axes"]["gz"]["z"][0] is None
+    assert parsed(ModelGapMessage.from_result("a", UNIX_S, 0, look).encode())["axes"]["gz"]["z"][0] is None
 
 
 def test_the_reports_own_words_are_kept_and_the_head_is_ours() -> None:
@@ -167,20 +169,20 @@ def test_the_reports_own_words_are_kept_and_the_head_is_ours() -> None:
 
 
 def test_too_few_data_are_null_and_say_so() -> None:
-    found = parsed(CoefficientsMessage.of("a", UNIX_S, 0, made.estimate(seconds=600.0)).encode())
+    found = parsed(CoefficientsMessage.from_result("a", UNIX_S, 0, made.estimate(seconds=600.0)).encode())
     assert found["axes"]["ax"]["R"] == {"value": None, "lo": None, "hi": None, "status": "unestimated"}
 
 
 def test_axes_that_are_not_measured_are_absent() -> None:
     estimate = gyro_z_only()
-    assert list(parsed(CoefficientsMessage.of("a", UNIX_S, 0, estimate).encode())["axes"]) == ["gz"]
-    assert list(parsed(AllanMessage.of("a", UNIX_S, 0, estimate).encode())["axes"]) == ["gz"]
+    assert list(parsed(CoefficientsMessage.from_result("a", UNIX_S, 0, estimate).encode())["axes"]) == ["gz"]
+    assert list(parsed(AllanMessage.from_result("a", UNIX_S, 0, estimate).encode())["axes"]) == ["gz"]
 
 
 def test_allan() -> None:
     estimate = gyro_z_only()
     estimate.curve.avar[-1, 2] = estimate.curve.lo[-1, 2] = estimate.curve.hi[-1, 2] = np.nan
-    found = parsed(AllanMessage.of("a", UNIX_S, 0, estimate).encode())
+    found = parsed(AllanMessage.from_result("a", UNIX_S, 0, estimate).encode())
     assert found["tau"] == estimate.curve.tau_s.tolist()
     assert set(found["axes"]["gz"]) == {"deviation", "lo", "hi"}
     gz = found["axes"]["gz"]
@@ -199,7 +201,7 @@ def test_event() -> None:
         since_ns=1_000_000_000,
         sigma=9.1,
     )
-    found = parsed(EventMessage.of("bench-1", UNIX_S, 7, what).encode())
+    found = parsed(EventMessage.from_result("bench-1", UNIX_S, 7, what).encode())
     assert {key: found[key] for key in list(found)[4:]} == {
         "kind": "noise_changed",
         "axis": "gz",
@@ -212,7 +214,7 @@ def test_event() -> None:
 
 def test_status() -> None:
     health = made.health(outputs={"zenoh": "ok", "viewer": "stalled"}, text="…", rate_hz=None, latency_p99_s=None)
-    found = parsed(StatusMessage.of("bench-1", UNIX_S, 0, health).encode())
+    found = parsed(StatusMessage.from_result("bench-1", UNIX_S, 0, health).encode())
     assert {key: found[key] for key in list(found)[4:]} == {
         "state": "running",
         "rate": None,
@@ -247,7 +249,7 @@ def analyzed(**more: Any) -> dict[str, Any]:
     theta = np.zeros((5, 6)) + made.true_coefficients() ** 2
     values = 1e-3 * np.random.default_rng(1).standard_normal((3000, 6))
     return parsed(
-        AnalysisMessage.of(
+        AnalysisMessage.from_analysis(
             result,
             total_curve(values, 100.0, theta, np.array([1, 1000, 2900])),
             hadamard_curve(values, 100.0, theta, np.array([1, 1000])),
@@ -321,7 +323,7 @@ def test_dynamic_curves_are_lists_by_time_step() -> None:
 
 
 def test_what_was_not_made_is_absent() -> None:
-    found = parsed(AnalysisMessage.of(made.analysis()).encode())
+    found = parsed(AnalysisMessage.from_analysis(made.analysis()).encode())
     assert "dynamic" not in found
     assert list(found["axes"]["gz"]) == ["allan", "coefficients", "bandwidth"]
     assert found["motions"] == found["changes"] == []

@@ -11,7 +11,7 @@ from drivers.errors import ConfigError
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.publishing.plots import allan_figure, analysis_plot, dynamic_figure, style
-from monitor.publishing.plots.allan_figure import OtherDeviation
+from monitor.publishing.plots.allan_figure import AdditionalDeviation
 from monitor.publishing.plots.analysis_plot import AnalysisPlotData
 from monitor.publishing.plots.dynamic_figure import ChangeMark
 from tests.monitor.publishing import made
@@ -125,7 +125,7 @@ def test_total_deviation_goes_on_where_the_allan_deviation_ends() -> None:
     longest = estimate.curve.tau_s[-1]
     tau_s = longest * np.array([0.5, 1.0, 2.0, 4.0])
     deviation = np.full((4, 6), 3.0e-5)
-    total = OtherDeviation("total", tau_s, deviation, 0.5 * deviation, np.full((4, 6), np.nan), only_beyond=True)
+    total = AdditionalDeviation("total", tau_s, deviation, 0.5 * deviation, np.full((4, 6), np.nan), only_beyond=True)
     axes = panel(estimate=estimate, others=[total])
     open_marks = [line.get_xdata() for line in axes.lines if line.get_markerfacecolor() == "white"]
     beyond = [x.tolist() for x in open_marks if len(x)]
@@ -136,16 +136,16 @@ def test_total_deviation_goes_on_where_the_allan_deviation_ends() -> None:
 
 def test_the_summary_says_what_is_missing() -> None:
     estimate = made.estimate()
-    assert analysis_plot.recording_line(estimate) == "360,000 samples at 100 Hz, 1 h 00 min"
-    assert analysis_plot.recording_line(replace(estimate, samples=359_000)).endswith("1 h 00 min, 1,000 missing")
+    assert analysis_plot.describe_recording(estimate) == "360,000 samples at 100 Hz, 1 h 00 min"
+    assert analysis_plot.describe_recording(replace(estimate, samples=359_000)).endswith("1 h 00 min, 1,000 missing")
 
 
 def test_k_or_r_is_said_of_bounds_only() -> None:
     estimate = replace(made.estimate(seconds=1000.0), k_or_r=np.array([True, False] + [True] * 4))
-    assert analysis_plot.is_k_or_r(estimate, "K", "gx")
-    assert not analysis_plot.is_k_or_r(estimate, "K", "gy")
-    assert not analysis_plot.is_k_or_r(estimate, "N", "gx")
-    assert not analysis_plot.is_k_or_r(made.estimate(), "K", "gx")
+    assert analysis_plot.is_k_r_ambiguous(estimate, "K", "gx")
+    assert not analysis_plot.is_k_r_ambiguous(estimate, "K", "gy")
+    assert not analysis_plot.is_k_r_ambiguous(estimate, "N", "gx")
+    assert not analysis_plot.is_k_r_ambiguous(made.estimate(), "K", "gx")
 
 
 @pytest.mark.long
@@ -157,7 +157,7 @@ def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing
     drawn = AnalysisPlotData(made.analysis(estimate), dynamic=changing, marks=[ChangeMark(300.0, "gz")])
     analysis_plot.save_analysis_plot(drawn, path, "bench-1")
     image = pixels(path)
-    below = dynamic_figure.height_inches(changing, "gyro") * style.STYLE["figure.dpi"]
+    below = dynamic_figure.dynamic_figure_height_inches(changing, "gyro") * style.STYLE["figure.dpi"]
     assert image.shape[0] == pytest.approx(analysis_plot.INCHES[1] * style.STYLE["figure.dpi"] + below, abs=2)
     gyro = image[round(analysis_plot.INCHES[1] * style.STYLE["figure.dpi"]) :, :, :3]
     blue = (gyro[..., 2] - gyro[..., 0] > 0.3).any(axis=0)
@@ -167,7 +167,7 @@ def test_dynamic_curves_stand_below_in_the_same_picture(tmp_path: Path, changing
 
 
 def test_colours_are_of_the_deviation_over_its_median(changing: DynamicAllan) -> None:
-    relative = dynamic_figure.divide_by_median(changing)
+    relative = dynamic_figure.divide_by_time_median(changing)
     assert np.nanmedian(relative, axis=0) == pytest.approx(np.ones(relative.shape[1:]))
     assert relative[-1, 0, 0] / relative[0, 0, 0] == pytest.approx(2.0, rel=0.1)
     assert relative[-1, 0, 5] / relative[0, 0, 5] == pytest.approx(1.0, rel=0.1)

@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 
 from monitor.publishing.plots.reconcile_figures import (
-    compared_diagnostic_svg,
-    detail_view,
+    common_y_limits,
+    diagnostic_comparison_svg,
     gap_chart_svg,
     interval_chart_svg,
     range_on_x_axis,
-    select_view,
-    to_field_units,
-    value_limits,
+    select_diagnostic_view,
+    to_displayed_units,
+    zoomed_view,
 )
 from monitor.publishing.plots.style import COLOURS, ORANGE
 from monitor.reconcile.result import Location, ParameterInterval, PlotData
@@ -33,7 +33,7 @@ def drawing(
     *views: PlotData, where: Location | None = None, width: float = 4.0, height: float = 2.5
 ) -> ElementTree.Element:
     return ElementTree.fromstring(
-        compared_diagnostic_svg([(f"panel {i}", view) for i, view in enumerate(views)], "gz", width, height, where)
+        diagnostic_comparison_svg([(f"panel {i}", view) for i, view in enumerate(views)], "gz", width, height, where)
     )
 
 
@@ -62,7 +62,7 @@ def test_panels_have_names_and_units_of_the_field() -> None:
 
 def test_a_point_of_the_curve_stands_at_its_place() -> None:
     (at,) = paths(drawing(ALLAN), COLOURS[2])
-    low, high = np.log10(value_limits([to_field_units("", ALLAN, "gz", None)]))
+    low, high = np.log10(common_y_limits([to_displayed_units("", ALLAN, "gz", None)]))
     tau, sigma = np.log10(ALLAN.x), np.log10(ALLAN.measured * np.degrees(3600.0))
     left, right, top, bottom = 72.0 * np.array([0.58, 0.15, 0.30, 0.44])
     wide, tall = 288.0 - left - right, 180.0 - top - bottom
@@ -84,7 +84,7 @@ def test_a_range_is_marked_and_named_where_the_diagnostic_resolves_it() -> None:
 
 
 def test_names_are_escaped_and_equal_data_give_equal_bytes() -> None:
-    first, second = (compared_diagnostic_svg([("a <b> & $x$", PSD)], "gz", 4.0, 2.5) for _ in range(2))
+    first, second = (diagnostic_comparison_svg([("a <b> & $x$", PSD)], "gz", 4.0, 2.5) for _ in range(2))
     assert first == second
     assert "a <b> & $x$" in texts(ElementTree.fromstring(first))
 
@@ -92,17 +92,17 @@ def test_names_are_escaped_and_equal_data_give_equal_bytes() -> None:
 def test_an_almost_empty_bin_does_not_press_the_curves_flat() -> None:
     deep = replace(PSD, measured=PSD.measured.copy())
     deep.measured[3] = 1e-30
-    low, high = value_limits([to_field_units("", deep, "gz", None)])
+    low, high = common_y_limits([to_displayed_units("", deep, "gz", None)])
     assert np.log10(high / low) < 6.0
     peak = replace(PSD, measured=PSD.measured.copy())
     peak.measured[300] = 1.0  # but a line is what one looks for
-    assert value_limits([to_field_units("", peak, "gz", None)])[1] > 1.0
+    assert common_y_limits([to_displayed_units("", peak, "gz", None)])[1] > 1.0
 
 
 def test_panels_side_by_side_have_one_height() -> None:
     small = replace(LEVEL, measured=0.1 * LEVEL.measured, lo=0.1 * LEVEL.lo, hi=0.1 * LEVEL.hi)
-    both = value_limits([to_field_units("", one, "gz", None) for one in (LEVEL, small)])
-    assert both == value_limits([to_field_units("", LEVEL, "gz", None)])
+    both = common_y_limits([to_displayed_units("", one, "gz", None) for one in (LEVEL, small)])
+    assert both == common_y_limits([to_displayed_units("", LEVEL, "gz", None)])
 
 
 def test_gaps_zeros_and_constants_can_be_drawn() -> None:
@@ -117,15 +117,15 @@ def test_gaps_zeros_and_constants_can_be_drawn() -> None:
 
 
 def test_a_narrow_range_has_a_detail_plot_and_a_wide_one_has_not() -> None:
-    part = detail_view(PSD, PEAK)
+    part = zoomed_view(PSD, PEAK)
     assert part is not None
     assert part.x[0] < 17.1
     assert part.x[-1] > 17.5
     assert part.x.size < PSD.x.size / 4
     assert part.measured.max() == PSD.measured[np.argmin(np.abs(PSD.x - 17.3))]
-    assert detail_view(ALLAN, Location(tau=(0.01, 0.64))) is None
-    assert detail_view(ALLAN, Location(tau=(1.0, 1.1))) is None  # three points are no picture
-    assert detail_view(PSD, Location()) is None
+    assert zoomed_view(ALLAN, Location(tau=(0.01, 0.64))) is None
+    assert zoomed_view(ALLAN, Location(tau=(1.0, 1.1))) is None  # three points are no picture
+    assert zoomed_view(PSD, Location()) is None
 
 
 def test_each_range_lies_along_the_views_that_resolve_it() -> None:
@@ -137,9 +137,9 @@ def test_each_range_lies_along_the_views_that_resolve_it() -> None:
 
 
 def test_a_diagnostic_without_plot_uses_the_one_along_its_range() -> None:
-    assert select_view(START.plots, "allan", Location()) is ALLAN
-    assert select_view(START.plots, "lines", PEAK) is PSD
-    assert select_view(START.plots, "other_axes", Location(source="ax")) is None
+    assert select_diagnostic_view(START.plots, "allan", Location()) is ALLAN
+    assert select_diagnostic_view(START.plots, "lines", PEAK) is PSD
+    assert select_diagnostic_view(START.plots, "other_axes", Location(source="ax")) is None
 
 
 def test_a_gap_chart_names_every_diagnostic_and_its_threshold() -> None:

@@ -16,7 +16,7 @@ from monitor.publishing.plots.dynamic_figure import (
     _shown_coefficients,
     draw_dynamic_panels,
 )
-from monitor.publishing.plots.style import COLOURS, DARK, time_unit
+from monitor.publishing.plots.style import COLOURS, DARK, select_time_unit
 
 
 @pytest.fixture(scope="module")
@@ -103,4 +103,4 @@ def test_courses_hold_their_values_and_most_of_their_bands(white: DynamicAllan) 
     ("span_s", "name"), [(599.0, "s"), (600.0, "min"), (10_800.0, "h"), (259_200.0, "d"), (1e9, "d")]
 )
 def test_the_time_axis_has_the_unit_of_its_span(span_s: float, name: str) -> None:
-    assert time_unit(span_s)[0] == name
+    assert select_time_unit(span_s)[0] == name

@@ -99,7 +99,7 @@ def test_what_is_not_known_is_said_in_words() -> None:
     assert "— <small>(too few data)</small>" in " ".join(text.split())
     assert "<h2>Notes</h2>" not in text
     drifting = replace(made.estimate(seconds=1000.0), k_or_r=np.array([True] + [False] * 5))
-    small = {letter: analysis_report.format_cell(drifting, letter, "gx")[1] for letter in SYMBOLS}
+    small = {letter: analysis_report.format_value_and_interval(drifting, letter, "gx")[1] for letter in SYMBOLS}
     assert small["K"] == "(upper bound; K or R)"
     assert small["R"] == "(too few data)"
     assert "…" in small["N"]

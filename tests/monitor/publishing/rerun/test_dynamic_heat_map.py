@@ -121,7 +121,7 @@ def test_gaps_have_their_row_only_where_there_is_a_model() -> None:
 
 
 def test_the_view_holds_picture_and_labels() -> None:
-    (left, right), (top, bottom) = dynamic_heat_map.view_bounds(17)
+    (left, right), (top, bottom) = dynamic_heat_map.heat_map_bounds(17)
     assert left < -11.0
     assert right > dynamic_heat_map.BAR_X + 11.0
     assert top < -4.0

@@ -16,7 +16,7 @@ from monitor.publishing.rerun.fleet import FleetView, full_device_key
 from monitor.publishing.rerun.panel_text import fleet_text
 from monitor.publishing.rerun.viewer_settings import DeviceInfo, ViewerSettings
 from monitor.publishing.zenoh.publisher import ZenohPublisher
-from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
+from monitor.publishing.zenoh.subscriber import ReceivedMessage, ZenohSubscriber
 from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import made
 from tests.support.ports import free_endpoint
@@ -67,19 +67,27 @@ def test_devices_in_detail_are_drawn_and_the_others_have_a_row(tmp_path: Path, m
         def publish() -> None:
             for device in ("nose", "tail"):
                 out.set_alive(device, True)
-                out.put(topics.STATUS, device, StatusMessage.of(device, time.time(), 0, made.health()).encode())
                 out.put(
-                    topics.COEFFICIENTS, device, CoefficientsMessage.of(device, 1.76e9, 0, made.estimate()).encode()
+                    topics.STATUS, device, StatusMessage.from_result(device, time.time(), 0, made.health()).encode()
                 )
-                out.put(topics.ALLAN, device, AllanMessage.of(device, 1.76e9, 0, made.estimate()).encode())
+                out.put(
+                    topics.COEFFICIENTS,
+                    device,
+                    CoefficientsMessage.from_result(device, 1.76e9, 0, made.estimate()).encode(),
+                )
+                out.put(topics.ALLAN, device, AllanMessage.from_result(device, 1.76e9, 0, made.estimate()).encode())
                 out.put(topics.SAMPLES, device, encode_samples(device, 10, rows))
             stop.wait(0.2)
 
         topics_shown = ("samples", "coefficients", "allan", "status")
         wait_for(lambda: publish() or taken >= {f"imu/nose/{topic}" for topic in topics_shown} | {"imu/tail/status"})
         publish()  # an Allan curve that comes before any coefficients is not drawn
-        out.put(topics.EVENT, "tail", EventMessage.of("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz")).encode())
-        wait_for(lambda: "imu/tail/event" in taken and len(fleet.board.devices(time.monotonic())) == 2)
+        out.put(
+            topics.EVENT,
+            "tail",
+            EventMessage.from_result("tail", 1.76e9, 5, Event("moved", 0, "gz moved", "gz")).encode(),
+        )
+        wait_for(lambda: "imu/tail/event" in taken and len(fleet.board.sorted_devices(time.monotonic())) == 2)
         tables = len(drawn)
         wait_for(lambda: len(drawn) >= tables + 2, "two more tables")
         stop.set()
@@ -100,13 +108,15 @@ def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.
     monkeypatch.setattr(viewer, "put", lambda _device, unix_s, _health: drawn.append(unix_s))
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
     fleet.process_message(
-        Message("imu/a/status", StatusMessage.of("a", None, 0, made.health(state="waiting")).encode())
+        ReceivedMessage("imu/a/status", StatusMessage.from_result("a", None, 0, made.health(state="waiting")).encode())
     )
-    (known,) = fleet.board.devices(time.monotonic())
+    (known,) = fleet.board.sorted_devices(time.monotonic())
     assert known.status is not None
     assert known.status.state == "waiting"
     assert drawn == []
-    fleet.process_message(Message("imu/a/status", StatusMessage.of("a", 5.0, 0, made.health()).encode()))
+    fleet.process_message(
+        ReceivedMessage("imu/a/status", StatusMessage.from_result("a", 5.0, 0, made.health()).encode())
+    )
     assert drawn == [5.0]
     assert fleet.malformed == fleet.board.malformed == 0
 
@@ -114,16 +124,18 @@ def test_a_status_without_a_time_has_a_row_and_is_not_drawn(monkeypatch: pytest.
 def test_hostile_messages_change_nothing_and_are_counted() -> None:
     viewer = RerunView(ViewerSettings(mode="none"), [DeviceInfo("imu/a")], fleet=True)
     fleet = FleetView(ZenohSubscriber("imu/**", [free_endpoint()], None, ["imu/a"]), viewer, ["imu/a"])
-    fleet.process_message(Message("imu/a/coefficients", CoefficientsMessage.of("a", 1.0, 0, made.estimate()).encode()))
+    fleet.process_message(
+        ReceivedMessage("imu/a/coefficients", CoefficientsMessage.from_result("a", 1.0, 0, made.estimate()).encode())
+    )
     for key, payload in {
         "imu/a/samples": b"\x81" * 10_000,
         "imu/a/allan": b'{"schema":"imu-monitor/allan/1","tau":[1]}',
         "imu/a/event": b"[" * 60_000,
         "other": b"",
     }.items():
-        fleet.process_message(Message(key, payload))
+        fleet.process_message(ReceivedMessage(key, payload))
     assert (fleet.malformed, fleet.board.malformed) == (2, 1)
-    assert [one.key for one in fleet.board.devices(time.monotonic())] == ["imu/a"]
+    assert [one.key for one in fleet.board.sorted_devices(time.monotonic())] == ["imu/a"]
 
 
 def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell() -> None:
@@ -132,11 +144,13 @@ def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell
         "well": {},
         "bad": {"state": "lost", "text": "gone | <img src=x> [a](http://b)\n\n# head"},
     }.items():
-        board.process_message(f"imu/{device}/status", StatusMessage.of(device, 1.0, 0, made.health(**changed)).encode())
         board.process_message(
-            f"imu/{device}/coefficients", CoefficientsMessage.of(device, 1.0, 0, made.estimate()).encode()
+            f"imu/{device}/status", StatusMessage.from_result(device, 1.0, 0, made.health(**changed)).encode()
         )
-    text = fleet_text(board.devices(10.0), 10.0, 40, "1 of 2 there")
+        board.process_message(
+            f"imu/{device}/coefficients", CoefficientsMessage.from_result(device, 1.0, 0, made.estimate()).encode()
+        )
+    text = fleet_text(board.sorted_devices(10.0), 10.0, 40, "1 of 2 there")
     lines = text.splitlines()
     assert lines[0] == "**2** devices: **1** lost, **1** running; N in °/√h"
     assert "**1 of 2 there**" in lines
@@ -144,4 +158,4 @@ def test_the_table_has_trouble_first_and_texts_of_others_cannot_leave_their_cell
     assert table[2].startswith("| **imu/bad** | **LOST** |")
     assert table[3].startswith("| **imu/well** | running | 99.98 Hz | 360,000 | 3 | 1 | 0.515 |")
     assert r"gone \| \<img src=x\> \[a\](http://b)  \# head" in table[2]
-    assert "… and 1 more with fewer problems" in fleet_text(board.devices(10.0), 10.0, 1)
+    assert "… and 1 more with fewer problems" in fleet_text(board.sorted_devices(10.0), 10.0, 1)

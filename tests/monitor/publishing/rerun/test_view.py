@@ -41,10 +41,10 @@ def server() -> Iterator[sinks.ViewerProcess]:
         ["--serve-web", "--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(web_port)]
     )
     child.port = port  # type: ignore[attr-defined]
-    wait_for(lambda: sinks.is_rerun(port))
+    wait_for(lambda: sinks.is_rerun_server(port))
     yield child
     child.kill()
-    child.end()
+    child.terminate()
 
 
 def feed(view: RerunView, i: int) -> None:
@@ -233,7 +233,7 @@ def test_a_viewer_that_dies_is_said_and_joined_again(
         wait_for(lambda: view.state == "ok")
         view.close()
     finally:
-        again.end()
+        again.terminate()
 
 
 def test_a_window_that_was_closed_is_not_opened_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -250,7 +250,7 @@ with socket.create_server(("127.0.0.1", port)) as server:
     server.accept()
 """)
     program.chmod(0o755)
-    monkeypatch.setattr(sinks, "viewer_program", lambda: program)
+    monkeypatch.setattr(sinks, "viewer_program_path", lambda: program)
     view = RerunView(ViewerSettings("native", port=free_port()), DEVICE)
     view.start()
     wait_for(lambda: view.state == sinks.CLOSED)
@@ -271,7 +271,7 @@ def test_the_page_takes_the_next_free_port_and_leaves_nothing_behind(monkeypatch
         assert f"{busy}%2Fproxy" not in view.url
         assert view.url.startswith("http://127.0.0.1:")
         port = int(view.url.rsplit("%3A", 1)[1].split("%2F")[0])
-        assert sinks.is_rerun(port)
+        assert sinks.is_rerun_server(port)
         view.close()
     assert not sinks.is_listening(port)
 
@@ -290,7 +290,7 @@ def test_a_killed_daemon_takes_its_viewer_along() -> None:
     """
     with subprocess.Popen([sys.executable, "-c", textwrap.dedent(program)]) as daemon:
         try:
-            wait_for(lambda: sinks.is_rerun(port))
+            wait_for(lambda: sinks.is_rerun_server(port))
         finally:
             daemon.kill()
     wait_for(lambda: not sinks.is_listening(port))

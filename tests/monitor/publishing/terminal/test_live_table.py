@@ -14,7 +14,7 @@ from drivers.data_types import Event
 from drivers.errors import ConfigError
 from monitor.common import topics
 from monitor.publishing import remote_devices
-from monitor.publishing.messages.results import CoefficientsMessage, EventMessage, GapMessage, StatusMessage
+from monitor.publishing.messages.results import CoefficientsMessage, EventMessage, ModelGapMessage, StatusMessage
 from monitor.publishing.remote_devices import MAX_EVENTS, DeviceStates
 from monitor.publishing.terminal import live_table
 from monitor.publishing.terminal.coefficient_tables import analysis_table
@@ -44,19 +44,19 @@ def board(clock: Clock) -> DeviceStates:
 
 def status(board: DeviceStates, device: str, prefix: str = "imu", **changed: object) -> None:
     board.process_message(
-        topics.STATUS.key(prefix, device), StatusMessage.of(device, 1.76e9, 0, made.health(**changed)).encode()
+        topics.STATUS.key(prefix, device), StatusMessage.from_result(device, 1.76e9, 0, made.health(**changed)).encode()
     )
 
 
 def noise(board: DeviceStates, device: str, seconds: float = 3600.0, scale: float = 1.0) -> None:
     estimate = made.estimate(seconds=seconds, scale=scale)
     board.process_message(
-        topics.COEFFICIENTS.key("imu", device), CoefficientsMessage.of(device, 1.76e9, 0, estimate).encode()
+        topics.COEFFICIENTS.key("imu", device), CoefficientsMessage.from_result(device, 1.76e9, 0, estimate).encode()
     )
 
 
 def event(board: DeviceStates, device: str, text: str) -> None:
-    payload = EventMessage.of(device, 1.76e9, 1, Event("noise_changed", 0, text)).encode()
+    payload = EventMessage.from_result(device, 1.76e9, 1, Event("noise_changed", 0, text)).encode()
     board.process_message(topics.EVENT.key("imu", device), payload)
 
 
@@ -118,7 +118,7 @@ def test_bounds_and_too_few_data_are_marked(board: DeviceStates) -> None:
     assert row(shown(board, 160), "early").count("≤") == 3  # B of the gyroscopes
     unknown = made.estimate()
     unknown.coefficients.status[:] = 0
-    board.process_message("imu/early/coefficients", CoefficientsMessage.of("early", 1.0, 0, unknown).encode())
+    board.process_message("imu/early/coefficients", CoefficientsMessage.from_result("early", 1.0, 0, unknown).encode())
     assert row(shown(board, 160), "early").count("—") == 9
 
 
@@ -147,7 +147,7 @@ def test_trouble_comes_first_and_has_a_sign_and_a_word(board: DeviceStates) -> N
 
 def test_hostile_messages_leave_a_bounded_board(board: DeviceStates) -> None:
     status(board, "good")
-    known = StatusMessage.of("good", 1.0, 0, made.health()).encode()
+    known = StatusMessage.from_result("good", 1.0, 0, made.health()).encode()
     deep = known[:-1] + b',"more":' + b"[" * 20_000 + b"]" * 20_000 + b"}"
     many_axes = (
         b'{"schema":"imu-monitor/coefficients/1","samples":1,"axes":{'
@@ -172,10 +172,10 @@ def test_devices_beyond_the_bound_are_passed_over_until_others_have_been_silent_
     monkeypatch.setattr(remote_devices, "MAX_DEVICES", 3)
     clock = [0.0]
     board = DeviceStates(lambda: clock[0])
-    payload = StatusMessage.of("a", 1.0, 0, made.health()).encode()
+    payload = StatusMessage.from_result("a", 1.0, 0, made.health()).encode()
     for device in ("a", "b", "c", "d", "x" * 300):
         board.process_message(f"imu/{device}/status", payload)
-        board.set_token(f"imu/{device}/alive", True)
+        board.set_liveliness_token(f"imu/{device}/alive", True)
     assert list(board._devices) == ["imu/a", "imu/b", "imu/c"]
     assert board.ignored == 4
     clock[0] = remote_devices.FORGET_AFTER_S + 1.0
@@ -191,19 +191,19 @@ def test_states_have_different_signs_for_different_ranks() -> None:
 
 def test_a_device_that_goes_is_marked(board: DeviceStates, clock: Clock) -> None:
     status(board, "a")
-    board.set_token("imu/a/alive", True)
-    board.set_token("imu/a/alive", False)
+    board.set_liveliness_token("imu/a/alive", True)
+    board.set_liveliness_token("imu/a/alive", False)
     assert row(shown(board, now_s=NOW_S + 3.0), "a").split()[1:3] == ["✖", "gone"]
     clock.now_s = NOW_S + 10.0
-    board.set_token("imu/a/alive", True)
+    board.set_liveliness_token("imu/a/alive", True)
     status(board, "a")
     assert row(shown(board, now_s=NOW_S + 10.5), "a").split()[1:3] == ["●", "running"]
 
 
 def test_a_device_of_which_only_the_presence_is_known(board: DeviceStates) -> None:
-    board.set_token("imu/new/alive", True)
+    board.set_liveliness_token("imu/new/alive", True)
     assert row(shown(board), "new").split()[:3] == ["new", "○", "present"]
-    board.set_token("imu/other/status", True)
+    board.set_liveliness_token("imu/other/status", True)
     assert "other" not in shown(board)
 
 
@@ -262,7 +262,7 @@ def test_a_gyroscope_alone_has_no_accelerometer_columns(board: DeviceStates) -> 
     whole = made.estimate()
     whole.curve.avar[:, 3:] = float("nan")
     status(board, "a")
-    board.process_message("imu/a/coefficients", CoefficientsMessage.of("a", 1.0, 0, whole).encode())
+    board.process_message("imu/a/coefficients", CoefficientsMessage.from_result("a", 1.0, 0, whole).encode())
     text = shown(board, 160)
     assert "°/√h" in text
     assert "m/s/√h" not in text
@@ -278,7 +278,7 @@ def test_the_last_events(board: DeviceStates) -> None:
 
 
 def test_a_time_that_is_no_date(board: DeviceStates) -> None:
-    payload = EventMessage.of("a", 1e300, 1, Event("moved", 0, "moved")).encode()
+    payload = EventMessage.from_result("a", 1e300, 1, Event("moved", 0, "moved")).encode()
     board.process_message("imu/a/event", payload)
     assert "1e+300 s  a  moved" in shown(board)
 
@@ -325,7 +325,7 @@ def test_two_threads_at_once(board: DeviceStates) -> None:
     def feed() -> None:
         for i in range(300):
             status(board, f"d{i}")
-            board.set_token(f"imu/d{i}/alive", True)
+            board.set_liveliness_token(f"imu/d{i}/alive", True)
 
     feeder = threading.Thread(target=feed)
     feeder.start()
@@ -345,7 +345,9 @@ def test_watch_refuses_what_zenoh_refuses() -> None:
 
 def test_a_device_that_disagrees_with_its_model_says_so(board: DeviceStates) -> None:
     status(board, "a")
-    board.process_message("imu/a/gap", GapMessage.of("a", 1.0, 0, made.look(scale=1.2, gz=False)).encode())
+    board.process_message(
+        "imu/a/gap", ModelGapMessage.from_result("a", 1.0, 0, made.look(scale=1.2, gz=False)).encode()
+    )
     assert "gz disagrees with its model: " in shown(board, 160)
-    board.process_message("imu/a/gap", GapMessage.of("a", 1.0, 0, made.look(gz=True)).encode())
+    board.process_message("imu/a/gap", ModelGapMessage.from_result("a", 1.0, 0, made.look(gz=True)).encode())
     assert "disagrees" not in shown(board, 160)

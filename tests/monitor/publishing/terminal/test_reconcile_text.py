@@ -6,7 +6,7 @@ import pytest
 from rich.cells import cell_len
 from rich.console import Console
 
-from monitor.publishing.terminal.reconcile_text import print_comparison, print_report
+from monitor.publishing.terminal.reconcile_text import print_comparison, print_reconciliation
 from monitor.reconcile.result import Reconciliation
 from monitor.reconcile.several_recordings.comparison import Comparison, compare_results
 from tests.monitor.reconcile import samples
@@ -15,7 +15,7 @@ from tests.monitor.reconcile.runs_made import line, run, step, with_axes
 
 def told(r: Reconciliation, width: int = 140) -> list[str]:
     console = Console(width=width, file=io.StringIO(), record=True)
-    print_report(r, console)
+    print_reconciliation(r, console)
     return console.export_text().splitlines()
 
 

@@ -23,7 +23,7 @@ from monitor.common import topics
 from monitor.publishing.messages.results import CoefficientsMessage, StatusMessage
 from monitor.publishing.terminal import watch
 from monitor.publishing.zenoh.publisher import ZenohPublisher
-from monitor.publishing.zenoh.subscriber import Message, ZenohSubscriber
+from monitor.publishing.zenoh.subscriber import ReceivedMessage, ZenohSubscriber
 from monitor.settings.loading import ZenohTable
 from tests.monitor.publishing import made
 from tests.support.ports import free_endpoint
@@ -45,9 +45,11 @@ def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohPubl
 
     def talk() -> None:
         while not ending.wait(0.1):
-            out.put(topics.STATUS, device, StatusMessage.of(device, time.time(), 0, made.health()).encode())
+            out.put(topics.STATUS, device, StatusMessage.from_result(device, time.time(), 0, made.health()).encode())
             out.put(
-                topics.COEFFICIENTS, device, CoefficientsMessage.of(device, time.time(), 0, made.estimate()).encode()
+                topics.COEFFICIENTS,
+                device,
+                CoefficientsMessage.from_result(device, time.time(), 0, made.estimate()).encode(),
             )
             out.put(topics.SAMPLES, device, b"raw")
             out.put(topics.ALLAN, device, b"curve")
@@ -65,13 +67,13 @@ def daemon(endpoint: str, device: str, mode: str = "peer") -> Iterator[ZenohPubl
 
 
 @contextlib.contextmanager
-def listening(keyexpr: str, *connect: str) -> Iterator[tuple[ZenohSubscriber, list[Message]]]:
+def listening(keyexpr: str, *connect: str) -> Iterator[tuple[ZenohSubscriber, list[ReceivedMessage]]]:
     with contextlib.closing(ZenohSubscriber(keyexpr, connect)) as arriving:
         arriving.start()
         yield arriving, []
 
 
-def keys(arriving: ZenohSubscriber, so_far: list[Message]) -> set[str]:
+def keys(arriving: ZenohSubscriber, so_far: list[ReceivedMessage]) -> set[str]:
     so_far += arriving.take(0.1)
     return {one.key for one in so_far}
 
@@ -87,7 +89,7 @@ def test_results_and_presence_arrive_but_not_the_bulk(endpoint: str) -> None:
         assert arriving.state == "ok"
         status = next(one for one in got if one.key == "imu/a/status")
         assert json.loads(status.payload or b"")["device"] == "a"
-        assert [one for one in got if one.payload is None] == [Message("imu/a/alive", None, True)]
+        assert [one for one in got if one.payload is None] == [ReceivedMessage("imu/a/alive", None, True)]
 
 
 @pytest.mark.parametrize(
@@ -126,11 +128,11 @@ def test_daemons_that_come_late_go_and_come_back() -> None:
             with daemon(first, "a"):
                 wait_for(lambda: keys(arriving, got) >= {"imu/a/status", "imu/a/alive"})
                 assert arriving.state == "ok"
-            wait_for(lambda: keys(arriving, got) and Message("imu/a/alive", None, False) in got)
-            assert Message("imu/b/alive", None, False) not in got
+            wait_for(lambda: keys(arriving, got) and ReceivedMessage("imu/a/alive", None, False) in got)
+            assert ReceivedMessage("imu/b/alive", None, False) not in got
             got.clear()
             with daemon(first, "a"):
-                wait_for(lambda: keys(arriving, got) and Message("imu/a/alive", None, True) in got)
+                wait_for(lambda: keys(arriving, got) and ReceivedMessage("imu/a/alive", None, True) in got)
 
 
 def test_through_a_router(endpoint: str) -> None:
@@ -147,7 +149,7 @@ def test_a_daemon_that_is_a_peer_is_heard_through_a_router(endpoint: str) -> Non
         out.set_alive("a", True)
 
         def both() -> bool:
-            out.put(topics.STATUS, "a", StatusMessage.of("a", time.time(), 0, made.health()).encode())
+            out.put(topics.STATUS, "a", StatusMessage.from_result("a", time.time(), 0, made.health()).encode())
             return keys(arriving, got) >= {"imu/a/status", "imu/a/alive"}
 
         wait_for(both)
