@@ -15,7 +15,11 @@ from drivers.data_types import AXES, Floats
 from monitor.common.units import format_rate, format_two_digits
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.line_and_outlier_detection import OUTLIER_SIGMA, Line, line_share
+from monitor.estimation.detection.line_and_outlier_detection import (
+    OUTLIER_SIGMA,
+    SpectralLine,
+    allan_variance_share_of_line,
+)
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.coefficient_fit import Fit
 from monitor.estimation.fit.coefficient_values import Status
@@ -50,7 +54,9 @@ MIN_DEPARTURE_RATIO: Final = 0.5
 """Minimum departure of a reported averaging time, relative to the largest departure of the curve."""
 
 
-def of_unexplained_curve(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass | None], rate_hz: float) -> list[str]:
+def describe_unexplained_curve(
+    curve: AllanCurve, fit: Fit, low_passes: Sequence[LowPass | None], rate_hz: float
+) -> list[str]:
     """Describe where the five terms do not explain the curve. Axes with the same description are listed in one note.
 
     Parameters
@@ -59,24 +65,26 @@ def of_unexplained_curve(curve: AllanCurve, fit: Fit, filters: Sequence[LowPass 
         Measured curve.
     fit : Fit
         Fit to the curve.
-    filters : sequence of LowPass or None
+    low_passes : sequence of LowPass or None
         Low-pass filter of each axis, or None.
     rate_hz : float
         Sample rate in Hz.
     """
     found = []
     for i, axis in enumerate(AXES):
-        low_pass = filters[i]
+        low_pass = low_passes[i]
         if low_pass is not None:
             found.append((axis, _bandwidth_note(low_pass, rate_hz)))
         elif fit.theta[Q, i] < 0.0 and not fit.left_out[i]:
             found.append((axis, BELOW_WHITE_NOISE))
         if fit.k_or_r[i]:
             found.append((axis, _k_or_r_note(fit.coefficients.status[K, i] == Status.ESTIMATED)))
-    return _group_axes(found) + of_misfit(curve, fit)
+    return _group_axes(found) + describe_misfit(curve, fit)
 
 
-def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bool = False) -> list[str]:
+def describe_misfit(
+    curve: AllanCurve, fit: Fit, lines: Sequence[SpectralLine] = (), includes_motion: bool = False
+) -> list[str]:
     """List the axes with a curve that the five terms cannot explain, grouped by cause.
 
     The cause is a spectral line or motion. Axes without a known cause are grouped if they depart at the same τ.
@@ -87,17 +95,17 @@ def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bo
         Measured curve.
     fit : Fit
         Fit to the curve.
-    found : sequence of Line
+    lines : sequence of SpectralLine
         Spectral lines that are reported.
-    moved : bool
+    includes_motion : bool
         True if the curve includes samples in motion.
     """
-    names, notes = _line_names(found), list[str]()
+    names, notes = _line_names(lines), list[str]()
     out = [i for i in range(len(AXES)) if fit.left_out[i]]
     for why, axes in _group_by_line(names, curve, {i: (0, int(fit.left_out[i]) - 1) for i in out}).items():
         notes.append(_left_out_note(curve.tau_s[fit.left_out - 1], axes, why or BANDWIDTH_OR_VIBRATION))
     runs = {i: _departure(curve, fit, i) for i in range(len(AXES)) if fit.misfit[i] > 1.0}
-    if moved:
+    if includes_motion:
         return [*notes, _misfit_note(curve.tau_s, fit, runs, MOTION_LEFT_IN, at=False)] if runs else notes
     for why, axes in _group_by_line(names, curve, runs).items():
         for those in [axes] if why else _group_overlapping(axes):
@@ -105,41 +113,44 @@ def of_misfit(curve: AllanCurve, fit: Fit, found: Sequence[Line] = (), moved: bo
     return notes
 
 
-def _quantization_notes(curve: AllanCurve, fit: Fit, found: Sequence[Line]) -> list[str]:
+def _quantization_notes(curve: AllanCurve, fit: Fit, found: Sequence[SpectralLine]) -> list[str]:
     """Warn if the estimate of Q may be caused by a spectral line."""
     causes = []
     for one, name in _line_names(found).items():
         estimated = fit.coefficients.status[Q, one.axis] == Status.ESTIMATED
-        if estimated and float(np.nanmax(line_share(one, curve)[:Q_ROWS], initial=0.0)) >= MIN_Q_SHARE:
+        if (
+            estimated
+            and float(np.nanmax(allan_variance_share_of_line(one, curve)[:Q_ROWS], initial=0.0)) >= MIN_Q_SHARE
+        ):
             causes.append((AXES[one.axis], f"quantization noise may be {name}"))
     return _group_axes(causes)
 
 
 def replace_guessed_causes(
-    notes: Sequence[str], curve: AllanCurve, fit: Fit, found: Sequence[Line], moved: bool = False
+    notes: Sequence[str], curve: AllanCurve, fit: Fit, lines: Sequence[SpectralLine], includes_motion: bool = False
 ) -> list[str]:
     """Replace the guessed causes of misfits with the causes found by the search for lines and motion.
 
     Parameters
     ----------
     notes : sequence of str
-        Notes of an analysis, including the result of ``of_unexplained_curve``.
+        Notes of an analysis, including the result of ``describe_unexplained_curve``.
     curve : AllanCurve
         Curve from which these notes were made.
     fit : Fit
         Fit from which these notes were made.
-    found : sequence of Line
+    lines : sequence of SpectralLine
         Spectral lines that are reported.
-    moved : bool
+    includes_motion : bool
         True if the curve includes samples in motion.
     """
-    known = of_misfit(curve, fit, found, moved)
-    guessed = [note for note in of_misfit(curve, fit) if note not in known]
+    known = describe_misfit(curve, fit, lines, includes_motion)
+    guessed = [note for note in describe_misfit(curve, fit) if note not in known]
     kept = [note for note in notes if note not in guessed]
-    return kept + [note for note in known if note not in kept] + _quantization_notes(curve, fit, found)
+    return kept + [note for note in known if note not in kept] + _quantization_notes(curve, fit, lines)
 
 
-def of_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list[str]:
+def describe_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list[str]:
     """Report how often and how long the sensor moved, and whether the samples in motion were removed.
 
     Parameters
@@ -161,7 +172,7 @@ def of_motions(motions: Sequence[Motion], rate_hz: float, removed: bool) -> list
     return notes + _count_omitted(len(motions), "motions")
 
 
-def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
+def describe_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
     """Report changes of the noise and the bias.
 
     Parameters
@@ -184,24 +195,27 @@ def of_changes(changes: Sequence[Change], rate_hz: float) -> list[str]:
     return notes
 
 
-def of_lines_and_outliers(found: Sequence[Line], far: Floats) -> list[str]:
+def describe_lines_and_outliers(lines: Sequence[SpectralLine], outlier_shares: Floats) -> list[str]:
     """Report spectral lines and the share of outliers. Axes with a line at the same frequency share a note.
 
     Parameters
     ----------
-    found : sequence of Line
+    lines : sequence of SpectralLine
         Spectral lines of all axes.
-    far : ndarray of float64, shape (6,)
+    outlier_shares : ndarray of float64, shape (6,)
         Share of outliers of each axis, 0 to 1; NaN means unknown.
     """
-    groups = _group_by_frequency(found)
+    groups = _group_by_frequency(lines)
     notes = []
     for here in groups[:MAX_NOTES]:
         sizes = [f"{AXES[one.axis]} {format_rate(AXES[one.axis], one.amplitude)}" for one in here]
         notes.append(f"{_line_name(here[0])}: {', '.join(sizes)}")
     left = [one for here in groups[MAX_NOTES:] for one in here]
     notes += _count_omitted(MAX_NOTES + len(left), "lines")
-    shares = [f"{AXES[i]} {100.0 * far[i]:.2g} %" for i in np.flatnonzero(far > MIN_OUTLIER_SHARE).tolist()]
+    shares = [
+        f"{AXES[i]} {100.0 * outlier_shares[i]:.2g} %"
+        for i in np.flatnonzero(outlier_shares > MIN_OUTLIER_SHARE).tolist()
+    ]
     if shares:
         notes.append(
             f"outliers beyond {OUTLIER_SIGMA:g} σ of the other samples: {', '.join(shares)} of all; "
@@ -210,9 +224,9 @@ def of_lines_and_outliers(found: Sequence[Line], far: Floats) -> list[str]:
     return notes
 
 
-def _group_by_frequency(found: Sequence[Line]) -> list[list[Line]]:
+def _group_by_frequency(found: Sequence[SpectralLine]) -> list[list[SpectralLine]]:
     """Group lines of the same frequency. The group with the strongest line is first."""
-    groups: list[list[Line]] = []
+    groups: list[list[SpectralLine]] = []
     left = sorted(found, key=lambda one: -one.share)
     while left:
         at_hz = left[0].frequency_hz
@@ -221,12 +235,12 @@ def _group_by_frequency(found: Sequence[Line]) -> list[list[Line]]:
     return groups
 
 
-def _line_name(line: Line) -> str:
+def _line_name(line: SpectralLine) -> str:
     """Return the name of a line or a resonance with its frequency."""
     return f"{'a resonance about' if line.wide else 'a line at'} {line.frequency_hz:.4g} Hz"
 
 
-def _line_names(found: Sequence[Line]) -> dict[Line, str]:
+def _line_names(found: Sequence[SpectralLine]) -> dict[SpectralLine, str]:
     """Return the name of each reported line in the notes."""
     return {
         one: _line_name(here[0]).replace("a ", "the ", 1)
@@ -269,7 +283,9 @@ def _group_axes(found: Sequence[tuple[str, str]]) -> list[str]:
     return [f"{', '.join(those)}: {text}" for text, those in axes.items()]
 
 
-def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[int, Run]) -> dict[str, dict[int, Run]]:
+def _group_by_line(
+    names: Mapping[SpectralLine, str], curve: AllanCurve, runs: Mapping[int, Run]
+) -> dict[str, dict[int, Run]]:
     """Group axes by the spectral line that contributes most in the range of τ of the axis.
 
     The key is an empty string if no line contributes at least ``MIN_EXPLAINING_SHARE``.
@@ -277,7 +293,7 @@ def _group_by_line(names: Mapping[Line, str], curve: AllanCurve, runs: Mapping[i
     found: dict[str, dict[int, Run]] = {}
     for i, (first, last) in runs.items():
         shares = {
-            name: float(np.nanmax(line_share(one, curve)[first : last + 1], initial=0.0))
+            name: float(np.nanmax(allan_variance_share_of_line(one, curve)[first : last + 1], initial=0.0))
             for one, name in names.items()
             if one.axis == i
         }

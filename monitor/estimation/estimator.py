@@ -1,7 +1,7 @@
 """Live estimator of one device, with sliding window, Allan curve, confidence intervals and fitted coefficients.
 
-``Estimator.update`` advances the window by a block of samples. Missing samples keep their places in time.
-``Estimator.get`` returns the current curve and coefficients. This fit uses the full covariance of all τ.
+``Estimator.add_samples`` advances the window by a block of samples. Missing samples keep their places in time.
+``Estimator.get_estimate`` returns the current curve and coefficients. This fit uses the full covariance of all τ.
 
 Optionally, ``continuous_refit`` also updates the coefficients after every sample.
 
@@ -51,7 +51,7 @@ MIN_SAMPLES: Final = 8
 SPECTRUM_SAMPLES: Final = 65_536
 """Number of newest samples whose spectrum is tested for a low-pass filter."""
 MAX_HISTORY_SAMPLES: Final = 65_536
-"""Maximum number of samples for which the per-sample coefficients are kept between two calls of ``Estimator.get``."""
+"""Maximum number of samples whose coefficients are stored between two calls of ``Estimator.get_estimate``."""
 
 
 class Estimator:
@@ -104,7 +104,7 @@ class Estimator:
         self._newest_ns = 0
 
     @property
-    def samples(self) -> int:
+    def samples_received(self) -> int:
         """Number of samples received since the start, including the samples before a reset."""
         return self._samples
 
@@ -114,7 +114,7 @@ class Estimator:
         return self._window.samples_in_window
 
     @property
-    def window_samples(self) -> int:
+    def window_length_samples(self) -> int:
         """Number of samples in the full window."""
         return self._window.length
 
@@ -122,10 +122,10 @@ class Estimator:
         """Return a copy of the samples in the window."""
         return copy_window(self._window, self.rate_hz)
 
-    def update(self, samples: SampleBlock) -> None:
+    def add_samples(self, samples: SampleBlock) -> None:
         """Advance the window by the missing samples before a block, then by the block."""
         if samples.lost > self._window.length:
-            self.reset()
+            self.empty_window()
         elif samples.lost:
             self._window.skip(samples.lost)
             self._lengths += samples.lost
@@ -145,7 +145,7 @@ class Estimator:
         self._samples += len(samples)
         self._newest_ns = int(samples.t_ns[-1])
 
-    def reset(self) -> None:
+    def empty_window(self) -> None:
         """Empty the window."""
         self._window.reset()
         self._lengths[:], self._theta[:] = 0, np.nan
@@ -153,18 +153,18 @@ class Estimator:
         if self._refit is not None:
             self._refit.reset()
 
-    def restart(self, axis: int, samples: int) -> None:
+    def restart_axis(self, axis: int, samples_to_keep: int) -> None:
         """Discard all but the newest samples of one axis, because its noise has changed.
 
         Parameters
         ----------
         axis : int
             Index into ``AXES``.
-        samples : int
+        samples_to_keep : int
             Number of newest samples to keep.
         """
-        self._window.keep_newest(axis, samples)
-        self._lengths[axis] = min(samples, self._lengths[axis])
+        self._window.keep_newest(axis, samples_to_keep)
+        self._lengths[axis] = min(samples_to_keep, self._lengths[axis])
         self._entered[:, axis], self._theta[:, axis] = False, np.nan
         if self._refit is not None:
             self._refit.restart(axis)
@@ -176,7 +176,7 @@ class Estimator:
         """
         return (self._entered if self._refit is None else self._refit.entered).copy(), self._theta.copy()
 
-    def restore_fit(self, entered: NDArray[np.bool_], theta: Floats) -> None:
+    def restore_fit(self, terms_in_fit: NDArray[np.bool_], theta: Floats) -> None:
         """Use a fit from before a restart of the program as the start, and repeat the fit until it converges.
 
         The threshold to drop a term is lower than the threshold to add a term, so the result depends on the previous
@@ -184,15 +184,15 @@ class Estimator:
 
         Parameters
         ----------
-        entered : ndarray of bool, shape (5, 6)
+        terms_in_fit : ndarray of bool, shape (5, 6)
             True for each term that was in the fit.
         theta : ndarray of float64, shape (5, 6)
             Squared coefficients Q², N², B², K², R² in SI.
         """
-        self._entered, self._theta = entered.copy(), theta.copy()
+        self._entered, self._theta = terms_in_fit.copy(), theta.copy()
         if self._window.samples_in_window >= MIN_SAMPLES:
             for _ in range(SETTLING_FITS):
-                self.get()
+                self.get_estimate()
 
     def refine_rate(self, rate_hz: float) -> None:
         """Set a more accurate sample rate.
@@ -203,12 +203,12 @@ class Estimator:
         self.window_s = self._window.length / rate_hz
         self._design = make_design(self._factors, rate_hz)
 
-    def get(self, fitted: bool = True) -> Estimate:
+    def get_estimate(self, fit_coefficients: bool = True) -> Estimate:
         """Return the Allan curve of the window and the coefficients fitted to it.
 
         Parameters
         ----------
-        fitted : bool
+        fit_coefficients : bool
             False to return the deviations without a fit.
 
         Raises
@@ -221,7 +221,7 @@ class Estimator:
             raise NotReady(f"{n} of at least {MIN_SAMPLES} samples")
         avar, terms = self._window.avar(), self._window.terms()
         own, recent = slice(0, self._m), slice(self._m, None)
-        result = self._fit(avar[own], terms[own]) if fitted else empty_fit(avar[own])
+        result = self._fit(avar[own], terms[own]) if fit_coefficients else empty_fit(avar[own])
         curve = self._curve(avar[own], terms[own], result.edf, n)
         quick_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent])
         quick = self._curve(avar[recent], terms[recent], quick_edf, n)

@@ -44,7 +44,7 @@ MIN_STRETCH_RATIO: Final = 4
 """A distance is used if at least one row in this number of rows begins a stretch without a gap."""
 
 
-def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -> Ints:
+def count_missing_samples(t_ns: Ints, rows_after_gaps: Ints, missing_by_clock: Ints, rows_after_jumps: Ints) -> Ints:
     """Return the number of samples that are missing before each gap.
 
     The clock also reports late samples as missing.
@@ -53,18 +53,18 @@ def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -
     ----------
     t_ns : ndarray of int64, shape (n,)
         Time stamps in nanoseconds, in the order of the rows.
-    rows : ndarray of int64, shape (k,)
+    rows_after_gaps : ndarray of int64, shape (k,)
         Rows after the gaps, ascending.
-    claimed : ndarray of int64, shape (k,)
-        Number of samples that the clock reports as missing before each of ``rows``.
-    breaks : ndarray of int64
+    missing_by_clock : ndarray of int64, shape (k,)
+        Number of samples that the clock reports as missing before each of ``rows_after_gaps``.
+    rows_after_jumps : ndarray of int64
         Rows after jumps of the time stamps and after long pauses. Time stamps before and after such a row are not
         compared.
 
     Returns
     -------
     ndarray of int64, shape (k,)
-        Number of missing samples, at most ``claimed``.
+        Number of missing samples, at most ``missing_by_clock``.
 
     >>> t_ns = 10_000_000 * np.arange(300)
     >>> t_ns[100:110] += 10_000_000  # late
@@ -72,13 +72,13 @@ def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -
     >>> count_missing_samples(t_ns, np.array([100, 200]), np.array([1, 1]), np.array([], int)).tolist()
     [0, 1]
     """
-    period_ns = _period_ns(t_ns, np.concatenate([rows, breaks]))
+    period_ns = _period_ns(t_ns, np.concatenate([rows_after_gaps, rows_after_jumps]))
     if not period_ns > 0.0:
-        return claimed
+        return missing_by_clock
     # relative to the first time stamp, because a double cannot hold Unix time and fractions of a period
     late = (t_ns - t_ns[0]) / period_ns - np.arange(t_ns.size)
-    ends = np.unique(np.concatenate([[0], rows, breaks, [t_ns.size]]))
-    return _count_missing(late, rows, claimed, ends, np.searchsorted(ends, rows))
+    ends = np.unique(np.concatenate([[0], rows_after_gaps, rows_after_jumps, [t_ns.size]]))
+    return _count_missing(late, rows_after_gaps, missing_by_clock, ends, np.searchsorted(ends, rows_after_gaps))
 
 
 def _period_ns(t_ns: Ints, edges: Ints) -> float:

@@ -23,8 +23,8 @@ from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
 from drivers.timing.sender_times import FORWARD_JUMP_S
 from monitor.common.units import format_rate, format_two_digits
-from monitor.estimation.detection.coarse_quantization import QuantizationStep, find_coarse_axes
-from monitor.estimation.detection.repeated_share import estimate_repeated_share
+from monitor.estimation.detection.coarse_quantization import QuantizationStep, find_coarsely_quantized_axes
+from monitor.estimation.detection.repeated_share import estimate_repeated_row_share
 from monitor.estimation.missing_sample_count import count_missing_samples
 
 MIN_RATE_DEVIATION: Final = 0.002
@@ -108,7 +108,9 @@ def _resample(
     """Return the stamped blocks, the missing samples before each block, the samples, the rate, and all notes."""
     stamped, lost, rate, notes = _stamp(blocks, rate_hz)
     values = _place_on_grid(stamped, lost)
-    notes += _repeated_notes(values) + _resolution_notes(find_coarse_axes(values)) + _missing_notes(lost, rate)
+    notes += (
+        _repeated_notes(values) + _resolution_notes(find_coarsely_quantized_axes(values)) + _missing_notes(lost, rate)
+    )
     return stamped, lost, values, rate, notes
 
 
@@ -207,7 +209,7 @@ def _late_notes(late: int) -> list[str]:
 
 def _repeated_notes(values: Floats) -> list[str]:
     """Format the note on rows that repeat the previous row."""
-    share = estimate_repeated_share(values)
+    share = estimate_repeated_row_share(values)
     if share < MIN_REPEATED_SHARE:
         return []
     percent = 100.0 * share

@@ -47,7 +47,7 @@ class WindowSnapshot:
     def __len__(self) -> int:
         return len(self.phase) - 1
 
-    def values(self) -> Floats:
+    def restore_samples(self) -> Floats:
         """Return the samples [n, 6] in rad/s and m/s², identical at every call; NaN means missing."""
         columns, rng = [], np.random.default_rng(0)
         for axis in range(len(AXES)):
@@ -134,8 +134,8 @@ class TemperatureRing:
         Number of samples to keep.
 
     >>> newest = TemperatureRing(3)
-    >>> newest.push(0, np.array([20.0, 21.0]))
-    >>> newest.push(1, np.array([22.0]))
+    >>> newest.push_temperatures(0, np.array([20.0, 21.0]))
+    >>> newest.push_temperatures(1, np.array([22.0]))
     >>> newest.newest_temperatures(3).tolist()
     [21.0, nan, 22.0]
     """
@@ -144,18 +144,18 @@ class TemperatureRing:
         self._ring = np.full(length, np.nan, np.float32)
         self._next = 0
 
-    def push(self, lost: int, temperature_c: Floats) -> None:
+    def push_temperatures(self, missing_before: int, temperature_c: Floats) -> None:
         """Append missing samples, then temperatures.
 
         Parameters
         ----------
-        lost : int
+        missing_before : int
             Number of missing samples before ``temperature_c``.
         temperature_c : ndarray of float64, shape (n,)
             Temperatures in °C.
         """
-        if lost:
-            self._write(np.full(min(lost, self._ring.size), np.nan))
+        if missing_before:
+            self._write(np.full(min(missing_before, self._ring.size), np.nan))
         self._write(temperature_c[-self._ring.size :])
 
     def newest_temperatures(self, n: int) -> Floats:

@@ -4,7 +4,7 @@ An effect is a frozen dataclass of parameters with units. There are four kinds o
 
 - A ``Source`` adds to the rate of its axis. The spectrum and the Allan variance of a source describe the sampled series
   that the source simulates, so fit, simulation and comparison use the same physics.
-- A ``Leak`` adds the measurement of another axis times a coefficient.
+- An ``AxisLeak`` adds the measurement of another axis times a coefficient.
 - ``NoiseStep`` changes the size of white noise.
 - A ``Transform`` acts on the sum of sources and leaks, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
 
@@ -47,7 +47,7 @@ class SampleBlockContext:
 class RunningEffect:
     """Effect that is being simulated on one axis."""
 
-    def drawn_values(self) -> dict[str, Any]:
+    def drawn_random_values(self) -> dict[str, Any]:
         """Return the random values drawn so far that the parameters do not contain."""
         return {}
 
@@ -56,7 +56,7 @@ class NoiseSeries(RunningEffect, ABC):
     """Endless time series of a source."""
 
     @abstractmethod
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         """Add the next ``values.size`` samples (at least one) to the values, in the unit of the axis.
 
         Parameters
@@ -67,19 +67,19 @@ class NoiseSeries(RunningEffect, ABC):
             Index, temperature and work array of the block.
         """
 
-    def draw(self, n: int, first: int = 0) -> Floats:
+    def draw_samples(self, n: int, first_index: int = 0) -> Floats:
         """Return the next samples of this series alone, without a temperature.
 
         Parameters
         ----------
         n : int
             Number of samples.
-        first : int
+        first_index : int
             Index of the first sample, counted from the start of the stream.
         """
         values = np.zeros(n)
         if n:
-            self.add(values, SampleBlockContext(first, np.full(n, np.nan), np.empty(n)))
+            self.add_next_samples(values, SampleBlockContext(first_index, np.full(n, np.nan), np.empty(n)))
         return values
 
 
@@ -89,7 +89,7 @@ class StatelessSeries(NoiseSeries):
     def __init__(self, function: Callable[[Floats, SampleBlockContext], object]) -> None:
         self._function = function
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         """Call the function."""
         self._function(values, block)
 
@@ -98,7 +98,7 @@ class RunningTransform(RunningEffect, ABC):
     """Transform that runs on one axis."""
 
     @abstractmethod
-    def apply(self, values: Floats) -> None:
+    def transform_in_place(self, values: Floats) -> None:
         """Transform the next values [n] in place."""
 
 
@@ -108,13 +108,13 @@ class MemorylessTransform(RunningTransform):
     def __init__(self, function: Callable[[Floats], object]) -> None:
         self._function = function
 
-    def apply(self, values: Floats) -> None:
+    def transform_in_place(self, values: Floats) -> None:
         """Call the function."""
         self._function(values)
 
 
 class ParameterTable:
-    """Table of parameters in a model file. A subclass is a frozen dataclass with fields from ``parameter``.
+    """Table of parameters in a model file. A subclass is a frozen dataclass with fields from ``parameter_field``.
 
     Raises
     ------
@@ -182,7 +182,7 @@ class Source(Effect):
         """
 
     @abstractmethod
-    def start(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
         """Return a new series.
 
         Parameters
@@ -205,7 +205,7 @@ class Source(Effect):
         """
         return self.spectrum(tau0_s).avar(tau_s)
 
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+    def two_sided_psd(self, f_hz: Floats, tau0_s: float) -> Floats:
         """Return the two-sided spectral density in unit²/Hz. The density of a spectral line or a slope is zero.
 
         Parameters
@@ -218,7 +218,7 @@ class Source(Effect):
         return self.spectrum(tau0_s).density(f_hz)
 
 
-class Leak(Effect):
+class AxisLeak(Effect):
     """Effect that adds ``coefficient`` times the measurement of the axis ``source``.
 
     Leaks into the source axis are left out of this measurement. Axes that leak into each other therefore need no order,
@@ -241,7 +241,7 @@ class Transform(Effect):
         """Return the spectrum after the transform. The spectrum is NaN if no formula for it is known."""
 
     @abstractmethod
-    def start(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
         """Return a new running transform.
 
         Parameters
@@ -253,17 +253,17 @@ class Transform(Effect):
         """
 
 
-def parameter(
+def parameter_field(
     gyro_unit: str,
     accelerometer_unit: str | None = None,
     *,
     signed: bool = False,
     positive: bool = False,
-    whole: bool = False,
+    whole_number: bool = False,
     optional: bool = False,
     below_nyquist: bool = False,
-    most: float = inf,
-    quantity: NumberRange | None = None,
+    maximum: float = inf,
+    number_range: NumberRange | None = None,
 ) -> Any:
     """Return a dataclass field with its units and its allowed range. The default range is all numbers ≥ 0.
 
@@ -276,26 +276,26 @@ def parameter(
         True if negative values are allowed.
     positive : bool
         True if zero is not allowed.
-    whole : bool
+    whole_number : bool
         True if only whole numbers are allowed.
     optional : bool
         True if the parameter may be absent (None).
     below_nyquist : bool
         True if the parameter is a frequency that must be below half the sample rate.
-    most : float
+    maximum : float
         Largest allowed value.
-    quantity : NumberRange or None
+    number_range : NumberRange or None
         NumberRange with the supported range. None selects the quantity by the unit.
     """
     metadata = {
         "units": (gyro_unit, accelerometer_unit or gyro_unit),
         "signed": signed,
         "positive": positive,
-        "whole": whole,
+        "whole": whole_number,
         "optional": optional,
         "below_nyquist": below_nyquist,
-        "most": most,
-        "quantity": quantity or QUANTITIES.get(gyro_unit, PARAMETER),
+        "most": maximum,
+        "quantity": number_range or QUANTITIES.get(gyro_unit, PARAMETER),
     }
     return field(default=None, metadata=metadata) if optional else field(metadata=metadata)
 
@@ -315,7 +315,7 @@ def required_parameters(table: type[ParameterTable]) -> tuple[str, ...]:
     return tuple(f.name for f in fields(table) if f.default is MISSING)  # type: ignore[arg-type]
 
 
-def first_sample_index(time_s: float, rate_hz: float) -> int:
+def first_sample_at_or_after(time_s: float, rate_hz: float) -> int:
     """Return the index of the first sample at or after a time. A millionth of a sample is allowed for rounding.
 
     Parameters

@@ -19,14 +19,14 @@ MAX_SERIES_ARGUMENT: Final = 1e-3
 2.5·10⁻⁴ for the series and 10⁻⁷ for the closed form."""
 
 
-def gauss_markov_spectrum(sigma: float, decay: complex, tau0_s: float) -> Spectrum:
+def gauss_markov_spectrum(sigma: float, decay_rate: complex, tau0_s: float) -> Spectrum:
     """Return the spectrum of a process with a geometric autocorrelation.
 
     Parameters
     ----------
     sigma : float
         Standard deviation of the process.
-    decay : complex
+    decay_rate : complex
         1/T_c − iω, 1/s.
     tau0_s : float
         Sample interval, s.
@@ -37,7 +37,9 @@ def gauss_markov_spectrum(sigma: float, decay: complex, tau0_s: float) -> Spectr
     >>> print(f"{gauss_markov_spectrum(0.5**0.5, 1.0, 1e-4).avar(tau)[0] ** 0.5:.3f}")  # peak: 0.437 q √T_c
     0.437
     """
-    return Spectrum(lambda f: _psd(sigma, decay, f, tau0_s), lambda tau: _avar(sigma, decay, tau, tau0_s), tau0_s)
+    return Spectrum(
+        lambda f: _psd(sigma, decay_rate, f, tau0_s), lambda tau: _avar(sigma, decay_rate, tau, tau0_s), tau0_s
+    )
 
 
 def _avar(sigma: float, decay: complex, tau_s: Floats, tau0_s: float) -> Floats:

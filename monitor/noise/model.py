@@ -17,14 +17,14 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.module_lookup import format_suggestion
-from monitor.noise.effect import Effect, Leak, Source, Transform
+from monitor.noise.effect import AxisLeak, Effect, Source, Transform
 from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
-from monitor.noise.model_toml import error_location, format_display_table, format_model, parse_model
-from monitor.noise.simulation import ModelStream, check_effects
-from monitor.noise.spectrum import Spectrum, undefined_spectrum, zero_spectrum
+from monitor.noise.model_toml import format_display_table, format_model_toml, parse_model_toml, prefix_config_errors
+from monitor.noise.simulation import ModelStream, check_effects_can_be_simulated
+from monitor.noise.spectrum import Spectrum, nan_spectrum, zero_spectrum
 from monitor.noise.temperature import Temperature
 
 
@@ -67,7 +67,7 @@ class NoiseModel:
             if axis not in AXES:
                 raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
             for effect in effects:
-                with error_location(f"{axis}.{effect.name}"):
+                with prefix_config_errors(f"{axis}.{effect.name}"):
                     effect.check_axis(axis)
         ratios = sorted({effect.ratio for _, effect in self if isinstance(effect, SampleRateError)})
         if len(ratios) > 1:
@@ -96,7 +96,7 @@ class NoiseModel:
         return format_display_table(self.effects, self.sample_rate_hz, self.temperature)
 
     @property
-    def true_to_stated_rate(self) -> float:
+    def true_to_stated_rate_ratio(self) -> float:
         """Return the true sample rate divided by the stated sample rate."""
         return self._clock.ratio
 
@@ -121,7 +121,7 @@ class NoiseModel:
         """
         return self.spectrum(axis, tau0_s).avar(np.asarray(tau_s, np.float64))
 
-    def psd(self, axis: str, f_hz: Floats, tau0_s: float) -> Floats:
+    def two_sided_psd(self, axis: str, f_hz: Floats, tau0_s: float) -> Floats:
         """Return the two-sided spectrum of one axis in unit²/Hz, up to half the sample rate, without lines and slopes.
 
         Parameters
@@ -145,15 +145,15 @@ class NoiseModel:
         tau0_s : float
             Stated sample interval, s.
         """
-        true_s = tau0_s / self.true_to_stated_rate
+        true_s = tau0_s / self.true_to_stated_rate_ratio
         leaking: dict[str, float] = {}
         for effect in self.effects.get(axis, ()):
-            if isinstance(effect, Leak):
+            if isinstance(effect, AxisLeak):
                 leaking[effect.source] = leaking.get(effect.source, 0.0) + effect.coefficient
         total = self._own(axis, true_s)
         for source, coefficient in leaking.items():
-            total += self._measured(source, self._own(source, true_s)).scaled(coefficient)
-        return self._clock.restate_spectrum(self._measured(axis, total))
+            total += self._measured(source, self._own(source, true_s)).scaled_by_amplitude(coefficient)
+        return self._clock.convert_to_stated_rate(self._measured(axis, total))
 
     def _own(self, axis: str, tau0_s: float) -> Spectrum:
         """Return the spectrum of the axis' own sources."""
@@ -163,40 +163,40 @@ class NoiseModel:
         for effect in effects:
             if isinstance(effect, Source):
                 once = stepped and isinstance(effect, AngleRandomWalk)
-                total += undefined_spectrum(tau0_s) if once else effect.spectrum(tau0_s)
+                total += nan_spectrum(tau0_s) if once else effect.spectrum(tau0_s)
         return total
 
     def _measured(self, axis: str, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum after all transforms of the axis."""
-        for transform in self.transforms(axis):
+        for transform in self.transforms_in_order(axis):
             spectrum = transform.transform_spectrum(spectrum)
         return spectrum
 
-    def transforms(self, axis: str) -> list[Transform]:
+    def transforms_in_order(self, axis: str) -> list[Transform]:
         """Return the transforms of an axis in the order in which they act."""
         found = [effect for effect in self.effects.get(axis, ()) if isinstance(effect, Transform)]
         return sorted(found, key=lambda transform: TRANSFORM_ORDER.index(type(transform)))
 
     # --- time series
 
-    def check(self, rate_hz: float, *, temperature: bool = True) -> None:
+    def check_can_be_simulated(self, rate_hz: float, *, has_temperature: bool = True) -> None:
         """Check that the model can be simulated at a stated rate.
 
         Parameters
         ----------
         rate_hz : float
             Stated sample rate, Hz.
-        temperature : bool
+        has_temperature : bool
             True if a temperature is available, from the model or from a recording.
 
         Raises
         ------
         ConfigError
-            If ``check_effects`` finds a mistake.
+            If ``check_effects_can_be_simulated`` finds a mistake.
         """
-        check_effects(self.effects, rate_hz * self.true_to_stated_rate, temperature)
+        check_effects_can_be_simulated(self.effects, rate_hz * self.true_to_stated_rate_ratio, has_temperature)
 
-    def stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> ModelStream:
+    def start_stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> ModelStream:
         """Return an endless series of six axes. The same rate and seed give the same series.
 
         Parameters
@@ -211,9 +211,9 @@ class NoiseModel:
         Raises
         ------
         ConfigError
-            If ``check_effects`` finds a mistake.
+            If ``check_effects_can_be_simulated`` finds a mistake.
         """
-        return ModelStream(self.effects, self.temperature, rate_hz, self.true_to_stated_rate, seed, temperature_c)
+        return ModelStream(self.effects, self.temperature, rate_hz, self.true_to_stated_rate_ratio, seed, temperature_c)
 
     def simulate(self, n: int, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> Floats:
         """Return the first ``n`` samples [n, 6] of ``stream``, in rad/s and m/s².
@@ -225,7 +225,7 @@ class NoiseModel:
         rate_hz, seed, temperature_c
             As in ``stream``.
         """
-        return self.stream(rate_hz, seed, temperature_c).draw(n)
+        return self.start_stream(rate_hz, seed, temperature_c).draw_samples(n)
 
     # --- text
 
@@ -238,14 +238,14 @@ class NoiseModel:
         ConfigError
             If the text is not valid. The message names the place in the file.
         """
-        effects, rate_hz, temperature = parse_model(text)
+        effects, rate_hz, temperature = parse_model_toml(text)
         model = cls(sample_rate_hz=rate_hz, temperature=temperature)
         for axes, given in effects:
             model += cls(dict.fromkeys(axes, given))
         if rate_hz is not None:
-            model.check(rate_hz)
+            model.check_can_be_simulated(rate_hz)
         return model
 
     def to_toml(self) -> str:
         """Return the model as text; ``from_toml`` reads it back to an equal model."""
-        return format_model(self.effects, self.sample_rate_hz, self.temperature)
+        return format_model_toml(self.effects, self.sample_rate_hz, self.temperature)

@@ -26,14 +26,14 @@ def read_model(path: Path) -> NoiseModel:
         raise ConfigError(*(f"{path}: {line}" for line in error.lines)) from error
 
 
-def load_model(name: str, folder: Path) -> NoiseModel:
+def load_model(name_or_path: str, base_folder: Path) -> NoiseModel:
     """Return a model of the catalogue by its name, or the model in a file.
 
     Parameters
     ----------
-    name : str
+    name_or_path : str
         Name in the catalogue, or path of a file.
-    folder : Path
+    base_folder : Path
         Folder to which relative paths refer.
 
     Raises
@@ -41,4 +41,4 @@ def load_model(name: str, folder: Path) -> NoiseModel:
     ConfigError
         If there is no such model, or if it is not valid.
     """
-    return read_model(model_path(name, folder))
+    return read_model(model_path(name_or_path, base_folder))

@@ -30,7 +30,7 @@ AxisEffects = tuple[tuple[str, ...], tuple[Effect, ...]]
 """Names of axes, and the effects of each of these axes."""
 
 
-def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature | None]:
+def parse_model_toml(text: str) -> tuple[list[AxisEffects], float | None, Temperature | None]:
     """Return the effects, the sample rate in Hz and the temperature of a model file's text.
 
     Raises
@@ -45,7 +45,7 @@ def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature
         with _collect_errors(mistakes):
             if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float):
                 raise ConfigError(f"sample_rate must be a number of Hz, is {rate_hz!r}")
-            with error_location("sample_rate"):
+            with prefix_config_errors("sample_rate"):
                 RATE_HZ.check(rate_hz)
     temperature = None
     with _collect_errors(mistakes):
@@ -60,7 +60,7 @@ def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature
     return effects, None if rate_hz is None else float(rate_hz), temperature
 
 
-def format_model(
+def format_model_toml(
     axis_effects: Mapping[str, tuple[Effect, ...]], sample_rate_hz: float | None, temperature: Temperature | None
 ) -> str:
     """Return the text of a model file.
@@ -92,7 +92,7 @@ def format_display_table(
 ) -> str:
     """Return a table for display, with one line per effect: axis, name, and parameters with units.
 
-    Sample rate and temperature are printed above the table. The arguments are those of ``format_model``.
+    Sample rate and temperature are printed above the table. The arguments are those of ``format_model_toml``.
     """
     head = [] if sample_rate_hz is None else [f"sample rate {sample_rate_hz:g} Hz"]
     if temperature is not None:
@@ -106,12 +106,12 @@ def format_display_table(
 
 
 @contextlib.contextmanager
-def error_location(place: str) -> Iterator[None]:
+def prefix_config_errors(location: str) -> Iterator[None]:
     """Add the place in the file to a ConfigError that is raised inside the context."""
     try:
         yield
     except ConfigError as error:
-        raise ConfigError(f"{place}: {str(error).removeprefix(place.rpartition('.')[2] + ': ')}") from error
+        raise ConfigError(f"{location}: {str(error).removeprefix(location.rpartition('.')[2] + ': ')}") from error
 
 
 @contextlib.contextmanager
@@ -182,6 +182,6 @@ def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
     ]
     if mistakes:
         raise ConfigError(*mistakes)
-    with error_location(place):
+    with prefix_config_errors(place):
         return kind(**parameters)
     raise AssertionError  # not reached: the context manager does not suppress exceptions

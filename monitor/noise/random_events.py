@@ -45,12 +45,12 @@ class RandomEvents:
         self.count = 0
         self._listed: list[tuple[float, float]] = []
 
-    def take(self, first: int, n: int) -> tuple[Ints, Floats]:
+    def take_block_events(self, first_index: int, n: int) -> tuple[Ints, Floats]:
         """Return the events before sample ``first + n`` that have not been returned yet.
 
         Parameters
         ----------
-        first : int
+        first_index : int
             Index of the first sample of the block.
         n : int
             Number of samples of the block.
@@ -58,13 +58,13 @@ class RandomEvents:
         Returns
         -------
         indices : ndarray, int64
-            Sample of each event, counted from ``first``.
+            Sample of each event, counted from ``first_index``.
         sizes : ndarray, float64
             Size of each event.
         """
         if self._first_index is None:
-            self._first_index = first
-        end = first - self._first_index + n - 1  # an event between two samples is visible at the later one
+            self._first_index = first_index
+        end = first_index - self._first_index + n - 1  # an event between two samples is visible at the later one
         taken, sizes = [], []
         while True:
             k = int(np.searchsorted(self._next, end, "right"))
@@ -79,12 +79,12 @@ class RandomEvents:
         self.count += when.size
         for one in range(min(when.size, MAX_LISTED_EVENTS - len(self._listed))):
             self._listed.append(((self._first_index + float(when[one])) / self._rate_hz, float(size[one])))
-        return np.ceil(when - (first - self._first_index)).astype(np.int64), size
+        return np.ceil(when - (first_index - self._first_index)).astype(np.int64), size
 
-    def drawn_values(self, size: str | None = None) -> dict[str, Any]:
+    def drawn_random_values(self, size_key: str | None = None) -> dict[str, Any]:
         """Return the number of events, and the times of the listed events in seconds since the start of the stream.
 
-        If ``size`` is given, the sizes of the listed events are returned under this key.
+        If ``size_key`` is given, the sizes of the listed events are returned under this key.
         """
         times: dict[str, Any] = {"count": self.count, "times": [time for time, _ in self._listed]}
-        return times if size is None else times | {size: [height for _, height in self._listed]}
+        return times if size_key is None else times | {size_key: [height for _, height in self._listed]}

@@ -24,21 +24,21 @@ from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.module_lookup import format_suggestion
 from monitor.noise.effect import (
+    AxisLeak,
     Effect,
-    Leak,
     NoiseSeries,
     RunningEffect,
     RunningTransform,
     SampleBlockContext,
     Source,
     Transform,
-    first_sample_index,
+    first_sample_at_or_after,
 )
 from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
-from monitor.noise.model_toml import error_location
+from monitor.noise.model_toml import prefix_config_errors
 from monitor.noise.temperature import Temperature, recorded_temperature
 
 PIECE_SAMPLES: Final = 2048
@@ -53,16 +53,18 @@ class SimulatedSamples:
     temperature_c: Floats  # [n] °C; NaN if the model has no temperature
 
 
-def check_effects(axis_effects: Mapping[str, tuple[Effect, ...]], true_hz: float, temperature: bool) -> None:
+def check_effects_can_be_simulated(
+    axis_effects: Mapping[str, tuple[Effect, ...]], true_rate_hz: float, has_temperature: bool
+) -> None:
     """Check that effects can be simulated together.
 
     Parameters
     ----------
     axis_effects : mapping of str to tuple of Effect
         Axis -> its effects.
-    true_hz : float
+    true_rate_hz : float
         True sample rate, Hz.
-    temperature : bool
+    has_temperature : bool
         True if a temperature is available, from the model or from a recording.
 
     Raises
@@ -74,13 +76,13 @@ def check_effects(axis_effects: Mapping[str, tuple[Effect, ...]], true_hz: float
     for axis in AXES:
         effects = axis_effects.get(axis, ())
         for effect in effects:
-            with error_location(f"{axis}.{effect.name}"):
-                effect.check_rate(true_hz)
-                if isinstance(effect, Leak) and not axis_effects.get(effect.source):
+            with prefix_config_errors(f"{axis}.{effect.name}"):
+                effect.check_rate(true_rate_hz)
+                if isinstance(effect, AxisLeak) and not axis_effects.get(effect.source):
                     raise ConfigError(f"the model has no effect on its source {effect.source}")
                 if isinstance(effect, NoiseStep) and not any(isinstance(one, AngleRandomWalk) for one in effects):
                     raise ConfigError(f"{axis} has no angle_random_walk to multiply")
-                if isinstance(effect, Source) and effect.uses_temperature and not temperature:
+                if isinstance(effect, Source) and effect.uses_temperature and not has_temperature:
                     raise ConfigError(
                         "no temperature: the model has no table [temperature], and no recording provides one"
                     )
@@ -97,7 +99,7 @@ class ModelStream:
         Simulated temperature.
     rate_hz : float
         Stated sample rate, Hz.
-    true_to_stated_rate : float
+    true_to_stated_rate_ratio : float
         True sample rate divided by the stated one.
     seed : int
         Seed of the random generators.
@@ -115,13 +117,15 @@ class ModelStream:
         axis_effects: Mapping[str, tuple[Effect, ...]],
         temperature: Temperature | None,
         rate_hz: float,
-        true_to_stated_rate: float,
+        true_to_stated_rate_ratio: float,
         seed: int,
         temperature_c: Floats | None = None,
     ) -> None:
-        check_effects(axis_effects, rate_hz * true_to_stated_rate, temperature_c is not None or temperature is not None)
+        check_effects_can_be_simulated(
+            axis_effects, rate_hz * true_to_stated_rate_ratio, temperature_c is not None or temperature is not None
+        )
         self._effects = {axis: axis_effects.get(axis, ()) for axis in AXES}
-        self._true_hz = rate_hz * true_to_stated_rate
+        self._true_hz = rate_hz * true_to_stated_rate_ratio
         self._seed = seed
         self._count = 0  # number of samples drawn so far
         self._occurrences: Counter[tuple[str, str]] = Counter()
@@ -130,17 +134,17 @@ class ModelStream:
         if temperature_c is not None:
             self._temperature = recorded_temperature(temperature_c)
         elif temperature is not None:
-            self._temperature = temperature.start(self._true_hz, self._rng("temperature", "", 0))
+            self._temperature = temperature.start_series(self._true_hz, self._rng("temperature", "", 0))
         self._axes = {axis: _AxisSimulator() for axis in AXES}
         for axis, effects in self._effects.items():
             for effect in effects:
                 self._begin(axis, effect)
 
-    def draw(self, n: int) -> Floats:
+    def draw_samples(self, n: int) -> Floats:
         """Return the next ``n`` samples [n, 6] in rad/s and m/s²."""
-        return self.draw_with_temperature(n).values
+        return self.draw_samples_with_temperature(n).values
 
-    def draw_with_temperature(self, n: int) -> SimulatedSamples:
+    def draw_samples_with_temperature(self, n: int) -> SimulatedSamples:
         """Return the next ``n`` samples with their temperature."""
         drawn = SimulatedSamples(np.empty((n, len(AXES))), np.full(n, np.nan))
         for begin in range(0, n, PIECE_SAMPLES):
@@ -148,7 +152,7 @@ class ModelStream:
             self._advance(drawn.values[piece], drawn.temperature_c[piece])
         return drawn
 
-    def add(self, axis: str, effect: Effect) -> None:
+    def add_effect(self, axis: str, effect: Effect) -> None:
         """Add an effect that begins at the next sample.
 
         A parameter ``time`` counts from the first sample of the stream. A random walk, a ramp or a transient begins at
@@ -170,14 +174,14 @@ class ModelStream:
             raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
         if isinstance(effect, SampleRateError):
             raise ConfigError(f"{axis}.{effect.name}: the sample rate error of a running stream cannot change")
-        with error_location(f"{axis}.{effect.name}"):
+        with prefix_config_errors(f"{axis}.{effect.name}"):
             effect.check_axis(axis)
         effects = self._effects | {axis: (*self._effects[axis], effect)}
-        check_effects(effects, self._true_hz, self._temperature is not None)
+        check_effects_can_be_simulated(effects, self._true_hz, self._temperature is not None)
         self._effects = effects
         self._begin(axis, effect)
 
-    def drawn_values(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
+    def drawn_random_values(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
         """Return the values that have been drawn at random so far, by axis and name of the effect.
 
         The list of an effect has one dictionary for each occurrence of the effect on the axis. The values are phases,
@@ -186,7 +190,7 @@ class ModelStream:
         """
         truths: dict[str, dict[str, list[dict[str, Any]]]] = {}
         for axis, effect, running in self._truths:
-            if truth := running.drawn_values():
+            if truth := running.drawn_random_values():
                 truths.setdefault(axis, {}).setdefault(effect.name, []).append(truth)
         return truths
 
@@ -196,18 +200,18 @@ class ModelStream:
         self._occurrences[axis, effect.name] += 1
         line = self._axes[axis]
         if isinstance(effect, Source):
-            series = effect.start(self._true_hz, self._rng(axis, effect.name, occurrence))
+            series = effect.start_series(self._true_hz, self._rng(axis, effect.name, occurrence))
             (line.white if isinstance(effect, AngleRandomWalk) else line.others).append(series)
             self._truths.append((axis, effect, series))
         elif isinstance(effect, NoiseStep):
-            line.steps.append((first_sample_index(effect.time, self._true_hz), effect.ratio))
-        elif isinstance(effect, Leak):
-            line.leak(effect)
+            line.steps.append((first_sample_at_or_after(effect.time, self._true_hz), effect.ratio))
+        elif isinstance(effect, AxisLeak):
+            line.add_leak(effect)
             self._axes[effect.source].leaks_out = True
         elif isinstance(effect, Transform):
-            with error_location(f"{axis}.{effect.name}"):
-                running = effect.start(self._true_hz, self._rng(axis, effect.name, occurrence))
-            line.insert(TRANSFORM_ORDER.index(type(effect)), running)
+            with prefix_config_errors(f"{axis}.{effect.name}"):
+                running = effect.start_transform(self._true_hz, self._rng(axis, effect.name, occurrence))
+            line.insert_transform(TRANSFORM_ORDER.index(type(effect)), running)
             self._truths.append((axis, effect, running))
         else:
             raise TypeError(f"{effect.name} is not a source, leak, noise step or transform")
@@ -223,15 +227,15 @@ class ModelStream:
         block = SampleBlockContext(self._count, temperature_c, np.empty(n))
         if self._temperature is not None:
             temperature_c[:] = 0.0
-            self._temperature.add(temperature_c, block)
-        sums = {axis: line.sum(block, n) for axis, line in self._axes.items()}
+            self._temperature.add_next_samples(temperature_c, block)
+        sums = {axis: line.sum_own_sources(block, n) for axis, line in self._axes.items()}
         alone = {
-            axis: line.measure_without_leaks(sums[axis])
+            axis: line.transform_without_leaks(sums[axis])
             for axis, line in self._axes.items()
             if line.needs_leak_free_measurement
         }
         for column, (axis, line) in enumerate(self._axes.items()):
-            values[:, column] = line.measure(sums[axis], alone)
+            values[:, column] = line.add_leaks_and_transform(sums[axis], alone)
         self._count += n
 
 
@@ -242,7 +246,7 @@ class _AxisSimulator:
         self.white: list[NoiseSeries] = []
         self.others: list[NoiseSeries] = []
         self.steps: list[tuple[int, float]] = []  # (index of the first sample, ratio)
-        self.leaks: list[Leak] = []
+        self.leaks: list[AxisLeak] = []
         self.leaks_out = False
         # Transforms with their positions in TRANSFORM_ORDER, sorted.
         self._chain: list[tuple[int, RunningTransform]] = []
@@ -255,49 +259,49 @@ class _AxisSimulator:
         piece."""
         return self.leaks_out or bool(self.leaks)
 
-    def insert(self, place: int, running: RunningTransform) -> None:
+    def insert_transform(self, order: int, transform: RunningTransform) -> None:
         """Insert a transform after the others at its position in TRANSFORM_ORDER."""
         if self.leaks:
-            self._alone.append((place, copy.deepcopy(running)))
+            self._alone.append((order, copy.deepcopy(transform)))
             self._alone.sort(key=lambda one: one[0])
-        self._chain.append((place, running))
+        self._chain.append((order, transform))
         self._chain.sort(key=lambda one: one[0])
 
-    def leak(self, leak: Leak) -> None:
+    def add_leak(self, leak: AxisLeak) -> None:
         """Add a leak into this axis. From the next sample, the measurements with and without leaks differ."""
         if not self.leaks:
             self._alone = copy.deepcopy(self._chain)
         self.leaks.append(leak)
 
-    def sum(self, block: SampleBlockContext, n: int) -> Floats:
+    def sum_own_sources(self, block: SampleBlockContext, n: int) -> Floats:
         """Return the sum [n] of the axis' own sources."""
         values = np.zeros(n)
         for series in self.white:
-            series.add(values, block)
+            series.add_next_samples(values, block)
         for first, ratio in self.steps:
             values[max(0, first - block.first) :] *= ratio
         for series in self.others:
-            series.add(values, block)
+            series.add_next_samples(values, block)
         return values
 
-    def measure_without_leaks(self, own: Floats) -> Floats:
-        """Return the measurement without leaks. If nothing leaks into the axis, ``own`` is changed in place."""
+    def transform_without_leaks(self, own_sum: Floats) -> Floats:
+        """Return the measurement without leaks. If nothing leaks into the axis, ``own_sum`` is changed in place."""
         if not self.leaks:
-            return _apply_transforms(self._chain, own)
-        return _apply_transforms(self._alone, own.copy())
+            return _apply_transforms(self._chain, own_sum)
+        return _apply_transforms(self._alone, own_sum.copy())
 
-    def measure(self, own: Floats, alone: dict[str, Floats]) -> Floats:
+    def add_leaks_and_transform(self, own_sum: Floats, leak_free: dict[str, Floats]) -> Floats:
         """Return the measurement of the axis with the leaks from other axes."""
         if self.leaks:
             for leak in self.leaks:
-                own += leak.coefficient * alone[leak.source]
+                own_sum += leak.coefficient * leak_free[leak.source]
         elif self.leaks_out:
-            return own  # already transformed by ``measure_without_leaks``
-        return _apply_transforms(self._chain, own)
+            return own_sum  # already transformed by ``transform_without_leaks``
+        return _apply_transforms(self._chain, own_sum)
 
 
 def _apply_transforms(chain: list[tuple[int, RunningTransform]], values: Floats) -> Floats:
     """Apply all transforms to the values in place, and return the values."""
     for _, running in chain:
-        running.apply(values)
+        running.transform_in_place(values)
     return values

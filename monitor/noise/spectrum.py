@@ -58,7 +58,7 @@ class Spectrum:
             self.peaks + other.peaks,
         )
 
-    def scaled(self, factor: float) -> "Spectrum":
+    def scaled_by_amplitude(self, factor: float) -> "Spectrum":
         """Return the spectrum of the series times ``factor``."""
         power, closed = factor**2, self.closed_form_avar
         return replace(
@@ -70,22 +70,22 @@ class Spectrum:
             level=factor * self.level,
         )
 
-    def filtered(self, gain: Curve, around: tuple[tuple[float, float], ...] = ()) -> "Spectrum":
+    def filtered_by(self, power_gain: Curve, narrow_peaks: tuple[tuple[float, float], ...] = ()) -> "Spectrum":
         """Return the spectrum of the series after a filter that passes constants.
 
         Parameters
         ----------
-        gain : callable
+        power_gain : callable
             Squared magnitude response as a function of frequency in Hz.
-        around : tuple of (float, float)
+        narrow_peaks : tuple of (float, float)
             Centres and widths in Hz of narrow peaks of the filter.
         """
         return replace(
             self,
-            density=lambda f: gain(f) * self.density(f),
+            density=lambda f: power_gain(f) * self.density(f),
             closed_form_avar=None,
-            lines=tuple((f, float(gain(np.array([f]))[0]) * size) for f, size in self.lines),
-            peaks=self.peaks + around,
+            lines=tuple((f, float(power_gain(np.array([f]))[0]) * size) for f, size in self.lines),
+            peaks=self.peaks + narrow_peaks,
         )
 
     def without_lines(self) -> "Spectrum":
@@ -96,25 +96,25 @@ class Spectrum:
         """Return the overlapping Allan variance in unit² at averaging times in seconds."""
         if self.closed_form_avar is not None:
             return self.closed_form_avar(tau_s)
-        total = allan_of_density(self.density, tau_s, self.tau0_s, self.peaks)
+        total = allan_variance_of_density(self.density, tau_s, self.tau0_s, self.peaks)
         total += 0.5 * (self.slope * tau_s) ** 2
         for f_hz, mean_square in self.lines:
-            total += allan_of_line(f_hz, mean_square, tau_s, self.tau0_s)
+            total += allan_variance_of_line(f_hz, mean_square, tau_s, self.tau0_s)
         return total
 
-    def mean_square(self, lowest_hz: float, gain: Curve | None = None) -> float:
+    def mean_square(self, lowest_hz: float, weight: Curve | None = None) -> float:
         """Return 2 ∫ S gain df from ``lowest_hz`` to half the sample rate, plus the lines, in unit².
 
         Parameters
         ----------
         lowest_hz : float
             Lower end of the integral, Hz.
-        gain : callable or None
+        weight : callable or None
             Weight as a function of frequency in Hz; None = 1.
         """
         f = frequency_grid(lowest_hz, self.tau0_s, self.peaks)
-        weighted = self.density(f) if gain is None else self.density(f) * gain(f)
-        lines = sum(size * (1.0 if gain is None else float(gain(np.array([f]))[0])) for f, size in self.lines)
+        weighted = self.density(f) if weight is None else self.density(f) * weight(f)
+        lines = sum(size * (1.0 if weight is None else float(weight(np.array([f]))[0])) for f, size in self.lines)
         return 2.0 * _integrate_log_trapezoid(weighted, f) + lines
 
 
@@ -137,12 +137,12 @@ def zero_spectrum(tau0_s: float) -> Spectrum:
     return Spectrum(np.zeros_like, np.zeros_like, tau0_s)
 
 
-def undefined_spectrum(tau0_s: float) -> Spectrum:
+def nan_spectrum(tau0_s: float) -> Spectrum:
     """Return a spectrum of NaN, for a series without known stationary second moments."""
     return Spectrum(_nan, _nan, tau0_s)
 
 
-def allan_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float) -> Floats:
+def allan_variance_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float) -> Floats:
     """Return the Allan variance of a sampled sinusoid: A² sin⁴(πfτ)/(m² sin²(πfτ0)), A² = 2·mean square.
 
     The formula is the sampled form of the sinusoidal noise of IEEE Std 952 annex C.
@@ -163,7 +163,9 @@ def allan_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float)
     return np.asarray(2.0 * mean_square * ratio**2)
 
 
-def allan_of_density(density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[tuple[float, float], ...]) -> Floats:
+def allan_variance_of_density(
+    density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[tuple[float, float], ...]
+) -> Floats:
     """Return the Allan variance of a spectral density by numerical integration, see the module's docstring.
 
     Parameters
@@ -180,7 +182,7 @@ def allan_of_density(density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[
     Examples
     --------
     >>> tau = np.array([0.01, 0.02, 1.0, 50.0])
-    >>> flat = allan_of_density(lambda f: np.full_like(f, 4.0), tau, 0.01, ())
+    >>> flat = allan_variance_of_density(lambda f: np.full_like(f, 4.0), tau, 0.01, ())
     >>> bool(np.all(np.abs(flat * tau / 4.0 - 1.0) < 3e-4))
     True
     """

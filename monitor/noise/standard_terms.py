@@ -24,7 +24,7 @@ UNIT_SOURCES: Final = tuple(term(**{symbol: 1.0}) for symbol, term in STANDARD_T
 """Noise terms with unit coefficients."""
 
 
-def unit_allan_variances(tau_s: Floats, tau0_s: float) -> Floats:
+def unit_coefficient_allan_variances(tau_s: Floats, tau0_s: float) -> Floats:
     """Return the Allan variances [m, 5] of the five terms with unit coefficients.
 
     Parameters
@@ -36,7 +36,7 @@ def unit_allan_variances(tau_s: Floats, tau0_s: float) -> Floats:
 
     Examples
     --------
-    >>> unit_allan_variances(np.array([2.0]), 1e-6).round(4).tolist()
+    >>> unit_coefficient_allan_variances(np.array([2.0]), 1e-6).round(4).tolist()
     [[0.75, 0.5, 0.4413, 0.6667, 2.0]]
     """
     return np.stack([source.avar(tau_s, tau0_s) for source in UNIT_SOURCES], axis=1)

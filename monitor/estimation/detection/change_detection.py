@@ -70,11 +70,11 @@ from monitor.estimation.detection.change_kernel import (
     F,
     N,
     S,
-    advance,
-    make_state,
-    set_due,
+    advance_until_decision,
+    make_change_state,
+    set_next_decision_time,
 )
-from monitor.estimation.detection.changed_coefficients import HaarVariancesBeforeAfter, identify_noise_change
+from monitor.estimation.detection.changed_coefficients import HaarVariancesBeforeAfter, identify_changed_coefficients
 
 MAX_CLUSTER_S: Final = 300.0
 """Longest cluster in seconds.
@@ -134,7 +134,7 @@ class Change:
     ]  # values before and after in SI: coefficients, band (from, to in Hz) and rms, …
     text: str  # description for users
 
-    def sides(self) -> dict[str, dict[str, float]]:
+    def values_before_and_after(self) -> dict[str, dict[str, float]]:
         """Return ``what`` with the keys ``before`` and ``after``, or ``from`` and ``to`` for a band."""
         return {
             name: {"from": first, "to": second} if name == "band" else {"before": first, "after": second}
@@ -160,8 +160,8 @@ class ChangeDetector:
     >>> detector = ChangeDetector(100.0)
     >>> noise = 1e-3 * np.random.default_rng(1).standard_normal((30_000, 6))
     >>> noise[20_000:, 2] *= 1.5
-    >>> detector.update(noise)
-    >>> [(change.kind, AXES[change.axis], list(change.what)) for change in detector.take()]
+    >>> detector.process_samples(noise)
+    >>> [(change.kind, AXES[change.axis], list(change.what)) for change in detector.take_changes()]
     [('noise_changed', 'gz', ['N'])]
     """
 
@@ -170,7 +170,7 @@ class ChangeDetector:
             raise ConfigError(f"rate {rate_hz} Hz and {alarms_per_day} alarms a day must be positive")
         self.rate_hz = rate_hz
         self._octaves = min(max(floor(log2(MAX_CLUSTER_S * rate_hz)), 7), 20) + 1
-        self._state = make_state(self._octaves)
+        self._state = make_change_state(self._octaves)
         looks = DAY_S * rate_hz * len(AXES)  # z² per day, which is also the number of pairs of blocks per day
         # The lower tail is used, because 1 - p would be rounded to 1 for p below 1e-16.
         once = -NormalDist().inv_cdf(min(0.5 * OTHER_SHARE * alarms_per_day / looks, 0.01))
@@ -182,19 +182,19 @@ class ChangeDetector:
         self._found: list[Change] = []
 
     @property
-    def samples(self) -> int:
+    def samples_since_start(self) -> int:
         """Number of samples since the start, including missing ones."""
         return int(self._state.clock[TOTAL])
 
     @property
-    def watched_octaves(self) -> NDArray[np.bool_]:
+    def octaves_ready_for_alarm(self) -> NDArray[np.bool_]:
         """True for octaves [J, 6] (clusters of 2^j samples) whose reference is long enough for an alarm."""
         band = self._state.band
         known = (band[:, :, N] >= MIN_REFERENCE_TERMS * band[:, :, F] ** 2) & (band[:, :, S] > 0.0)
-        old_enough = self.samples - self._state.born >= LEARN_S * self.rate_hz
+        old_enough = self.samples_since_start - self._state.born >= LEARN_S * self.rate_hz
         return np.asarray((known & old_enough[:, None]).T)
 
-    def update(self, values: Floats) -> None:
+    def process_samples(self, values: Floats) -> None:
         """Process samples.
 
         Parameters
@@ -212,30 +212,30 @@ class ChangeDetector:
             raise ValueError(f"samples of shape {rows.shape}; expected is [n, {len(AXES)}]")
         row = 0
         while row < len(rows):
-            row = advance(self._state, rows, row)
+            row = advance_until_decision(self._state, rows, row)
             if self._state.clock[TOTAL] >= self._state.clock[NEXT_DUE]:
                 for axis in np.flatnonzero(
-                    (self._state.alarm[:, KIND] > 0) & (self._state.alarm[:, DUE] <= self.samples)
+                    (self._state.alarm[:, KIND] > 0) & (self._state.alarm[:, DUE] <= self.samples_since_start)
                 ):
                     self._decide(int(axis))
-                set_due(self._state)
+                set_next_decision_time(self._state)
 
-    def skip(self, n: int) -> None:
+    def skip_missing_samples(self, n_samples: int) -> None:
         """Process n missing samples."""
-        hole = np.full((min(n, SKIP_BLOCK_ROWS), len(AXES)), np.nan)
-        for start in range(0, n, SKIP_BLOCK_ROWS):
-            self.update(hole[: n - start])
+        hole = np.full((min(n_samples, SKIP_BLOCK_ROWS), len(AXES)), np.nan)
+        for start in range(0, n_samples, SKIP_BLOCK_ROWS):
+            self.process_samples(hole[: n_samples - start])
 
-    def take(self) -> list[Change]:
+    def take_changes(self) -> list[Change]:
         """Return the changes found since the last call, in the order of detection."""
         found, self._found = self._found, []
         return found
 
-    def restart(self, axis: int | None = None) -> None:
+    def restart_references(self, axis: int | None = None) -> None:
         """Start a new reference of one axis, or of all axes."""
         for one in range(len(AXES)) if axis is None else (axis,):
             self._restart_reference(one)
-        set_due(self._state)
+        set_next_decision_time(self._state)
 
     def _decide(self, axis: int) -> None:
         """Decide which change caused the alarm of one axis, after the waiting time."""
@@ -291,8 +291,8 @@ class ChangeDetector:
                 v1 = after[:, UNIT_RAW] / after[:, UNIT_N]
             v1 = np.where(after[:, UNIT_N] > 0, v1, 0.0)
         octaves = HaarVariancesBeforeAfter(v0, np.maximum(before_n, 0.0) / spread, v1, after[:, UNIT_N] / spread)
-        what = identify_noise_change(octaves, self.rate_hz)
-        sigma = sqrt(2.0 * max(octaves.evidence(), alarm[EVIDENCE]))
+        what = identify_changed_coefficients(octaves, self.rate_hz)
+        sigma = sqrt(2.0 * max(octaves.log_likelihood_ratio_of_change(), alarm[EVIDENCE]))
         text = f"{AXES[axis]} {_noise_text(AXES[axis], what)}"
         self._found.append(Change("noise_changed", axis, int(alarm[START]), int(alarm[FOUND]), sigma, what, text))
         self._restart_reference(axis, int(alarm[START]))
@@ -303,7 +303,7 @@ class ChangeDetector:
     def _report_burst(self, axis: int, alarm: Floats, after: Floats, before_n: Floats, before_s: Floats) -> None:
         """Report a burst of outliers after the end, and remove the samples of the burst from the reference."""
         s = self._state
-        now = self.samples
+        now = self.samples_since_start
         latest = s.cum[axis, 0, UNIT_EXTREME] - self._cum_at(now - MIN_DWELL_SAMPLES // 2)[axis, 0, UNIT_EXTREME]
         lasting = now - alarm[START] >= max(MAX_BURST_S * self.rate_hz, 2 * MIN_DWELL_SAMPLES)
         if latest > 0 and not lasting:
@@ -339,16 +339,16 @@ class ChangeDetector:
         """Reset the evidence of changes of one axis, and skip the blocks that contain samples of the change."""
         s = self._state
         s.cusum[axis] = s.unit[axis] = 0.0
-        s.cusum[axis, :, :, SINCE] = self.samples
-        s.burst[axis] = 0.0, self.samples
+        s.cusum[axis, :, :, SINCE] = self.samples_since_start
+        s.burst[axis] = 0.0, self.samples_since_start
         s.step[axis], s.step[axis, 0] = 0.0, -1.0
-        under_way = self.samples % (2 << np.arange(self._octaves)) != 0
+        under_way = self.samples_since_start % (2 << np.arange(self._octaves)) != 0
         s.fill[axis] = -under_way.astype(np.int64)
 
     def _restart_reference(self, axis: int, born: int | None = None) -> None:
         """Start a new reference of one axis, and reset the evidence. The block sums of the octaves are kept."""
         s = self._state
-        s.born[axis] = self.samples if born is None else born
+        s.born[axis] = self.samples_since_start if born is None else born
         s.band[axis] = s.spread[axis] = 0.0
         s.band[axis, :, F] = 1.0
         s.alarm[axis] = 0.0

@@ -127,7 +127,7 @@ class ChangeState(NamedTuple):
     snap_at: Ints  # [levels, SLOTS] sample numbers of the snapshots
 
 
-def make_state(octaves: int) -> ChangeState:
+def make_change_state(octaves: int) -> ChangeState:
     """Return the initial state. The caller must set ``levels``."""
     a, j = AXES, octaves
     state = ChangeState(
@@ -144,22 +144,22 @@ def make_state(octaves: int) -> ChangeState:
 
 
 @compiled
-def advance(s: ChangeState, rows: Floats, first: int) -> int:
+def advance_until_decision(s: ChangeState, samples: Floats, first_row: int) -> int:
     """Process rows until a decision is due, and return the row after the last one processed.
 
     Parameters
     ----------
     s : ChangeState
         State, updated in place.
-    rows : ndarray of float64, shape (n, 6)
+    samples : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s²; NaN means missing.
-    first : int
+    first_row : int
         First row to process.
     """
-    for row in range(first, len(rows)):
+    for row in range(first_row, len(samples)):
         place = s.clock[TOTAL] % TICK_SAMPLES
         for axis in range(AXES):
-            s.stage[axis, place] = rows[row, axis]
+            s.stage[axis, place] = samples[row, axis]
         s.clock[TOTAL] += 1
         if place == TICK_SAMPLES - 1:
             now = s.clock[TOTAL]
@@ -168,7 +168,7 @@ def advance(s: ChangeState, rows: Floats, first: int) -> int:
             _remember(s, now // TICK_SAMPLES)
             if now >= s.clock[NEXT_DUE]:
                 return row + 1
-    return len(rows)
+    return len(samples)
 
 
 @compiled
@@ -444,11 +444,11 @@ def _alarm(s: ChangeState, axis: int, kind: float, since: float, evidence: float
     wait = np.ceil(min(max(now - since, s.levels[DWELL]), s.levels[LONGEST_DWELL]) / TICK_SAMPLES) * TICK_SAMPLES
     alarm[KIND], alarm[START], alarm[FOUND], alarm[EVIDENCE], alarm[DUE] = kind, since, now, evidence, now + wait
     s.step[axis, 0] = -1.0
-    set_due(s)
+    set_next_decision_time(s)
 
 
 @compiled
-def set_due(s: ChangeState) -> None:
+def set_next_decision_time(s: ChangeState) -> None:
     """Set the sample at which the kernel stops for the next decision."""
     s.clock[NEXT_DUE] = NEVER
     for axis in range(AXES):
@@ -504,7 +504,7 @@ def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
         alarm = s.alarm[axis]
         alarm[KIND], alarm[START], alarm[FOUND] = STEP, step[PLACE], now
         alarm[EVIDENCE], alarm[DUE] = 0.5 * step[SIGMA] ** 2, now
-        set_due(s)
+        set_next_decision_time(s)
 
 
 @compiled

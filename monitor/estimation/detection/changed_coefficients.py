@@ -26,7 +26,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.standard_terms import unit_allan_variances
+from monitor.noise.standard_terms import unit_coefficient_allan_variances
 
 CHANGE_SYMBOLS: Final = "QNBK"
 """Symbols of the coefficients that can change."""
@@ -52,23 +52,23 @@ class HaarVariancesBeforeAfter:
     n_after: Floats  # number of terms, divided by their spread F
 
     @property
-    def usable_octaves(self) -> np.ndarray:
+    def octaves_with_enough_terms(self) -> np.ndarray:
         """Boolean array, True for octaves with enough terms before and after the change."""
         return (self.n_after >= MIN_TERMS) & (self.n_before >= MIN_TERMS) & (self.before > 0.0)
 
-    def evidence(self) -> float:
+    def log_likelihood_ratio_of_change(self) -> float:
         """Return the logarithm of the likelihood ratio of "all octaves changed" and "no octave changed".
 
         The expectation without a change is subtracted.
         """
-        ok = self.usable_octaves & (self.after > 0.0)
+        ok = self.octaves_with_enough_terms & (self.after > 0.0)
         n0, n1, v0, v1 = self.n_before[ok], self.n_after[ok], self.before[ok], self.after[ok]
         pooled = (n0 * v0 + n1 * v1) / (n0 + n1)
         gained = 0.5 * ((n0 + n1) * np.log(pooled) - n0 * np.log(v0) - n1 * np.log(v1))
         return float(max(gained.sum() - 0.5 * ok.sum(), 0.0))
 
 
-def identify_noise_change(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> dict[str, tuple[float, float]]:
+def identify_changed_coefficients(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> dict[str, tuple[float, float]]:
     """Return the coefficients that changed, or the frequency band if no coefficient explains the change.
 
     Parameters
@@ -85,12 +85,12 @@ def identify_noise_change(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> 
         contains the lowest and the highest frequency in Hz. ``rms`` then contains the Haar deviation before and after
         at the octave that changed most. The dictionary is empty if no octave has enough terms.
     """
-    ok = octaves.usable_octaves
+    ok = octaves.octaves_with_enough_terms
     if not ok.any():
         return {}
     tau0 = 1.0 / rate_hz
     tau = np.asarray(tau0 * 2.0 ** np.flatnonzero(ok), np.float64)
-    columns = unit_allan_variances(tau, tau0)[:, : len(CHANGE_SYMBOLS)]
+    columns = unit_coefficient_allan_variances(tau, tau0)[:, : len(CHANGE_SYMBOLS)]
     v0, v1, n0, n1 = octaves.before[ok], octaves.after[ok], octaves.n_before[ok], octaves.n_after[ok]
     floor, _, _ = _select_letters(
         columns, v0, 2.0 * v0**2 / n0 + (SHAPE_TOLERANCE * v0) ** 2, np.zeros(len(CHANGE_SYMBOLS))

@@ -39,12 +39,12 @@ class QuantizationStep:
     noise: float  # σ from sample to sample, including quantization, rad/s or m/s²
 
 
-def find_coarse_axes(values: Floats) -> list[QuantizationStep]:
+def find_coarsely_quantized_axes(values: Floats) -> list[QuantizationStep]:
     """Return the axes of samples [n, 6] whose quantization step is at least ``MIN_STEP_TO_NOISE`` times the noise.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[:, 4] = noise[:, 4].round()
-    >>> [(one.axis, one.step, round(one.noise, 1)) for one in find_coarse_axes(noise)]
+    >>> [(one.axis, one.step, round(one.noise, 1)) for one in find_coarsely_quantized_axes(noise)]
     [(4, 1.0, 1.0)]
     """
     rows = min(ROWS, len(values))

@@ -1,9 +1,9 @@
 """Detection of spectral lines, resonances and outliers, which the five Gaussian noise terms cannot explain.
 
-The input is a recording on a regular grid and the Allan curve of the recording. The results are a ``Line`` for each
-relevant peak, and the share of outliers of each axis. At most ``MAX_STRETCHES`` stretches of ``ROWS`` samples, spread
-over the recording, are searched. The longest recording therefore takes no more than a second. Stretches with more than
-``MAX_MISSING_SHARE`` missing samples are skipped.
+The input is a recording on a regular grid and the Allan curve of the recording. The results are a ``SpectralLine`` for
+each relevant peak, and the share of outliers of each axis. At most ``MAX_STRETCHES`` stretches of ``ROWS`` samples,
+spread over the recording, are searched. The longest recording therefore takes no more than a second. Stretches with
+more than ``MAX_MISSING_SHARE`` missing samples are skipped.
 
 - **Lines.** The periodograms of the stretches with a Hann window are averaged (Welch 1967). A peak exceeds the medians
   of the bins on both sides by ``MIN_PEAK_SIGMA`` and by the factor ``MIN_PEAK_RATIO``. Lines are searched in single
@@ -91,7 +91,7 @@ NEIGHBOURS: Final = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class SpectralLine:
     """Spectral peak of one axis."""
 
     axis: int  # index into AXES
@@ -110,14 +110,14 @@ class _Peak:
     wide: bool  # True for a peak wider than the resolution of the spectrum
 
 
-def detect_lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve) -> list[Line]:
+def detect_spectral_lines(values: Floats, in_motion: Mask, rate_hz: float, curve: AllanCurve) -> list[SpectralLine]:
     """Return the spectral peaks of all axes, the strongest of each axis first.
 
     Parameters
     ----------
     values : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s²; NaN means missing.
-    moving : ndarray of bool, shape (n,)
+    in_motion : ndarray of bool, shape (n,)
         True for samples to ignore.
     rate_hz : float
         Sample rate in Hz.
@@ -129,7 +129,7 @@ def detect_lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve
         return []
     found = []
     for axis in range(len(AXES)):
-        parts = [_filled(part) for part in _stretches(values[:, axis], moving, rows, MAX_STRETCHES)]
+        parts = [_filled(part) for part in _stretches(values[:, axis], in_motion, rows, MAX_STRETCHES)]
         if len(parts) < MIN_STRETCHES:
             continue
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # constant axes and extreme values
@@ -140,14 +140,14 @@ def detect_lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve
     return found
 
 
-def outlier_share(values: Floats, moving: Mask) -> Floats:
+def outlier_share_of_axes(values: Floats, in_motion: Mask) -> Floats:
     """Return the share of outliers of each axis.
 
     Parameters
     ----------
     values : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s²; NaN means missing.
-    moving : ndarray of bool, shape (n,)
+    in_motion : ndarray of bool, shape (n,)
         True for samples to ignore.
 
     Returns
@@ -157,7 +157,7 @@ def outlier_share(values: Floats, moving: Mask) -> Floats:
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[::50, 2] = 30.0
-    >>> outlier_share(noise, np.zeros(20_000, bool)).round(3).tolist()
+    >>> outlier_share_of_axes(noise, np.zeros(20_000, bool)).round(3).tolist()
     [0.0, 0.0, 0.02, 0.0, 0.0, 0.0]
     """
     shares = np.full(len(AXES), np.nan)
@@ -165,19 +165,19 @@ def outlier_share(values: Floats, moving: Mask) -> Floats:
     for axis in range(len(AXES)) if rows else ():
         far = [
             _outlier_share(part[np.isfinite(part)])
-            for part in _stretches(values[:, axis], moving, rows, MAX_OUTLIER_STRETCHES)
+            for part in _stretches(values[:, axis], in_motion, rows, MAX_OUTLIER_STRETCHES)
         ]
         if far:
             shares[axis] = np.mean(far)
     return shares
 
 
-def line_share(line: Line, curve: AllanCurve) -> Floats:
+def allan_variance_share_of_line(line: SpectralLine, curve: AllanCurve) -> Floats:
     """Return the share [m] of the Allan variance that a line contributes at each τ.
 
     Parameters
     ----------
-    line : Line
+    line : SpectralLine
         Spectral line.
     curve : AllanCurve
         Allan curve of the recording.
@@ -275,11 +275,11 @@ def _find_runs(marks: Mask) -> list[tuple[int, int]]:
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
-def _make_line(axis: int, peak: _Peak, bin_hz: float, rate_hz: float, curve: AllanCurve) -> Line:
-    """Convert a peak to a ``Line``, and compute the share of the Allan variance."""
+def _make_line(axis: int, peak: _Peak, bin_hz: float, rate_hz: float, curve: AllanCurve) -> SpectralLine:
+    """Convert a peak to a ``SpectralLine``, and compute the share of the Allan variance."""
     frequency, amplitude = peak.middle * bin_hz, (2.0 * peak.power) ** 0.5
     shares = _allan_share(axis, frequency / rate_hz, amplitude, curve)
-    return Line(axis, frequency, amplitude, float(np.nanmax(shares, initial=0.0)), peak.wide)
+    return SpectralLine(axis, frequency, amplitude, float(np.nanmax(shares, initial=0.0)), peak.wide)
 
 
 def _allan_share(axis: int, turns: float, amplitude: float, curve: AllanCurve) -> Floats:

@@ -2,11 +2,12 @@
 
 The window is compared with the model ten times per second, and successive results are strongly correlated. Several
 results above the threshold are therefore not independent evidence. In addition, some of many windows exceed the
-threshold by chance. A model is rejected only if every comparison exceeds the stricter limit ``AxisGap.alarm`` until an
-eighth of the window and at least ``MIN_SAMPLES`` samples have been replaced. If the gap is above twice the threshold,
-chance is excluded, and ``MIN_SAMPLES`` new samples are sufficient. A rejected model is accepted again if the gap stays
-below ``null95`` until the same share of the window has been replaced. Between the two limits, the decision does not
-change. In a simulation of 1600 windows of six axes with 128 comparisons each, a true model was rejected three times.
+threshold by chance. A model is rejected only if every comparison exceeds the stricter limit
+``AxisModelComparison.alarm`` until an eighth of the window and at least ``MIN_SAMPLES`` samples have been replaced. If
+the gap is above twice the threshold, chance is excluded, and ``MIN_SAMPLES`` new samples are sufficient. A rejected
+model is accepted again if the gap stays below ``null95`` until the same share of the window has been replaced. Between
+the two limits, the decision does not change. In a simulation of 1600 windows of six axes with 128 comparisons each, a
+true model was rejected three times.
 
 A rejection and a renewed acceptance are reported as ``model_disagrees`` events. The field ``agrees`` of the event is
 the new decision.
@@ -17,7 +18,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.data_types import AXES, Event
-from monitor.estimation.detection.model_comparison import MIN_SAMPLES, AxisGap, ModelGap
+from monitor.estimation.detection.model_comparison import MIN_SAMPLES, AxisModelComparison, ModelComparison
 
 KIND: Final = "model_disagrees"
 RENEWED_SHARE: Final = 0.125
@@ -34,23 +35,23 @@ class _Axis:
     since: tuple[int, int] | None = None  # samples and t_ns of the first comparison that contradicts the decision
 
 
-class ModelAgreement:
+class ModelAgreementMonitor:
     """Decisions whether the axes of one device agree with the noise model."""
 
     def __init__(self) -> None:
         self._axes = {axis: _Axis() for axis in AXES}
 
     @property
-    def decisions(self) -> Mapping[str, bool]:
+    def agreement_by_axis(self) -> Mapping[str, bool]:
         """Current decision for each decided axis, True if the axis agrees with the model."""
         return {axis: one.agrees for axis, one in self._axes.items() if one.agrees is not None}
 
-    def update(self, comparison: ModelGap) -> list[Event]:
+    def update_decisions(self, comparison: ModelComparison) -> list[Event]:
         """Process one comparison, and return an event for each axis whose decision changes."""
         found = (self._update_axis(self._axes[axis], gap, comparison) for axis, gap in comparison.axes.items())
         return [event for event in found if event is not None]
 
-    def _update_axis(self, axis: _Axis, gap: AxisGap, comparison: ModelGap) -> Event | None:
+    def _update_axis(self, axis: _Axis, gap: AxisModelComparison, comparison: ModelComparison) -> Event | None:
         """Update the decision for one axis, and return an event if it changed."""
         if axis.agrees is None and gap.gap <= gap.alarm:
             axis.agrees = True  # a first decision for agreement is not reported
@@ -68,7 +69,7 @@ class ModelAgreement:
         return _event(gap, axis.agrees, comparison.t_ns, since_ns)
 
 
-def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
+def _event(gap: AxisModelComparison, agrees: bool, t_ns: int, since_ns: int) -> Event:
     """Build the event for a changed decision."""
     lo, hi = gap.tau_s
     tau = f"{lo:.3g} s" if lo == hi else f"{lo:.3g} to {hi:.3g} s"
@@ -76,7 +77,7 @@ def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
         "agrees": agrees,
         "gap": gap.gap,
         "threshold": gap.threshold,
-        "ratio": gap.ratio,
+        "ratio": gap.measured_to_model_ratio,
         "tau_lo": lo,
         "tau_hi": hi,
     }
@@ -85,7 +86,7 @@ def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
     else:
         text = (
             f"{gap.axis} disagrees with its model at τ {tau}: "
-            f"the deviation is {gap.ratio:.3g} times the deviation of the model, "
+            f"the deviation is {gap.measured_to_model_ratio:.3g} times the deviation of the model, "
             f"a gap of {gap.gap:.3g} σ with a threshold of {gap.threshold:.1f} σ"
         )
     return Event(KIND, t_ns, text, gap.axis, {"model": what}, since_ns, gap.gap)

@@ -2,7 +2,7 @@
 
 For each axis, the comparison gives the difference at each τ in standard deviations and the largest difference, called
 the gap. It also gives the limits that the gap of a true model exceeds only by chance.
-``model_agreement.ModelAgreement`` converts successive comparisons into events.
+``model_agreement.ModelAgreementMonitor`` converts successive comparisons into events.
 
 If the model is true, ν σ²(τ)/σ²_model(τ) is approximately χ² with ν degrees of freedom. The cube root of χ² is
 approximately normal (Wilson & Hilferty, PNAS 17, 1931), which gives
@@ -45,11 +45,11 @@ MIN_SAMPLES: Final = 1000
 FALSE_ALARM: Final = 0.01
 """Share of independent windows of a true model that exceed the threshold on any axis."""
 FALSE_ALARM_WATCHED: Final = 0.001
-"""Share of independent windows of a true model that exceed ``AxisGap.alarm`` on any axis."""
+"""Share of independent windows of a true model that exceed ``AxisModelComparison.alarm`` on any axis."""
 
 
 @dataclass(frozen=True, slots=True)
-class AxisGap:
+class AxisModelComparison:
     """Comparison of one axis of the window with its model."""
 
     axis: str
@@ -65,13 +65,13 @@ class AxisGap:
     samples: int  # samples of this axis in the window
 
     @property
-    def ratio(self) -> float:
+    def measured_to_model_ratio(self) -> float:
         """Ratio of the measured deviation to the deviation of the model at the largest gap."""
         return float(self.measured[self.row] / self.model[self.row])
 
 
 @dataclass(frozen=True, slots=True)
-class ModelGap:
+class ModelComparison:
     """Comparison of all axes at one moment."""
 
     t_ns: int  # time of the newest sample
@@ -80,7 +80,7 @@ class ModelGap:
     samples: int  # received since the start
     n: int  # samples in the window
     tau_s: Floats  # [m]
-    axes: Mapping[str, AxisGap]  # axes that can be compared, in the order of AXES
+    axes: Mapping[str, AxisModelComparison]  # axes that can be compared, in the order of AXES
     agrees: Mapping[str, bool] = field(default_factory=dict)  # current decisions, see ``model_agreement``
 
 
@@ -102,22 +102,22 @@ class PreparedModel:
         self._tables = AxisCovarianceTables(np.empty(0, np.int64), length)
         self._of: tuple[float, tuple[int, ...]] = (0.0, ())  # rate and cluster sizes of the prepared values
 
-    def compare(self, estimate: Estimate) -> ModelGap:
+    def compare_with_estimate(self, estimate: Estimate) -> ModelComparison:
         """Compare all axes that are part of the model and have at least ``MIN_SAMPLES`` samples in the window."""
         curve = estimate.curve
         tables = self._prepare(curve.factors, estimate.rate_hz)
-        found: dict[str, AxisGap] = {}
+        found: dict[str, AxisModelComparison] = {}
         for axis, expected in self._expected.items():
             i = AXES.index(axis)
             terms = curve.terms[:, i]
-            n = samples_of_axis(curve, i)
+            n = count_axis_samples_in_window(curve, i)
             if n < MIN_SAMPLES:
                 continue
-            edf = expected.edf(tables.at(i, n, curve.n), terms)
+            edf = expected.degrees_of_freedom(tables.at(i, n, curve.n), terms)
             one = _axis_gap(axis, curve.tau_s, curve.avar[:, i], expected.avar, edf, n, len(self._expected))
             if one is not None:
                 found[axis] = one
-        return ModelGap(
+        return ModelComparison(
             estimate.t_ns, estimate.rate_hz, estimate.window_s, estimate.samples, curve.n, curve.tau_s, found
         )
 
@@ -131,13 +131,13 @@ class PreparedModel:
             self._tables = AxisCovarianceTables(factors, self._length)
         if self._of != of:
             named = (axis for axis in AXES if self._model.effects.get(axis))
-            known = {axis: _Expected.of(self._model, axis, factors, rate_hz) for axis in named}
+            known = {axis: _Expected.from_model(self._model, axis, factors, rate_hz) for axis in named}
             self._expected = {axis: one for axis, one in known.items() if (one.avar > 0.0).any()}
             self._of = of
         return self._tables
 
 
-def samples_of_axis(curve: AllanCurve, axis: int) -> int:
+def count_axis_samples_in_window(curve: AllanCurve, axis: int) -> int:
     """Return the number of samples of an axis in the window, which is less than ``curve.n`` for a restarted axis.
 
     Parameters
@@ -160,18 +160,18 @@ class _Expected:
     more: Floats  # [m] variance of one term beyond the variance from Q N B K, unit⁴
 
     @classmethod
-    def of(cls, model: NoiseModel, axis: str, factors: Ints, rate_hz: float) -> "_Expected":
+    def from_model(cls, model: NoiseModel, axis: str, cluster_sizes: Ints, rate_hz: float) -> "_Expected":
         """Compute the expected values of one axis of a model at the given cluster sizes."""
         spectrum = model.spectrum(axis, 1.0 / rate_hz)
-        tau_s = factors / rate_hz
+        tau_s = cluster_sizes / rate_hz
         shape, classic = _standard_terms(model, axis, rate_hz)
-        more = _excess_variance(spectrum, classic, factors, rate_hz)
+        more = _excess_variance(spectrum, classic, cluster_sizes, rate_hz)
         # A ramp has no variance, but the product of ramp and noise has. The effect is at most the effect of a random
         # walk of the same size.
         shape[K] += 1.5 * spectrum.slope**2 * float(tau_s.max()) / rate_hz
         return cls(spectrum.avar(tau_s), shape, more)
 
-    def edf(self, table: CovarianceTable, terms: Ints) -> Floats:
+    def degrees_of_freedom(self, table: CovarianceTable, terms: Ints) -> Floats:
         """Return the degrees of freedom [m] for these numbers of terms; NaN without terms."""
         pairs = np.array([self.shape[a] * self.shape[b] * (1.0 if a == b else 2.0) for a, b in PAIRS])
         exact = np.einsum("iik,k->i", table.covariance, pairs)
@@ -225,15 +225,15 @@ def _kernel(nu: Floats, m: int) -> Floats:
 
 def _axis_gap(
     axis: str, tau_s: Floats, avar: Floats, expected: Floats, edf: Floats, samples: int, axes: int
-) -> AxisGap | None:
+) -> AxisModelComparison | None:
     """Compare one axis of a model that has ``axes`` axes. Return None if no τ can be compared."""
     expected = np.where(expected > 0.0, expected, np.nan)
-    z = normal_score(avar / expected, edf)
+    z = chi2_ratio_to_normal_score(avar / expected, edf)
     judged = np.isfinite(z)
     if not judged.any():
         return None
     count = int(judged.sum())
-    threshold, alarm = (max_z_limit(share, axes * count) for share in (FALSE_ALARM, FALSE_ALARM_WATCHED))
+    threshold, alarm = (max_abs_z_limit(share, axes * count) for share in (FALSE_ALARM, FALSE_ALARM_WATCHED))
     size = np.where(judged, np.abs(z), -1.0)
     at = int(size.argmax())
     alike = (size > threshold) & (np.sign(z) == np.sign(z[at]))
@@ -243,13 +243,13 @@ def _axis_gap(
     while last + 1 < alike.size and alike[last + 1]:
         last += 1
     where = float(tau_s[first]), float(tau_s[last])
-    null95 = max_z_limit(0.05, count)
-    return AxisGap(
+    null95 = max_abs_z_limit(0.05, count)
+    return AxisModelComparison(
         axis, np.sqrt(avar), np.sqrt(expected), z, float(size[at]), where, at, null95, threshold, alarm, samples
     )
 
 
-def normal_score(ratio: Floats, edf: Floats) -> Floats:
+def chi2_ratio_to_normal_score(ratio: Floats, edf: Floats) -> Floats:
     """Return the deviation of χ²/ν from 1 in standard deviations, computed from the cube root of the ratio.
 
     The result is NaN for fewer than ``MIN_EDF`` degrees of freedom. In the example, 129.561 is the 97.5 % quantile of
@@ -262,26 +262,26 @@ def normal_score(ratio: Floats, edf: Floats) -> Floats:
     edf : ndarray of float64
         Degrees of freedom ν.
 
-    >>> round(float(normal_score(np.array([1.29561]), np.array([100.0]))[0]), 2)
+    >>> round(float(chi2_ratio_to_normal_score(np.array([1.29561]), np.array([100.0]))[0]), 2)
     1.96
     """
     spread = 2.0 / (9.0 * np.where(edf >= MIN_EDF, edf, np.nan))
     return np.asarray((np.cbrt(ratio) - 1.0 + spread) / np.sqrt(spread))
 
 
-def max_z_limit(share: float, numbers: int) -> float:
+def max_abs_z_limit(exceedance_probability: float, count: int) -> float:
     """Return the limit that the largest of several |z| exceeds with a given probability.
 
     The probability is exact for independent z, and an upper bound otherwise.
 
     Parameters
     ----------
-    share : float
+    exceedance_probability : float
         Probability that the limit is exceeded.
-    numbers : int
+    count : int
         Number of z.
 
-    >>> f"{max_z_limit(0.05, 1):.3f} {max_z_limit(0.01, 6 * 14):.3f}"
+    >>> f"{max_abs_z_limit(0.05, 1):.3f} {max_abs_z_limit(0.01, 6 * 14):.3f}"
     '1.960 3.847'
     """
-    return -normal_quantile(float(-0.5 * np.expm1(np.log1p(-share) / numbers)))
+    return -normal_quantile(float(-0.5 * np.expm1(np.log1p(-exceedance_probability) / count)))

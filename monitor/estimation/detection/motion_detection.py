@@ -30,8 +30,8 @@ from monitor.estimation.detection.motion_kernel import (
     LAST,
     PEAK,
     REMOVED_AFTER,
-    advance,
-    make_state,
+    advance_motion_detection,
+    make_motion_state,
 )
 
 BLOCK_S: Final = 0.25
@@ -68,25 +68,25 @@ class MotionDetector:
     >>> rest = MotionDetector(100.0)
     >>> still = np.random.default_rng(0).normal(0.0, 1e-3, (2000, 6))
     >>> still[1000:1200, 0] += np.sin(np.arange(200) / 20)
-    >>> out = rest.advance_and_take_decided(make_block(np.arange(2000), still)) + rest.flush()
-    >>> [motion.text for motion in rest.take()]
+    >>> out = rest.advance_and_take_decided(make_block(np.arange(2000), still)) + rest.flush_delayed_samples()
+    >>> [motion.text for motion in rest.take_motions()]
     ['moved for 2.0 s: gx up to 57 °/s']
-    >>> rest.moved_samples, sum(int(np.isnan(one.values[:, 0]).sum()) for one in out)
+    >>> rest.samples_in_motion, sum(int(np.isnan(one.values[:, 0]).sum()) for one in out)
     (275, 275)
     """
 
     def __init__(self, rate_hz: float) -> None:
-        self.moved_samples = 0
+        self.samples_in_motion = 0
         self.episodes = 0
         self._rate_hz = rate_hz
-        self._size = block_size(rate_hz)
-        self._state = make_state()
+        self._size = samples_per_block(rate_hz)
+        self._state = make_motion_state()
         self._held: deque[tuple[int, SampleBlock]] = deque()  # blocks with the index of their first row
         self._index = 0  # index of the next sample
         self._motions: list[Motion] = []
 
     @property
-    def moving(self) -> bool:
+    def is_moving(self) -> bool:
         """True if the newest decided block belongs to an episode of motion."""
         return bool(self._state.place[BEGAN] >= 0)
 
@@ -96,18 +96,20 @@ class MotionDetector:
         self._held.append((first, samples))
         self._index = first + len(samples)
         blocks, moving, episodes = _allocate_output(len(samples), self._size)
-        filled = advance(samples.values, first, self._size, False, self._state, blocks, moving, episodes)
+        filled = advance_motion_detection(
+            samples.values, first, self._size, False, self._state, blocks, moving, episodes
+        )
         return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
-    def flush(self) -> list[SampleBlock]:
+    def flush_delayed_samples(self) -> list[SampleBlock]:
         """Return the delayed samples and end the current episode, because the stream has ended."""
         blocks, moving, episodes = _allocate_output(0, self._size)
-        filled = advance(
+        filled = advance_motion_detection(
             _read_only(np.empty((0, len(AXES)))), 0, self._size, True, self._state, blocks, moving, episodes
         )
         return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
-    def take(self) -> list[Motion]:
+    def take_motions(self) -> list[Motion]:
         """Return the episodes that ended since the last call."""
         motions, self._motions = self._motions, []
         return motions
@@ -126,7 +128,7 @@ class MotionDetector:
                 samples = samples[: end - first]
             rows = (first + np.arange(len(samples))) // self._size
             struck = moving[np.searchsorted(blocks, rows)].astype(bool)
-            self.moved_samples += int(struck.sum())
+            self.samples_in_motion += int(struck.sum())
             out.append(_remove_moving(samples, struck))
         return out
 
@@ -148,15 +150,17 @@ def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], li
     motions : list of Motion
         Episodes of motion.
     """
-    size = block_size(rate_hz)
-    kernel_state = make_state()
+    size = samples_per_block(rate_hz)
+    kernel_state = make_motion_state()
     blocks, moving, episodes = _allocate_output(len(values), size)
-    verdicts, stretches = advance(_read_only(values), 0, size, True, kernel_state, blocks, moving, episodes)
+    verdicts, stretches = advance_motion_detection(
+        _read_only(values), 0, size, True, kernel_state, blocks, moving, episodes
+    )
     mask = np.repeat(moving[:verdicts].astype(bool), size)[: len(values)]
     return mask, [_make_motion(episode, size, rate_hz) for episode in episodes[:stretches]]
 
 
-def block_size(rate_hz: float) -> int:
+def samples_per_block(rate_hz: float) -> int:
     """Return the number of samples in a block."""
     return max(round(BLOCK_S * rate_hz), MIN_BLOCK_SAMPLES)
 

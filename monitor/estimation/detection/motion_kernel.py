@@ -122,7 +122,7 @@ class MotionState(NamedTuple):
     peaks: Floats  # [2, 6] largest excursion of the open episode, in SI and relative to the noise
 
 
-def make_state() -> MotionState:
+def make_motion_state() -> MotionState:
     """Return the initial state."""
     place = np.zeros(10, np.int64)
     place[[HELD, BEGAN]] = -1
@@ -136,8 +136,15 @@ def make_state() -> MotionState:
 
 
 @compiled
-def advance(
-    values: Floats, first: int, size: int, ends: bool, s: MotionState, blocks: Ints, moving: Ints, episodes: Floats
+def advance_motion_detection(
+    values: Floats,
+    first_index: int,
+    block_samples: int,
+    stream_ends: bool,
+    s: MotionState,
+    blocks: Ints,
+    moving: Ints,
+    episodes: Floats,
 ) -> Ints:
     """Process consecutive rows, and write the new decisions and the finished episodes to the output arrays.
 
@@ -145,11 +152,11 @@ def advance(
     ----------
     values : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s²; NaN means missing.
-    first : int
+    first_index : int
         Index of the first row, including missing samples.
-    size : int
+    block_samples : int
         Number of samples in a block.
-    ends : bool
+    stream_ends : bool
         True if the stream ends after these rows. The decision for the last, incomplete block is then made at once, and
         the current episode ends.
     s : MotionState
@@ -166,9 +173,9 @@ def advance(
     """
     filled = np.zeros(2, np.int64)
     for i in range(values.shape[0]):
-        number = (first + i) // size
+        number = (first_index + i) // block_samples
         if number != s.place[OPEN]:
-            _close(size, s, blocks, moving, episodes, filled)
+            _close(block_samples, s, blocks, moving, episodes, filled)
             s.place[OPEN] = number
         for a in range(AXES):
             value = values[i, a]
@@ -187,8 +194,8 @@ def advance(
             s.open[a, SQUARES] += off * off
             s.open[a, LOW] = min(s.open[a, LOW], value)
             s.open[a, HIGH] = max(s.open[a, HIGH], value)
-    if ends:
-        _close(size, s, blocks, moving, episodes, filled)
+    if stream_ends:
+        _close(block_samples, s, blocks, moving, episodes, filled)
         _emit(s, blocks, moving, filled)
         s.place[HELD] = -1
         if s.place[BEGAN] >= 0:

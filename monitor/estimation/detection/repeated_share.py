@@ -23,7 +23,7 @@ MAX_STRETCHES: Final = 500
 BISECTIONS: Final = 40
 
 
-def estimate_repeated_share(values: Floats) -> float:
+def estimate_repeated_row_share(values: Floats) -> float:
     """Return the share of rows [n, 6] that repeat the previous row because the sensor had no new measurement.
 
     Let s be the share of repeated rows, and q_a the share of the other rows in which the value of axis a repeats by
@@ -32,7 +32,7 @@ def estimate_repeated_share(values: Floats) -> float:
     for s. NaN means missing.
 
     >>> noise = np.random.default_rng(0).normal(size=(5000, 6)).round()
-    >>> estimate_repeated_share(noise), round(estimate_repeated_share(noise.repeat(2, axis=0)), 1)
+    >>> estimate_repeated_row_share(noise), round(estimate_repeated_row_share(noise.repeat(2, axis=0)), 1)
     (0.0, 0.5)
     """
     there = np.array([not np.isnan(column[:1]).all() or not np.isnan(column).all() for column in values.T])

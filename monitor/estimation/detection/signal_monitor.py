@@ -22,7 +22,7 @@ After a longer gap, the detector starts again.
 
 
 @dataclass(frozen=True, slots=True)
-class RestartRequest:
+class AxisRestartRequest:
     """Request to restart the estimate of one axis."""
 
     axis: int  # index into AXES
@@ -62,19 +62,19 @@ class SignalMonitor:
         self._newest_ns = 0
         self._moved_before = 0
         self._events: list[Event] = []
-        self._restarts: list[RestartRequest] = []
+        self._restarts: list[AxisRestartRequest] = []
         self._pending: list[SampleBlock] = []  # delayed at the previous rate, returned with the next block
         self._begin()
 
     @property
-    def moving(self) -> bool:
+    def is_moving(self) -> bool:
         """True if the device is being moved."""
-        return self._rest.moving
+        return self._rest.is_moving
 
     @property
-    def moved_samples(self) -> int:
+    def samples_in_motion(self) -> int:
         """Number of samples in motion so far."""
-        return self._moved_before + self._rest.moved_samples
+        return self._moved_before + self._rest.samples_in_motion
 
     def set_rate(self, rate_hz: float) -> None:
         """Set a more accurate sample rate.
@@ -82,12 +82,12 @@ class SignalMonitor:
         If the rate differs by more than ``MAX_RATE_CHANGE``, the detectors start again.
         """
         if abs(rate_hz / self._rate_hz - 1.0) > MAX_RATE_CHANGE:
-            self._pending = self.flush()
-            self._moved_before += self._rest.moved_samples
+            self._pending = self.flush_delayed_samples()
+            self._moved_before += self._rest.samples_in_motion
             self._rate_hz = rate_hz
             self._begin()
 
-    def update(self, samples: SampleBlock) -> list[SampleBlock]:
+    def process_samples(self, samples: SampleBlock) -> list[SampleBlock]:
         """Process a block, and return the blocks to be estimated now."""
         self._received += samples.lost + len(samples)
         self._newest_ns = int(samples.t_ns[-1])
@@ -95,9 +95,9 @@ class SignalMonitor:
         self._search(still)
         return self._with_pending(still) if self._remove_motion else [samples]
 
-    def flush(self) -> list[SampleBlock]:
+    def flush_delayed_samples(self) -> list[SampleBlock]:
         """Return the delayed samples at the end of the stream."""
-        still = self._rest.flush()
+        still = self._rest.flush_delayed_samples()
         self._search(still)
         return self._with_pending(still) if self._remove_motion else []
 
@@ -106,7 +106,7 @@ class SignalMonitor:
         events, self._events = self._events, []
         return events
 
-    def take_restarts(self) -> list[RestartRequest]:
+    def take_restart_requests(self) -> list[AxisRestartRequest]:
         """Return the restart requests that were made since the last call."""
         restarts, self._restarts = self._restarts, []
         return restarts
@@ -135,7 +135,7 @@ class SignalMonitor:
         """Collect the episodes of motion, and pass the samples at rest to the change detector."""
         if self._keep_samples_at_rest:
             self._still += still
-        motions = self._rest.take()
+        motions = self._rest.take_motions()
         self.orientation_changes += sum(motion.kind == "handling/orientation" for motion in motions)
         self._events += [self._motion_event(motion) for motion in motions]
         if self._changes is None:
@@ -143,20 +143,22 @@ class SignalMonitor:
         for samples in still:
             if samples.lost > MAX_SKIPPED_SAMPLES:
                 self._report_changes(self._changes)
-                self._first += self._changes.samples + samples.lost
+                self._first += self._changes.samples_since_start + samples.lost
                 self._changes = ChangeDetector(self._rate_hz, self._alarms_per_day)
             elif samples.lost:
-                self._changes.skip(samples.lost)
-            self._changes.update(samples.values)
+                self._changes.skip_missing_samples(samples.lost)
+            self._changes.process_samples(samples.values)
         self._report_changes(self._changes)
 
     def _report_changes(self, changes: ChangeDetector) -> None:
         """Report the changes found, and request restarts of axes whose noise changed."""
-        for change in changes.take():
+        for change in changes.take_changes():
             self._events.append(self._change_event(change))
             if change.kind == "noise_changed":
-                handed_on = changes.samples if self._remove_motion else self._received - self._began - self._first
-                self._restarts.append(RestartRequest(change.axis, handed_on - change.since))
+                handed_on = (
+                    changes.samples_since_start if self._remove_motion else self._received - self._began - self._first
+                )
+                self._restarts.append(AxisRestartRequest(change.axis, handed_on - change.since))
 
     def _motion_event(self, motion: Motion) -> Event:
         """Convert an episode of motion to an event."""

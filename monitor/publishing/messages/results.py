@@ -17,10 +17,10 @@ from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
-from monitor.noise.standard_terms import unit_allan_variances
+from monitor.noise.standard_terms import unit_coefficient_allan_variances
 from monitor.publishing.messages.message import Count, Message, decode_message, remove_control_characters, shared_fields
 
 MAX_AVERAGING_TIMES: Final = 1000
@@ -201,7 +201,7 @@ class GapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics.GAP.
     axes: dict[str, AxisGapValues]
 
     @classmethod
-    def _convert(cls, _t: float | None, result: ModelGap) -> dict[str, Any]:
+    def _convert(cls, _t: float | None, result: ModelComparison) -> dict[str, Any]:
         axes = {
             axis: AxisGapValues(
                 agrees=result.agrees.get(axis), where=TauRange(one.tau_s), **shared_fields(AxisGapValues, one)
@@ -469,7 +469,7 @@ def fitted_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficients) -
     coefficients
         Coefficients of all axes.
     """
-    total: Floats = unit_allan_variances(tau_s, 1.0 / rate_hz) @ np.nan_to_num(coefficients.value) ** 2
+    total: Floats = unit_coefficient_allan_variances(tau_s, 1.0 / rate_hz) @ np.nan_to_num(coefficients.value) ** 2
     total[:, np.isnan(coefficients.value).all(axis=0)] = np.nan
     return total
 

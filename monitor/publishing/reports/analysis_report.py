@@ -11,7 +11,7 @@ from typing import Any, Final
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from monitor.common.units import COEFFICIENT_NAMES, KIND_NAMES, Kind, axes_of, format_duration, format_number
-from monitor.estimation.analysis import Analysis
+from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing.coefficient_cells import (
@@ -72,7 +72,7 @@ def render_page(drawn: AnalysisPlotData, title: str = "") -> str:
     )
 
 
-def recording_facts(analysis: Analysis) -> tuple[tuple[str, str], ...]:
+def recording_facts(analysis: RecordingAnalysis) -> tuple[tuple[str, str], ...]:
     """Return names and values that describe the recording."""
     estimate = analysis.estimate
     missing = max(estimate.curve.n - estimate.samples, 0)

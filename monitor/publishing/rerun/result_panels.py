@@ -25,7 +25,7 @@ from monitor.common.units import (
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.history.history_table import HistoryTable
@@ -260,7 +260,7 @@ class ThermalPanel(Panel):
 class GapPanel(Panel):
     """Gap between measurement and noise model over time. The next Allan plot also draws the model."""
 
-    newest: ModelGap | None = None
+    newest: ModelComparison | None = None
 
     def log_styles(self) -> None:
         """Log the styles of the lines."""
@@ -268,7 +268,7 @@ class GapPanel(Panel):
             self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", colours.AXIS_COLOURS[axis], 1.5)])
         self._style_lines("gap/threshold", [("threshold", colours.blend(colours.TEXT, 0.6), 1.0)])
 
-    def draw(self, unix_s: Floats, results: Sequence[ModelGap]) -> None:
+    def draw(self, unix_s: Floats, results: Sequence[ModelComparison]) -> None:
         """Draw the results."""
         self.newest = results[-1]
         highest = [max((axis.threshold for axis in one.axes.values()), default=np.nan) for one in results]

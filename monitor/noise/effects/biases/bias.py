@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from monitor.noise.effect import Source, StatelessSeries, parameter
+from monitor.noise.effect import Source, StatelessSeries, parameter_field
 from monitor.noise.spectrum import Spectrum, zero_spectrum
 
 
@@ -18,7 +18,7 @@ class Bias(Source):
     9.8
     """
 
-    value: float = parameter("rad/s", "m/s²", signed=True)
+    value: float = parameter_field("rad/s", "m/s²", signed=True)
 
     description: ClassVar[str] = "The sensor reads a constant value when the true value is zero."
 
@@ -26,6 +26,6 @@ class Bias(Source):
         """Return a spectrum that has only a constant level."""
         return replace(zero_spectrum(tau0_s), level=self.value)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
         """Return a constant series."""
         return StatelessSeries(lambda values, block: np.add(values, self.value, out=values))

@@ -8,8 +8,8 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
-from monitor.noise.spectrum import Spectrum, undefined_spectrum
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,18 +25,18 @@ class TemperatureLag(Source):
     True
     """
 
-    coefficient: float = parameter("rad/s/°C", "m/s²/°C", signed=True)
-    reference: float = parameter("°C", signed=True)
-    time_constant: float = parameter("s", positive=True)
+    coefficient: float = parameter_field("rad/s/°C", "m/s²/°C", signed=True)
+    reference: float = parameter_field("°C", signed=True)
+    time_constant: float = parameter_field("s", positive=True)
 
     description: ClassVar[str] = "The bias follows the temperature of the sensor with a delay."
     uses_temperature: ClassVar[bool] = True
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return NaN, because the spectrum depends on the temperature."""
-        return undefined_spectrum(tau0_s)
+        return nan_spectrum(tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_LaggedBias":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_LaggedBias":
         """Return a series whose lagged temperature starts at the first temperature."""
         return _LaggedBias(self.coefficient, self.reference, -expm1(-1.0 / (self.time_constant * rate_hz)))
 
@@ -46,7 +46,7 @@ class _LaggedBias(NoiseSeries):
         self._coefficient, self._reference_c, self._share = coefficient, reference_c, share
         self._lagged_c: float | None = None
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         inside = float(block.temperature_c[0]) if self._lagged_c is None else self._lagged_c
         self._lagged_c = _add_lagged_bias(
             values, block.temperature_c, inside, self._coefficient, self._reference_c, self._share

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from drivers.errors import ConfigError
-from monitor.noise.effect import GYROS, Leak, parameter, source_axis_field
+from monitor.noise.effect import GYROS, AxisLeak, parameter_field, source_axis_field
 
 
 @dataclass(frozen=True, slots=True)
-class CrossAxis(Leak):
+class CrossAxis(AxisLeak):
     """Cross-axis sensitivity (IEEE Std 1293): the measurement changes by c·x. x is the measurement of the axis
     ``source`` without leaks.
 
@@ -18,7 +18,7 @@ class CrossAxis(Leak):
     """
 
     source: str = source_axis_field()
-    coefficient: float = parameter("1", signed=True)
+    coefficient: float = parameter_field("1", signed=True)
 
     description: ClassVar[str] = "A misalignment adds a share of the signal of another axis."
 

@@ -4,11 +4,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 from drivers.errors import ConfigError
-from monitor.noise.effect import ACCELEROMETERS, GYROS, Leak, parameter, source_axis_field
+from monitor.noise.effect import ACCELEROMETERS, GYROS, AxisLeak, parameter_field, source_axis_field
 
 
 @dataclass(frozen=True, slots=True)
-class GSensitivity(Leak):
+class GSensitivity(AxisLeak):
     """g-sensitive drift (IEEE Std 952): the rate changes by c·a.
 
     a is the measurement of the accelerometer axis ``source`` without leaks.
@@ -19,7 +19,7 @@ class GSensitivity(Leak):
     """
 
     source: str = source_axis_field()
-    coefficient: float = parameter("rad/s per m/s²", "1", signed=True)
+    coefficient: float = parameter_field("rad/s per m/s²", "1", signed=True)
 
     description: ClassVar[str] = "Gravity and vibration change the reading of the gyroscope."
 

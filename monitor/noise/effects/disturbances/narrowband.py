@@ -8,7 +8,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.gauss_markov import gauss_markov_spectrum
 from monitor.noise.spectrum import Spectrum
 
@@ -24,14 +24,14 @@ class Narrowband(Source):
     samples.
 
     >>> hum = Narrowband(sigma=1.0, frequency=20.0, bandwidth=1.0)
-    >>> peak, half = hum.psd(np.array([20.0, 20.5]), 1e-4)
+    >>> peak, half = hum.two_sided_psd(np.array([20.0, 20.5]), 1e-4)
     >>> print(f"{half / peak:.3f}")
     0.500
     """
 
-    sigma: float = parameter("rad/s", "m/s²")
-    frequency: float = parameter("Hz", positive=True, below_nyquist=True)
-    bandwidth: float = parameter("Hz", positive=True)
+    sigma: float = parameter_field("rad/s", "m/s²")
+    frequency: float = parameter_field("Hz", positive=True, below_nyquist=True)
+    bandwidth: float = parameter_field("Hz", positive=True)
 
     description: ClassVar[str] = "A nearby resonance adds an oscillation with a randomly varying amplitude."
 
@@ -45,7 +45,7 @@ class Narrowband(Source):
         peaks = ((self.frequency, self.bandwidth),)
         return replace(gauss_markov_spectrum(self.sigma, self._decay, tau0_s), peaks=peaks)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Resonance":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Resonance":
         """Return a stationary series."""
         return _Resonance(self.sigma, self._decay / rate_hz, rng)
 
@@ -60,7 +60,7 @@ class _Resonance(NoiseSeries):
         self._drive = sigma * float(np.sqrt(-np.expm1(-2.0 * step.real)))
         self._x, self._y = sigma * rng.standard_normal(2)
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal((values.size, 2))
         self._x, self._y = _add_resonance(values, white, self._cos, self._sin, self._drive, self._x, self._y)
 

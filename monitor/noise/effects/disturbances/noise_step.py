@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import ClassVar
 
-from monitor.noise.effect import Effect, parameter
+from monitor.noise.effect import Effect, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +17,7 @@ class NoiseStep(Effect):
     'noise_step'
     """
 
-    time: float = parameter("s")
-    ratio: float = parameter("1")
+    time: float = parameter_field("s")
+    ratio: float = parameter_field("1")
 
     description: ClassVar[str] = "The size of the white noise changes once by a factor."

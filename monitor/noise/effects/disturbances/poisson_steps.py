@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.effects.ieee952.rate_random_walk import RateRandomWalk
 from monitor.noise.random_events import RandomEvents
 from monitor.noise.spectrum import Spectrum
@@ -24,8 +24,8 @@ class PoissonSteps(Source):
     1e-08
     """
 
-    rate: float = parameter("1/s")
-    height: float = parameter("rad/s", "m/s²")
+    rate: float = parameter_field("1/s")
+    height: float = parameter_field("rad/s", "m/s²")
 
     description: ClassVar[str] = "The bias jumps at random times and keeps each new value."
 
@@ -38,7 +38,7 @@ class PoissonSteps(Source):
         """Return the spectrum of rate random walk with K² = λh²."""
         return RateRandomWalk(K=self.rate**0.5 * self.height).spectrum(tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_RandomSteps":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_RandomSteps":
         """Return a series that starts at zero."""
         return _RandomSteps(self.rate / rate_hz, self.height, rate_hz, rng)
 
@@ -51,12 +51,12 @@ class _RandomSteps(NoiseSeries):
         )
         self._level = 0.0
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
-        when, heights = self._events.take(block.first, values.size)
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
+        when, heights = self._events.take_block_events(block.first, values.size)
         edges = [0, *when.tolist(), values.size]
         for jump, (begin, end) in zip([0.0, *heights.tolist()], pairwise(edges), strict=True):
             self._level += jump
             values[begin:end] += self._level
 
-    def drawn_values(self) -> dict[str, Any]:
-        return self._events.drawn_values("heights")
+    def drawn_random_values(self) -> dict[str, Any]:
+        return self._events.drawn_random_values("heights")

@@ -15,7 +15,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 # fmt: off
@@ -53,7 +53,7 @@ class BiasInstability(Source):
     0.664
     """
 
-    B: float = parameter("rad/s", "m/s²")
+    B: float = parameter_field("rad/s", "m/s²")
 
     description: ClassVar[str] = (
         "The bias fluctuates with 1/f noise, so longer averaging does not reduce the error below a floor."
@@ -74,7 +74,7 @@ class BiasInstability(Source):
 
         return Spectrum(lambda f: self.B**2 / (2.0 * np.pi * f), avar, tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Flicker":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Flicker":
         """Return a stationary series."""
         return _Flicker(self.B, rng)
 
@@ -102,7 +102,7 @@ class _Flicker(NoiseSeries):
         overlap = ONE_MINUS_POLE[:, None] + ONE_MINUS_POLE - ONE_MINUS_POLE[:, None] * ONE_MINUS_POLE
         self._states = np.linalg.cholesky(1.0 / overlap) @ rng.standard_normal(ONE_MINUS_POLE.size)
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal(out=block.scratch)
         _add_flicker_noise(values, white, self._states, self._poles, self._residues, self._direct)
 

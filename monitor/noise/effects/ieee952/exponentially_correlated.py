@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.gauss_markov import gauss_markov_spectrum
 from monitor.noise.spectrum import Spectrum
 
@@ -26,8 +26,8 @@ class ExponentiallyCorrelated(Source):
     0.381
     """
 
-    sigma: float = parameter("rad/s", "m/s²")
-    correlation_time: float = parameter("s", positive=True)
+    sigma: float = parameter_field("rad/s", "m/s²")
+    correlation_time: float = parameter_field("s", positive=True)
 
     description: ClassVar[str] = "The bias fluctuates about zero with an exponential autocorrelation."
 
@@ -35,7 +35,7 @@ class ExponentiallyCorrelated(Source):
         """Return the closed forms of the class docstring."""
         return gauss_markov_spectrum(self.sigma, 1.0 / self.correlation_time, tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_GaussMarkov":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_GaussMarkov":
         """Return a stationary series."""
         return _GaussMarkov(self.sigma, 1.0 / (self.correlation_time * rate_hz), rng)
 
@@ -49,7 +49,7 @@ class _GaussMarkov(NoiseSeries):
         self._drive = sigma * float(np.sqrt(-np.expm1(-2.0 * step)))
         self._state = sigma * float(rng.standard_normal())
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal(out=block.scratch)
         self._state = _add_gauss_markov(values, white, self._phi, self._drive, self._state)
 

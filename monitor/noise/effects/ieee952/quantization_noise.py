@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -18,7 +18,7 @@ class QuantizationNoise(Source):
     1.2e-09
     """
 
-    Q: float = parameter("rad", "m/s")
+    Q: float = parameter_field("rad", "m/s")
 
     description: ClassVar[str] = "Rounding of the angle adds noise that averages out faster than white noise."
 
@@ -30,7 +30,7 @@ class QuantizationNoise(Source):
             tau0_s,
         )
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Differences":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Differences":
         """Return a series of differences of white angle noise."""
         return _Differences(self.Q, rate_hz, rng)
 
@@ -41,7 +41,7 @@ class _Differences(NoiseSeries):
         self._scale = Q * rate_hz
         self._angle = self._scale * float(rng.standard_normal())  # last angle error divided by the sample interval
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         angles = self._rng.standard_normal(out=block.scratch)
         angles *= self._scale
         values += angles

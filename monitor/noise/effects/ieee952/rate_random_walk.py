@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -23,7 +23,7 @@ class RateRandomWalk(Source):
     3e-08
     """
 
-    K: float = parameter("rad/s/√s", "m/s²/√s")
+    K: float = parameter_field("rad/s/√s", "m/s²/√s")
 
     description: ClassVar[str] = "The bias takes independent random steps, so the error grows with the averaging time."
 
@@ -35,7 +35,7 @@ class RateRandomWalk(Source):
             tau0_s,
         )
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_RandomWalk":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_RandomWalk":
         """Return a random walk that starts at zero."""
         return _RandomWalk(self.K / rate_hz**0.5, rng)
 
@@ -45,7 +45,7 @@ class _RandomWalk(NoiseSeries):
         self._step, self._rng = step, rng
         self._level = 0.0
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         steps = self._rng.standard_normal(out=block.scratch)
         self._level = _add_random_walk(values, steps, self._step, self._level)
 

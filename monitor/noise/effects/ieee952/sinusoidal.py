@@ -8,8 +8,8 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
-from monitor.noise.spectrum import Spectrum, allan_of_line
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.spectrum import Spectrum, allan_variance_of_line
 
 RENEWAL_SAMPLES: Final = 64
 """Samples after which the rotation that generates the sinusoid starts from an exact value, which limits the rounding
@@ -29,18 +29,18 @@ class Sinusoidal(Source):
     [0.5, 0.5, 0.0]
     """
 
-    amplitude: float = parameter("rad/s", "m/s²")
-    frequency: float = parameter("Hz", positive=True, below_nyquist=True)
-    phase: float | None = parameter("rad", signed=True, optional=True)
+    amplitude: float = parameter_field("rad/s", "m/s²")
+    frequency: float = parameter_field("Hz", positive=True, below_nyquist=True)
+    phase: float | None = parameter_field("rad", signed=True, optional=True)
 
     description: ClassVar[str] = "A steady oscillation adds a line to the spectrum and waves to the Allan deviation."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return a spectrum that has only one line, because a line has power but no density."""
         line = self.frequency, 0.5 * self.amplitude**2
-        return Spectrum(np.zeros_like, lambda tau: allan_of_line(*line, tau, tau0_s), tau0_s, lines=(line,))
+        return Spectrum(np.zeros_like, lambda tau: allan_variance_of_line(*line, tau, tau0_s), tau0_s, lines=(line,))
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Sinusoid":
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Sinusoid":
         """Return a sinusoid whose time counts from the first sample of the stream."""
         drawn = self.phase is None
         phase = float(rng.uniform(0.0, 2.0 * pi)) if self.phase is None else self.phase
@@ -51,10 +51,10 @@ class _Sinusoid(NoiseSeries):
     def __init__(self, amplitude: float, step: float, phase: float, drawn: bool) -> None:
         self._amplitude, self._step, self._phase, self._drawn = amplitude, step, phase, drawn
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         _add_sinusoid(values, block.first, self._amplitude, self._step, self._phase)
 
-    def drawn_values(self) -> dict[str, Any]:
+    def drawn_random_values(self) -> dict[str, Any]:
         return {"phase": self._phase} if self._drawn else {}
 
 

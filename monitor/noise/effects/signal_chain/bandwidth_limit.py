@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import RunningTransform, Transform, parameter
+from monitor.noise.effect import RunningTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -24,8 +24,8 @@ class BandwidthLimit(Transform):
     0.005
     """
 
-    cutoff: float = parameter("Hz", positive=True, below_nyquist=True)
-    order: int = parameter("1", positive=True, whole=True, most=8)
+    cutoff: float = parameter_field("Hz", positive=True, below_nyquist=True)
+    order: int = parameter_field("1", positive=True, whole_number=True, maximum=8)
 
     description: ClassVar[str] = "The low-pass filter of the sensor attenuates fast motion and high-frequency noise."
 
@@ -34,14 +34,14 @@ class BandwidthLimit(Transform):
         tau0_s = spectrum.tau0_s
         corner = np.tan(np.pi * self.cutoff * tau0_s)
 
-        def gain(f_hz: Floats) -> Floats:
+        def squared_response(f_hz: Floats) -> Floats:
             # At half the sample rate the tangent is 1e16. Its power overflows to infinity, and the gain is zero.
             with np.errstate(over="ignore"):
                 return np.asarray(1.0 / (1.0 + (np.tan(np.pi * f_hz * tau0_s) / corner) ** (2 * int(self.order))))
 
-        return spectrum.filtered(gain)
+        return spectrum.filtered_by(squared_response)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
         """Return the filter. The first sample sets the state of the filter, so there is no transient."""
         return _LowPass(butterworth_sections(int(self.order), self.cutoff, rate_hz))
 
@@ -87,7 +87,7 @@ class _LowPass(RunningTransform):
         self._sections = sections
         self._state: Floats | None = None
 
-    def apply(self, values: Floats) -> None:
+    def transform_in_place(self, values: Floats) -> None:
         if self._state is None:
             b0, _, b2, _, a2 = self._sections.T
             self._state = np.stack([1.0 - b0, b2 - a2], axis=1) * values[0]

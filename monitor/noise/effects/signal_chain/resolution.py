@@ -6,8 +6,8 @@ from typing import ClassVar, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import MemorylessTransform, Transform, parameter
-from monitor.noise.spectrum import Spectrum, undefined_spectrum, white_noise_spectrum
+from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
+from monitor.noise.spectrum import Spectrum, nan_spectrum, white_noise_spectrum
 
 MIN_DEVIATION_STEPS: Final = 0.6
 """Smallest Allan deviation at τ0, in steps, for which the rounding error is white. The harmonics of the error are then
@@ -28,7 +28,7 @@ class Resolution(Transform):
     [0.0112, nan]
     """
 
-    step: float = parameter("rad/s", "m/s²", positive=True)
+    step: float = parameter_field("rad/s", "m/s²", positive=True)
 
     description: ClassVar[str] = "The output changes in steps of one least significant bit."
 
@@ -39,10 +39,10 @@ class Resolution(Transform):
         return (
             spectrum + white_noise_spectrum(self.step**2 / 12.0, tau0_s)
             if deviation >= MIN_DEVIATION_STEPS * self.step
-            else undefined_spectrum(tau0_s)
+            else nan_spectrum(tau0_s)
         )
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
         """Return a rounding transform."""
 
         def round_to_steps(values: Floats) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import RunningTransform, Transform, parameter
+from monitor.noise.effect import RunningTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -26,7 +26,7 @@ class RandomSampleHold(Transform):
     0.500
     """
 
-    fraction: float = parameter("1", most=0.999)
+    fraction: float = parameter_field("1", maximum=0.999)
 
     description: ClassVar[str] = "Some samples repeat the previous value."
 
@@ -34,22 +34,22 @@ class RandomSampleHold(Transform):
         """Return the spectrum by the formula of the class docstring."""
         h, tau0_s = self.fraction, spectrum.tau0_s
 
-        def squared(f_hz: Floats) -> Floats:
+        def squared_denominator(f_hz: Floats) -> Floats:
             return np.asarray((1.0 - h) ** 2 + 4.0 * h * np.sin(np.pi * f_hz * tau0_s) ** 2)  # |1 − h/z|²
 
-        def gain(f_hz: Floats) -> Floats:
-            return (1.0 - h) ** 2 / squared(f_hz)
+        def squared_response(f_hz: Floats) -> Floats:
+            return (1.0 - h) ** 2 / squared_denominator(f_hz)
 
         lowest = 1e-7 / tau0_s
         # 4h sin²(πfτ0)/|1 − h/z|² equals 1 − |G|², without cancellation at low frequencies.
         lost = (
-            spectrum.mean_square(lowest, lambda f: 4.0 * h * np.sin(np.pi * f * tau0_s) ** 2 / squared(f))
+            spectrum.mean_square(lowest, lambda f: 4.0 * h * np.sin(np.pi * f * tau0_s) ** 2 / squared_denominator(f))
             + spectrum.slope**2 * tau0_s**2 * h / (1.0 - h) ** 2
         )
-        rest = Spectrum(lambda f: lost * tau0_s * (1.0 - h**2) / squared(f), None, tau0_s)
-        return spectrum.filtered(gain, around=((0.0, (1.0 - h) / (2.0 * np.pi * tau0_s)),)) + rest
+        rest = Spectrum(lambda f: lost * tau0_s * (1.0 - h**2) / squared_denominator(f), None, tau0_s)
+        return spectrum.filtered_by(squared_response, narrow_peaks=((0.0, (1.0 - h) / (2.0 * np.pi * tau0_s)),)) + rest
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_RepeatedSamples":
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> "_RepeatedSamples":
         """Return a transform that never repeats a sample from before its first call."""
         return _RepeatedSamples(self.fraction, rng)
 
@@ -61,12 +61,12 @@ class _RepeatedSamples(RunningTransform):
         self._last = np.nan
         self._repeat_count = 0
 
-    def apply(self, values: Floats) -> None:
+    def transform_in_place(self, values: Floats) -> None:
         tosses = self._rng.random(values.size)
         self._last, held = _repeat_samples(values, tosses, self._fraction, self._last)
         self._repeat_count += held
 
-    def drawn_values(self) -> dict[str, Any]:
+    def drawn_random_values(self) -> dict[str, Any]:
         return {"count": self._repeat_count}
 
 

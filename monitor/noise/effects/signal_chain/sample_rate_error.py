@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.number_ranges import RATE_RATIO
-from monitor.noise.effect import MemorylessTransform, Transform, parameter
+from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -19,22 +19,22 @@ class SampleRateError(Transform):
     effect on one axis only. If a model lists the effect twice, the ratios must be equal.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
-    >>> stated = SampleRateError(ratio=2.0).restate_spectrum(white_noise_spectrum(1.0, 0.005))
+    >>> stated = SampleRateError(ratio=2.0).convert_to_stated_rate(white_noise_spectrum(1.0, 0.005))
     >>> stated.tau0_s, float(stated.avar(np.array([0.01]))[0])
     (0.01, 1.0)
     """
 
-    ratio: float = parameter("1", positive=True, quantity=RATE_RATIO)
+    ratio: float = parameter_field("1", positive=True, number_range=RATE_RATIO)
 
     description: ClassVar[str] = (
         "The true sample rate differs from the stated rate, which scales all times and frequencies."
     )
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum unchanged; ``restate_spectrum`` converts its time scale after all transforms."""
+        """Return the spectrum unchanged; ``convert_to_stated_rate`` converts its time scale after all transforms."""
         return spectrum
 
-    def restate_spectrum(self, spectrum: Spectrum) -> Spectrum:
+    def convert_to_stated_rate(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum of samples at the true rate, converted to the time scale that the recording states."""
         r, closed = self.ratio, spectrum.closed_form_avar
         return Spectrum(
@@ -47,6 +47,6 @@ class SampleRateError(Transform):
             tuple((f / r, width / r) for f, width in spectrum.peaks),
         )
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
         """Return a transform that does nothing."""
         return MemorylessTransform(lambda values: None)

@@ -6,8 +6,8 @@ from typing import ClassVar, Final
 import numpy as np
 
 from drivers.number_ranges import HOUR_S
-from monitor.noise.effect import MemorylessTransform, Transform, parameter
-from monitor.noise.spectrum import Spectrum, undefined_spectrum
+from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
+from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 OBSERVATION_S: Final = float(HOUR_S)
 """Time in seconds over which noise and slope must stay within the range."""
@@ -29,7 +29,7 @@ class Saturation(Transform):
     [0.01, nan]
     """
 
-    limit: float = parameter("rad/s", "m/s²", positive=True)
+    limit: float = parameter_field("rad/s", "m/s²", positive=True)
 
     description: ClassVar[str] = "Values beyond the measurement range are replaced by the end of the range."
 
@@ -38,8 +38,8 @@ class Saturation(Transform):
         steady = abs(spectrum.level) + sum((2.0 * size) ** 0.5 for _, size in spectrum.lines)
         steady += spectrum.slope * OBSERVATION_S
         noise = spectrum.without_lines().mean_square(1.0 / max(OBSERVATION_S, 4.0 * spectrum.tau0_s)) ** 0.5
-        return spectrum if steady + NOISE_SIGMAS * noise < self.limit else undefined_spectrum(spectrum.tau0_s)
+        return spectrum if steady + NOISE_SIGMAS * noise < self.limit else nan_spectrum(spectrum.tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
         """Return a clipping transform."""
         return MemorylessTransform(lambda values: np.clip(values, -self.limit, self.limit, out=values))

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from monitor.noise.effect import MemorylessTransform, Transform, parameter
+from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -18,7 +18,7 @@ class ScaleFactor(Transform):
     4.0
     """
 
-    factor: float = parameter("1")
+    factor: float = parameter_field("1")
 
     description: ClassVar[str] = (
         "All values of the axis are multiplied by a constant, for example after an error of units."
@@ -26,8 +26,8 @@ class ScaleFactor(Transform):
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
         """Return the spectrum times f²."""
-        return spectrum.scaled(self.factor)
+        return spectrum.scaled_by_amplitude(self.factor)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
         """Return a multiplying transform."""
         return MemorylessTransform(lambda values: np.multiply(values, self.factor, out=values))
