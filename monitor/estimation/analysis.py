@@ -1,14 +1,11 @@
-"""Analysis of a whole recording, with Allan variance, confidence intervals and fitted coefficients.
+"""Analysis of a whole recording: Allan deviations, confidence intervals, noise coefficients and detected events.
 
-The results are the reference for the live estimator. The recording is first resampled to a regular grid, with the same
-clock as for live samples. Missing samples become NaN. ``RecordingAnalysis.notes`` lists all irregularities of the time
-stamps.
+``analyze`` computes the Allan variance and fits the noise coefficients. ``detect_events`` searches the recording
+for motion, noise changes, spectral lines and outliers. The search is a separate function because it takes longer than the
+fit.
 
-``analyze`` computes the Allan variance and the fit. ``detect_events`` searches the same samples for motion, noise
-changes, spectral lines and outliers. The search is a separate step because it takes longer than the fit.
-
-Samples in motion are removed from the Allan variance only on request, because the detector may take samples at rest for
-motion. ``detect_events`` always ignores samples in motion.
+By default, samples in motion remain in the Allan variance, because the motion detector may mistake samples at rest for
+motion. The search for events always ignores samples in motion.
 """
 
 from collections.abc import Iterable, Sequence
@@ -48,12 +45,12 @@ from monitor.estimation.regular_grid import resample_to_grid
 MIN_SAMPLES: Final = 50
 """Minimum number of samples of a recording."""
 DETECTOR_CHUNK_ROWS: Final = 65_536
-"""Number of rows passed to the change detector in one call."""
+"""Number of samples passed to the change detector in one call."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingAnalysis:
-    """Result of ``imu-monitor analyze``."""
+    """Allan deviations, noise coefficients and events of one recording."""
 
     estimate: Estimate
     seconds: float
@@ -63,7 +60,7 @@ class RecordingAnalysis:
     bandwidth_hz: Floats  # [6] cutoff of the sensor's low-pass filter; NaN if no filter has been found
     motions: tuple[Motion, ...] = ()
     changes: tuple[Change, ...] = ()
-    motion_removed: bool = False  # True if the samples in motion have been removed from ``values``
+    motion_removed: bool = False  # True if ``values`` contains no samples in motion
     axes_of_temperature: tuple[str, ...] = ()  # axes on which temperature explains most of the slow variance
 
 
@@ -75,7 +72,7 @@ def analyze(
     map_axes: EachAxis = map,
     remove_motion: bool = False,
 ) -> RecordingAnalysis:
-    """Compute the Allan curve of a recording and fit the coefficients to it.
+    """Compute the Allan deviations of a recording, and fit the noise coefficients.
 
     Parameters
     ----------
@@ -86,18 +83,18 @@ def analyze(
     tau : TauGrid
         Grid of averaging times, or a tuple of averaging times in seconds.
     reading_notes : iterable of str
-        Notes from reading the file, which precede the other notes of the result.
+        Notes of the file reader. The analysis lists these notes first.
     map_axes : EachAxis
-        Function that maps over the axes. With the ``map`` method of a thread pool, the axes are computed in parallel.
+        Function that maps over the axes. The ``map`` method of a thread pool processes the axes in parallel.
     remove_motion : bool
-        True to remove the samples during which the sensor moved.
+        True to remove the samples in motion.
 
     Raises
     ------
     NotReady
-        If the recording has fewer than ``MIN_SAMPLES`` samples, or if fewer than ``MIN_SAMPLES`` samples are at rest.
+        If fewer than ``MIN_SAMPLES`` samples can be used.
     ConfigError
-        If no τ of the tuple lies between one sample and half the recording.
+        If every averaging time is shorter than one sample or longer than half the recording.
     """
     values, rate, found = resample_to_grid(blocks, rate_hz)
     if len(values) < MIN_SAMPLES:
@@ -129,7 +126,7 @@ def analyze(
 
 
 def detect_events(result: RecordingAnalysis, alarms_per_day: float = 1.0 / 30.0) -> RecordingAnalysis:
-    """Add motion, noise changes, spectral lines and outliers to an analysis and to its notes.
+    """Search a recording for motion, noise changes, spectral lines and outliers, and add the results to the analysis.
 
     Parameters
     ----------
@@ -159,14 +156,14 @@ def detect_events(result: RecordingAnalysis, alarms_per_day: float = 1.0 / 30.0)
 
 
 def fit_other_samples(result: RecordingAnalysis, samples: Floats, map_axes: EachAxis = map) -> Fit:
-    """Compute the Allan variance of other samples at the averaging times of an analysis, and fit the coefficients.
+    """Fit the noise coefficients to other samples, with the sample rate and the averaging times of an analysis.
 
     Parameters
     ----------
     result : RecordingAnalysis
-        Result of ``analyze``, which gives the sample rate and the cluster sizes.
+        Analysis with the sample rate and the averaging times.
     samples : ndarray of float64, shape (n, 6)
-        Samples in rad/s and m/s², for example the samples of ``result`` after a correction. NaN means missing.
+        Samples in rad/s and m/s², for example after temperature compensation; NaN means missing.
     map_axes : EachAxis
         Function that maps over the axes.
     """
@@ -175,7 +172,6 @@ def fit_other_samples(result: RecordingAnalysis, samples: Floats, map_axes: Each
 
 
 def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]]:
-    """Return the samples with NaN for samples in motion, and the episodes of motion."""
     moving, motions = detect_motion(values, rate_hz)
     left = len(values) - int(moving.sum())
     if left < MIN_SAMPLES:
@@ -186,7 +182,6 @@ def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motio
 def _fit_curve(
     values: Floats, rate_hz: float, factors: Ints, each: EachAxis
 ) -> tuple[AllanCurve, Fit, list[LowPass | None]]:
-    """Return the Allan curve with confidence intervals, the fit, and the low-pass filter of each axis or None."""
     n = len(values)
     avar, terms = overlapping_avar(values, factors, each)
     columns, covariances = make_design(factors, rate_hz), covariance_table(n, factors)
