@@ -1,14 +1,12 @@
-"""Simulation of the time series of a noise model: endless, in blocks of any size, independent of the division into
-blocks.
+"""Simulation of the samples of a noise model.
 
-Blocks are simulated in pieces that fit the processor's cache. For each piece, the sources of every axis are added.
-White noise is added first, because a noise step multiplies only white noise. Next, the transforms are applied to each
-axis that leaks into other axes. The results are added to the other axes, and the transforms are applied to the sums.
-All effects are simulated at the true sample rate.
+Samples are simulated in blocks of any size, and the division into blocks does not affect the samples. The sources of
+each axis are added first. The leaks from other axes are then added, and the transforms are applied to the sums. All
+effects are simulated at the true sample rate.
 
-Every effect of every axis has its own random generator. Its seed is formed from the seed of the stream, the names of
-axis and effect, and the number of earlier effects of the same name on the axis. Adding or removing an effect therefore
-changes no other series.
+Each effect has a separate random generator. The seed is derived from the seed of the stream, the axis, the name of the
+effect and the number of earlier effects of the same name. Adding or removing an effect does not change the random
+numbers of other effects.
 """
 
 import copy
@@ -42,36 +40,35 @@ from monitor.noise.model_toml import prefix_config_errors
 from monitor.noise.temperature import Temperature, recorded_temperature
 
 PIECE_SAMPLES: Final = 2048
-"""Samples simulated at once. Six axes of them, with their work arrays, stay in the cache of a processor core."""
+"""Number of samples simulated at once. The arrays of six axes then fit into the processor cache."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimulatedSamples:
-    """Simulated samples with their temperature."""
+    """Simulated samples and temperatures."""
 
     values: Floats  # [n, 6] in AXES order, rad/s and m/s²
-    temperature_c: Floats  # [n] °C; NaN if the model has no temperature
+    temperature_c: Floats  # [n] °C; NaN without a temperature
 
 
 def check_effects_can_be_simulated(
     axis_effects: Mapping[str, tuple[Effect, ...]], true_rate_hz: float, has_temperature: bool
 ) -> None:
-    """Check that effects can be simulated together.
+    """Check that the effects of a model can be simulated.
 
     Parameters
     ----------
     axis_effects : mapping of str to tuple of Effect
-        Axis -> its effects.
+        Effects of each axis.
     true_rate_hz : float
         True sample rate, Hz.
     has_temperature : bool
-        True if a temperature is available, from the model or from a recording.
+        True if the model or a recording provides a temperature.
 
     Raises
     ------
     ConfigError
-        If a frequency is at or above half the sample rate, the axis of a leak has no effects, a noise step has no white
-        noise, or a required temperature is missing.
+        If a frequency is too high for the sample rate, or if an effect requires another effect or a missing temperature.
     """
     for axis in AXES:
         effects = axis_effects.get(axis, ())
@@ -89,18 +86,18 @@ def check_effects_can_be_simulated(
 
 
 class ModelStream:
-    """Endless simulated series of six axes. Axes without effects are zero.
+    """Endless simulation of six axes. Axes without effects are zero.
 
     Parameters
     ----------
     axis_effects : mapping of str to tuple of Effect
-        Axis -> its effects.
+        Effects of each axis.
     temperature : Temperature or None
         Simulated temperature.
     rate_hz : float
         Stated sample rate, Hz.
     true_to_stated_rate_ratio : float
-        True sample rate divided by the stated one.
+        Ratio of the true sample rate to the stated sample rate.
     seed : int
         Seed of the random generators.
     temperature_c : ndarray, shape (n,), or None
@@ -109,7 +106,7 @@ class ModelStream:
     Raises
     ------
     ConfigError
-        If the effects cannot be simulated at this rate.
+        If the effects cannot be simulated at the sample rate.
     """
 
     def __init__(
@@ -145,7 +142,7 @@ class ModelStream:
         return self.draw_samples_with_temperature(n).values
 
     def draw_samples_with_temperature(self, n: int) -> SimulatedSamples:
-        """Return the next ``n`` samples with their temperature."""
+        """Return the next ``n`` samples and temperatures."""
         drawn = SimulatedSamples(np.empty((n, len(AXES))), np.full(n, np.nan))
         for begin in range(0, n, PIECE_SAMPLES):
             piece = slice(begin, min(begin + PIECE_SAMPLES, n))
@@ -153,10 +150,10 @@ class ModelStream:
         return drawn
 
     def add_effect(self, axis: str, effect: Effect) -> None:
-        """Add an effect that begins at the next sample.
+        """Add an effect that starts at the next sample.
 
-        A parameter ``time`` counts from the first sample of the stream. A random walk, a ramp or a transient begins at
-        zero.
+        A parameter ``time`` is relative to the first sample of the stream. Random walks, ramps and transients start at
+        the next sample.
 
         Parameters
         ----------
@@ -168,7 +165,7 @@ class ModelStream:
         Raises
         ------
         ConfigError
-            If the effect cannot be on that axis, at that rate, or in a running stream (a sample rate error).
+            If the effect is not possible on the axis, at the sample rate or in a running stream.
         """
         if axis not in AXES:
             raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
@@ -182,11 +179,10 @@ class ModelStream:
         self._begin(axis, effect)
 
     def drawn_random_values(self) -> dict[str, dict[str, list[dict[str, Any]]]]:
-        """Return the values that have been drawn at random so far, by axis and name of the effect.
+        """Return the random values drawn so far, by axis and name of the effect.
 
-        The list of an effect has one dictionary for each occurrence of the effect on the axis. The values are phases,
-        numbers of events, and times in seconds from the start, ready for JSON. Effects that their parameters describe
-        completely are left out.
+        Each occurrence of an effect has a dictionary with phases, numbers of events and event times in seconds. The
+        values can be converted to JSON. Effects without such values are omitted.
         """
         truths: dict[str, dict[str, list[dict[str, Any]]]] = {}
         for axis, effect, running in self._truths:
@@ -195,7 +191,6 @@ class ModelStream:
         return truths
 
     def _begin(self, axis: str, effect: Effect) -> None:
-        """Start an effect on an axis."""
         occurrence = self._occurrences[axis, effect.name]
         self._occurrences[axis, effect.name] += 1
         line = self._axes[axis]
@@ -217,12 +212,11 @@ class ModelStream:
             raise TypeError(f"{effect.name} is not a source, leak, noise step or transform")
 
     def _rng(self, axis: str, effect: str, occurrence: int) -> np.random.Generator:
-        """Return the random generator of one effect."""
         key = (crc32(axis.encode()), crc32(effect.encode()), occurrence)
         return np.random.default_rng(np.random.SeedSequence(self._seed, spawn_key=key))
 
     def _advance(self, values: Floats, temperature_c: Floats) -> None:
-        """Simulate the next piece of all axes into ``values`` [n, 6] and ``temperature_c`` [n]."""
+        """Simulate the next samples into ``values`` [n, 6] and ``temperature_c`` [n]."""
         n = temperature_c.size
         block = SampleBlockContext(self._count, temperature_c, np.empty(n))
         if self._temperature is not None:
@@ -240,7 +234,7 @@ class ModelStream:
 
 
 class _AxisSimulator:
-    """Running effects of one axis."""
+    """Simulated effects of one axis."""
 
     def __init__(self) -> None:
         self.white: list[NoiseSeries] = []
@@ -248,19 +242,21 @@ class _AxisSimulator:
         self.steps: list[tuple[int, float]] = []  # (index of the first sample, ratio)
         self.leaks: list[AxisLeak] = []
         self.leaks_out = False
-        # Transforms with their positions in TRANSFORM_ORDER, sorted.
+        # Transforms and their positions in TRANSFORM_ORDER, sorted by position.
         self._chain: list[tuple[int, RunningTransform]] = []
-        # Copies of the transforms for the measurement without leaks, if other axes leak into this axis.
+        # Copies of the transforms for the measurement without leaks.
         self._alone: list[tuple[int, RunningTransform]] = []
 
     @property
     def needs_leak_free_measurement(self) -> bool:
-        """True if the measurement without leaks is needed. Transforms with a memory need the measurement in every
-        piece."""
+        """True if the measurement without leaks is needed.
+
+        Transforms with memory require this measurement for every block.
+        """
         return self.leaks_out or bool(self.leaks)
 
     def insert_transform(self, order: int, transform: RunningTransform) -> None:
-        """Insert a transform after the others at its position in TRANSFORM_ORDER."""
+        """Insert a transform at the position ``order`` of TRANSFORM_ORDER."""
         if self.leaks:
             self._alone.append((order, copy.deepcopy(transform)))
             self._alone.sort(key=lambda one: one[0])
@@ -268,13 +264,15 @@ class _AxisSimulator:
         self._chain.sort(key=lambda one: one[0])
 
     def add_leak(self, leak: AxisLeak) -> None:
-        """Add a leak into this axis. From the next sample, the measurements with and without leaks differ."""
+        """Add a leak from another axis."""
         if not self.leaks:
             self._alone = copy.deepcopy(self._chain)
         self.leaks.append(leak)
 
     def sum_own_sources(self, block: SampleBlockContext, n: int) -> Floats:
-        """Return the sum [n] of the axis' own sources."""
+        """Return the sum [n] of the sources of the axis. White noise is first, because noise steps multiply only white
+        noise.
+        """
         values = np.zeros(n)
         for series in self.white:
             series.add_next_samples(values, block)
@@ -285,13 +283,13 @@ class _AxisSimulator:
         return values
 
     def transform_without_leaks(self, own_sum: Floats) -> Floats:
-        """Return the measurement without leaks. If nothing leaks into the axis, ``own_sum`` is changed in place."""
+        """Return the measurement without leaks. ``own_sum`` is modified in place if the axis has no leaks."""
         if not self.leaks:
             return _apply_transforms(self._chain, own_sum)
         return _apply_transforms(self._alone, own_sum.copy())
 
     def add_leaks_and_transform(self, own_sum: Floats, leak_free: dict[str, Floats]) -> Floats:
-        """Return the measurement of the axis with the leaks from other axes."""
+        """Return the measurement of the axis, including leaks from other axes."""
         if self.leaks:
             for leak in self.leaks:
                 own_sum += leak.coefficient * leak_free[leak.source]
@@ -301,7 +299,7 @@ class _AxisSimulator:
 
 
 def _apply_transforms(chain: list[tuple[int, RunningTransform]], values: Floats) -> Floats:
-    """Apply all transforms to the values in place, and return the values."""
+    """Apply all transforms in place, and return the values."""
     for _, running in chain:
         running.transform_in_place(values)
     return values

@@ -1,7 +1,7 @@
-"""Temperature of a simulated sensor: a periodic swing, such as day and night, plus slow random wander.
+"""Temperature of a simulated sensor.
 
-T(t) = mean + swing sin(2πt/period) + first-order Gauss–Markov noise of standard deviation ``wander`` and correlation
-time ``wander_time``. If a recording has its own temperature, it is used instead.
+The temperature is T(t) = mean + swing sin(2πt/period) plus first-order Gauss–Markov noise. ``wander`` is the standard
+deviation of the noise, and ``wander_time`` the correlation time.
 """
 
 from dataclasses import dataclass
@@ -22,12 +22,12 @@ PAIRS: Final = (("swing", "period"), ("wander", "wander_time"))
 
 @dataclass(frozen=True, slots=True)
 class Temperature(ParameterTable):
-    """Parameters of the table ``[temperature]`` of a model file.
+    """Parameters of the table ``[temperature]`` in a model file.
 
     Raises
     ------
     ConfigError
-        If a parameter is not allowed, or if one parameter of a pair is missing.
+        If a parameter is out of range, or if one parameter of a pair is missing.
 
     Examples
     --------
@@ -54,14 +54,14 @@ class Temperature(ParameterTable):
                     raise ConfigError(f"temperature: {given} needs a {needed}")
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
-        """Return a new series in °C.
+        """Start a simulated temperature series in °C.
 
         Parameters
         ----------
         rate_hz : float
             Sample rate, Hz.
         rng : numpy.random.Generator
-            Generator of the temperature alone.
+            Random generator of the temperature.
         """
         parts: list[NoiseSeries] = []
         if self.swing is not None and self.period is not None:
@@ -83,17 +83,17 @@ class Temperature(ParameterTable):
 def recorded_temperature(temperature_c: Floats) -> NoiseSeries:
     """Return the temperature of a recording as a series.
 
-    A missing value is replaced by the previous value. The last value continues beyond the end of the recording.
+    Missing values are replaced by the previous value. The last value is repeated after the end of the recording.
 
     Parameters
     ----------
     temperature_c : ndarray, shape (n,)
-        Temperature in °C; NaN = missing.
+        Temperature in °C; NaN means missing.
 
     Raises
     ------
     ConfigError
-        If there is no value at all.
+        If all values are missing.
     """
     given = np.asarray(temperature_c, np.float64).ravel()
     known = np.flatnonzero(np.isfinite(given))

@@ -160,7 +160,7 @@ def change(kind="noise_changed"):
 
 
 def test_many_events_are_counted_rather_than_listed():
-    notes = analysis_notes.describe_motions([motion(100 * i) for i in range(14)], RATE_HZ, reincludes_motion=True)
+    notes = analysis_notes.describe_motions([motion(100 * i) for i in range(14)], RATE_HZ, removed=True)
     assert notes[0] == "the sensor moved 14 times, 7 s in all: removed"
     assert notes[1] == "at 0.0 s: moved for 0.5 s: gx up to 5.7 °/s"
     assert notes[-1] == "and 4 more motions"

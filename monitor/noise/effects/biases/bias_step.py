@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 @dataclass(frozen=True, slots=True)
 class BiasStep(Source):
-    """Step of the bias by ``height``, from the first sample at or after ``time``.
+    """Step of the bias by ``height`` at the first sample at or after ``time``.
 
     >>> bool(np.isnan(BiasStep(time=60.0, height=1e-3).avar(np.array([1.0]), 0.01)[0]))
     True
@@ -24,11 +24,11 @@ class BiasStep(Source):
     description: ClassVar[str] = "The bias jumps once and keeps the new value, for example after a knock."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return NaN, because the effect of a single step depends on the length of the recording."""
+        """Return NaN, because the effect of a step depends on the length of the recording."""
         return nan_spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
-        """Return a series in which ``time`` counts from the first sample of the stream."""
+        """Start a series with a step. ``time`` is relative to the first sample of the stream."""
         first = first_sample_at_or_after(self.time, rate_hz)
 
         def add_bias_step(values: Floats, block: SampleBlockContext) -> None:

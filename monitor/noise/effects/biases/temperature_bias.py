@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 @dataclass(frozen=True, slots=True)
 class TemperatureBias(Source):
-    """Bias that is a polynomial of second order in temperature: b = c (T − T_r) + q (T − T_r)² (IEEE Std 952).
+    """Bias that is a second-order polynomial of the temperature: b = c (T − T_r) + q (T − T_r)² (IEEE Std 952).
 
     >>> bool(np.isnan(TemperatureBias(coefficient=1e-4, reference=25.0).two_sided_psd(np.array([1.0]), 0.01)[0]))
     True
@@ -30,7 +30,7 @@ class TemperatureBias(Source):
         return nan_spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
-        """Return a series that is a function of the temperature of each sample."""
+        """Start a series that depends on the temperature of each sample."""
 
         def add_temperature_bias(values: Floats, block: SampleBlockContext) -> None:
             warmer = block.temperature_c - self.reference

@@ -1,4 +1,4 @@
-"""Bias that depends on temperature with a delay."""
+"""Bias that follows the temperature with a delay."""
 
 from dataclasses import dataclass
 from math import expm1
@@ -14,11 +14,10 @@ from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 @dataclass(frozen=True, slots=True)
 class TemperatureLag(Source):
-    """Bias that follows temperature with a first-order lag (Newton's law of cooling): b = c (T_l − T_r), dT_l/dt = (T −
-    T_l)/τ.
+    """Bias that follows the temperature with a first-order lag (Newton's law of cooling).
 
-    The lagged temperature T_l starts at the first temperature of the series. The temperature is assumed to be constant
-    between samples.
+    The bias is b = c (T_l − T_r), where dT_l/dt = (T − T_l)/τ. The lagged temperature T_l starts at the first
+    temperature. The temperature is constant between samples.
 
     >>> lag = TemperatureLag(coefficient=1e-4, reference=25.0, time_constant=60.0)
     >>> bool(np.isnan(lag.avar(np.array([1.0]), 0.01)[0]))
@@ -37,7 +36,7 @@ class TemperatureLag(Source):
         return nan_spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_LaggedBias":
-        """Return a series whose lagged temperature starts at the first temperature."""
+        """Start a series whose lagged temperature starts at the first temperature."""
         return _LaggedBias(self.coefficient, self.reference, -expm1(-1.0 / (self.time_constant * rate_hz)))
 
 
@@ -57,7 +56,6 @@ class _LaggedBias(NoiseSeries):
 def _add_lagged_bias(
     values: Floats, temperature_c: Floats, inside: float, coefficient: float, reference: float, share: float
 ) -> float:
-    """Add the bias of the lagged temperature to the values [n], and return the lagged temperature in °C."""
     for k in range(values.size):
         values[k] += coefficient * (inside - reference)
         inside += share * (temperature_c[k] - inside)

@@ -1,4 +1,4 @@
-"""Transient after switching on."""
+"""Transient of the bias after switching on."""
 
 from dataclasses import dataclass
 from math import exp
@@ -14,7 +14,7 @@ from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 @dataclass(frozen=True, slots=True)
 class TurnOnTransient(Source):
-    """Exponential transient A exp(−t/τ), which begins at the first sample (warm-up term of IEEE Std 952).
+    """Exponential transient A exp(−t/τ) that starts at the first sample (warm-up term of IEEE Std 952).
 
     >>> bool(np.isnan(TurnOnTransient(amplitude=1e-3, time_constant=60.0).avar(np.array([1.0]), 0.01)[0]))
     True
@@ -26,11 +26,11 @@ class TurnOnTransient(Source):
     description: ClassVar[str] = "After the sensor is switched on, the bias decays exponentially to its final value."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return NaN, because the effect of a single transient depends on the length of the recording."""
+        """Return NaN, because the effect of a transient depends on the length of the recording."""
         return nan_spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Decay":
-        """Return a transient that begins at the first sample after the call, also in a running stream."""
+        """Start a transient at the next sample."""
         return _Decay(self.amplitude, 1.0 / (self.time_constant * rate_hz))
 
 
@@ -46,6 +46,5 @@ class _Decay(NoiseSeries):
 
 @compiled
 def _add_decay(values: Floats, first: int, amplitude: float, step: float) -> None:
-    """Add amplitude · exp(−step · k) for k = first, … to the values [n]."""
     for k in range(values.size):
         values[k] += amplitude * exp(-step * (first + k))

@@ -9,9 +9,8 @@ from monitor.noise.effect import ACCELEROMETERS, GYROS, AxisLeak, parameter_fiel
 
 @dataclass(frozen=True, slots=True)
 class GSensitivity(AxisLeak):
-    """g-sensitive drift (IEEE Std 952): the rate changes by c·a.
-
-    a is the measurement of the accelerometer axis ``source`` without leaks.
+    """g-sensitivity (IEEE Std 952), which adds ``coefficient`` times the acceleration of the axis ``source`` to a
+    gyroscope.
 
     >>> GSensitivity(source="az", coefficient=1e-5).check_axis("ax")
     Traceback (most recent call last):
@@ -24,7 +23,7 @@ class GSensitivity(AxisLeak):
     description: ClassVar[str] = "Gravity and vibration change the reading of the gyroscope."
 
     def check_axis(self, axis: str) -> None:
-        """Raise ConfigError if the axis is not a gyroscope, or the source not an accelerometer."""
+        """Raise ConfigError if the axis is not a gyroscope or the source is not an accelerometer."""
         if axis not in GYROS:
             raise ConfigError(f"{self.name}: belongs on a gyroscope, not on {axis}")
         if self.source not in ACCELEROMETERS:

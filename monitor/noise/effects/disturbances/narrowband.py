@@ -15,13 +15,11 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class Narrowband(Source):
-    """White noise through a second-order resonance of frequency f and bandwidth Δ. The autocovariance is σ² exp(−πΔ|t|)
-    cos 2πft.
+    """White noise after a second-order resonance of frequency f and bandwidth Δ.
 
-    The series is the real part of complex first-order noise, z ← φz + w with φ = exp((−πΔ + 2πif)τ0). The spectrum is
-    therefore a pair of Lorentzian lines at ±f with full width Δ at half power. The Allan variance is the real part of
-    the closed form for exponentially correlated noise with this φ. Spectrum and Allan variance are exact for the
-    samples.
+    The autocovariance is σ² exp(−πΔ|t|) cos 2πft. The series is the real part of the complex process z ← φz + w with φ
+    = exp((−πΔ + 2πif)τ0). The spectrum has two Lorentzian peaks at ±f with the full width Δ at half power. Allan
+    variance and spectrum are exact for samples.
 
     >>> hum = Narrowband(sigma=1.0, frequency=20.0, bandwidth=1.0)
     >>> peak, half = hum.two_sided_psd(np.array([20.0, 20.5]), 1e-4)
@@ -37,22 +35,20 @@ class Narrowband(Source):
 
     @property
     def _decay(self) -> complex:
-        """Return the complex decay rate 1/T_c − iω in 1/s."""
+        """Complex decay rate 1/T_c − iω in 1/s."""
         return pi * self.bandwidth - 2j * pi * self.frequency
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return spectrum and Allan variance in closed form. The position of the peak refines the grid of integrals."""
+        """Return the spectrum and the Allan variance in closed form."""
         peaks = ((self.frequency, self.bandwidth),)
         return replace(gauss_markov_spectrum(self.sigma, self._decay, tau0_s), peaks=peaks)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Resonance":
-        """Return a stationary series."""
+        """Start a stationary series."""
         return _Resonance(self.sigma, self._decay / rate_hz, rng)
 
 
 class _Resonance(NoiseSeries):
-    """Series of the real part of complex first-order noise."""
-
     def __init__(self, sigma: float, step: complex, rng: np.random.Generator) -> None:
         self._rng = rng
         phi = np.exp(-step)
@@ -69,7 +65,6 @@ class _Resonance(NoiseSeries):
 def _add_resonance(
     values: Floats, white: Floats, c: float, s: float, drive: float, x: float, y: float
 ) -> tuple[float, float]:
-    """Add the real part x of the complex noise x + iy to the values [n], and return the last x and y."""
     for k in range(values.size):
         values[k] += x
         x, y = c * x - s * y + drive * white[k, 0], s * x + c * y + drive * white[k, 1]

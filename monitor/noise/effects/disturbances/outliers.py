@@ -13,11 +13,9 @@ from monitor.noise.spectrum import Spectrum, white_noise_spectrum
 
 @dataclass(frozen=True, slots=True)
 class Outliers(Source):
-    """Tukey's contaminated noise. With probability p, a sample has an additional Gaussian error of standard deviation
-    s.
+    """Additional Gaussian error of standard deviation s on a fraction p of the samples (Tukey's contaminated noise).
 
-    The errors are white noise with a variance of p s² per sample. The spectrum is S(f) = p s² τ0, and the Allan
-    variance is σ²(τ) = p s² τ0/τ.
+    The power spectral density is S(f) = p s² τ0, and the Allan variance is σ²(τ) = p s² τ0/τ.
 
     >>> print(f"{Outliers(fraction=1e-4, scale=0.1).avar(np.array([1.0]), 0.01)[0]:.6g}")
     1e-08
@@ -33,7 +31,7 @@ class Outliers(Source):
         return white_noise_spectrum(self.fraction * self.scale**2, tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_IsolatedErrors":
-        """Return a series of outliers with geometric gaps, which correspond to an independent draw for every sample."""
+        """Start a series of outliers with geometric gaps."""
         return _IsolatedErrors(self.fraction, self.scale, rate_hz, rng)
 
 

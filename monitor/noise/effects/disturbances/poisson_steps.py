@@ -1,4 +1,4 @@
-"""Steps of the bias at random times."""
+"""Random steps of the bias."""
 
 from dataclasses import dataclass
 from itertools import pairwise
@@ -15,9 +15,9 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class PoissonSteps(Source):
-    """Compound Poisson process: Gaussian steps, λ per second on average (Cox & Miller, Theory of Stochastic Processes).
+    """Compound Poisson process with λ Gaussian steps per second (Cox & Miller, Theory of Stochastic Processes).
 
-    The increments are independent, so the second moments equal those of rate random walk with K² = λh².
+    The spectrum equals the spectrum of rate random walk with K² = λh².
 
     >>> jumps = PoissonSteps(rate=0.01, height=1e-4)
     >>> print(f"{jumps.avar(np.array([300.0]), 0.01)[0]:.6g}")
@@ -31,7 +31,7 @@ class PoissonSteps(Source):
 
     @property
     def events_hz(self) -> float:
-        """Return the mean number of steps per second."""
+        """Mean number of steps per second."""
         return self.rate
 
     def spectrum(self, tau0_s: float) -> Spectrum:
@@ -39,7 +39,7 @@ class PoissonSteps(Source):
         return RateRandomWalk(K=self.rate**0.5 * self.height).spectrum(tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_RandomSteps":
-        """Return a series that starts at zero."""
+        """Start a series at zero."""
         return _RandomSteps(self.rate / rate_hz, self.height, rate_hz, rng)
 
 

@@ -1,4 +1,4 @@
-"""Angle random walk N, which is called velocity random walk on an accelerometer."""
+"""Angle random walk N of a gyroscope, or velocity random walk of an accelerometer."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class AngleRandomWalk(Source):
-    """White noise of the rate: S(f) = N² and σ²(τ) = N²/τ (IEEE Std 952 eq. C.18–C.19).
+    """White noise of the rate, with S(f) = N² and σ²(τ) = N²/τ (IEEE Std 952 eq. C.18–C.19).
 
     >>> print(f"{AngleRandomWalk(N=1.5e-4).avar(np.array([9.0]), 0.01)[0]:.6g}")
     2.5e-09
@@ -27,7 +27,7 @@ class AngleRandomWalk(Source):
         return Spectrum(lambda f: np.full_like(f, self.N**2), lambda tau: self.N**2 / tau, tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_WhiteNoise":
-        """Return independent samples with standard deviation N √rate."""
+        """Start a series of independent samples with the standard deviation N √rate."""
         return _WhiteNoise(self.N * rate_hz**0.5, rng)
 
 

@@ -14,9 +14,9 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class ExponentiallyCorrelated(Source):
-    """Sampled Markov noise (IEEE Std 952 annex C) with the autocovariance σ²φ^|n|, φ = exp(−τ0/T_c).
+    """Sampled Markov noise (IEEE Std 952 annex C) with the autocovariance σ²φ^|n| and φ = exp(−τ0/T_c).
 
-    Allan variance and spectrum, with n = τ/τ0, are:
+    With n = τ/τ0, the Allan variance and the power spectral density are:
 
         σ²(τ) = σ²(1 − φ²)[n − 3φ − nφ² + 4φ^(n+1) − φ^(2n+1)] / [n²(1 − φ)²(1 − φ²)]
         S(f) = σ²τ0(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)
@@ -32,16 +32,16 @@ class ExponentiallyCorrelated(Source):
     description: ClassVar[str] = "The bias fluctuates about zero with an exponential autocorrelation."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return the closed forms of the class docstring."""
+        """Return the spectrum and the Allan variance in closed form."""
         return gauss_markov_spectrum(self.sigma, 1.0 / self.correlation_time, tau0_s)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_GaussMarkov":
-        """Return a stationary series."""
+        """Start a stationary series."""
         return _GaussMarkov(self.sigma, 1.0 / (self.correlation_time * rate_hz), rng)
 
 
 class _GaussMarkov(NoiseSeries):
-    """Series of the recursion x ← φx + σ√(1 − φ²) w."""
+    """Series of the recursion x ← φx + σ√(1 − φ²) w with white noise w."""
 
     def __init__(self, sigma: float, step: float, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -56,7 +56,6 @@ class _GaussMarkov(NoiseSeries):
 
 @compiled
 def _add_gauss_markov(values: Floats, white: Floats, phi: float, drive: float, state: float) -> float:
-    """Add the process to the values [n], and return its state."""
     for k in range(values.size):
         values[k] += state
         state = phi * state + drive * white[k]

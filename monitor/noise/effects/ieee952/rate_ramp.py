@@ -12,7 +12,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class RateRamp(Source):
-    """Constant slope of the rate: σ²(τ) = R²τ²/2 (IEEE Std 952 eq. C.32). A ramp is deterministic and has no spectrum.
+    """Constant slope of the rate, with σ²(τ) = R²τ²/2 (IEEE Std 952 eq. C.32). A ramp has no spectrum.
 
     >>> float(RateRamp(R=2e-6).avar(np.array([1000.0]), 0.01)[0])
     2e-06
@@ -23,11 +23,11 @@ class RateRamp(Source):
     description: ClassVar[str] = "The bias changes at a constant rate, for example while a sensor warms up."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return a spectrum that has only a slope."""
+        """Return a spectrum with a slope and no noise."""
         return Spectrum(np.zeros_like, lambda tau: 0.5 * (self.R * tau) ** 2, tau0_s, slope=self.R)
 
     def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Ramp":
-        """Return a ramp that starts at zero."""
+        """Start a ramp at zero."""
         return _Ramp(self.R / rate_hz)
 
 

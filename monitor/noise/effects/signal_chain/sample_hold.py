@@ -13,16 +13,15 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class RandomSampleHold(Transform):
-    """Random repetition of samples. With probability h, a sample repeats the previous output.
+    """Random repetition of samples. Each sample repeats the previous output with probability h.
 
-    The age of an output value has a geometric distribution. On average, the output equals the input after the filter G
-    = (1 − h)/(1 − h/z). The remainder is noise whose correlation decays as hⁿ. The output spectrum is S_out(f) = |G|² S
-    + V τ0 (1 − h²)/|1 − h/z|², where V is the mean square of (1 − |G|²) S. This formula is exact for any input with
-    stationary increments. The Allan variance is an integral over this spectrum.
+    On average, the output equals the input after the filter G = (1 − h)/(1 − h/z). The remainder is noise with a
+    correlation that decays as hⁿ. The power spectral density is S_out(f) = |G|² S + V τ0 (1 − h²)/|1 − h/z|², where V
+    is the mean square of (1 − |G|²) S. The formula is exact for all inputs with stationary increments.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> held = RandomSampleHold(fraction=0.5).transform_spectrum(white_noise_spectrum(1.0, 0.01))
-    >>> print(f"{held.avar(np.array([0.01]))[0]:.3f}")  # r(0) − r(1) of white_noise_spectrum noise held: 1 − h
+    >>> print(f"{held.avar(np.array([0.01]))[0]:.3f}")  # 1 − h for white noise
     0.500
     """
 
@@ -31,7 +30,7 @@ class RandomSampleHold(Transform):
     description: ClassVar[str] = "Some samples repeat the previous value."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum by the formula of the class docstring."""
+        """Return the spectrum after the repetition of samples."""
         h, tau0_s = self.fraction, spectrum.tau0_s
 
         def squared_denominator(f_hz: Floats) -> Floats:
@@ -41,7 +40,7 @@ class RandomSampleHold(Transform):
             return (1.0 - h) ** 2 / squared_denominator(f_hz)
 
         lowest = 1e-7 / tau0_s
-        # 4h sin²(πfτ0)/|1 − h/z|² equals 1 − |G|², without cancellation at low frequencies.
+        # 1 − |G|² = 4h sin²(πfτ0)/|1 − h/z|² avoids cancellation at low frequencies.
         lost = (
             spectrum.mean_square(lowest, lambda f: 4.0 * h * np.sin(np.pi * f * tau0_s) ** 2 / squared_denominator(f))
             + spectrum.slope**2 * tau0_s**2 * h / (1.0 - h) ** 2
@@ -50,7 +49,7 @@ class RandomSampleHold(Transform):
         return spectrum.filtered_by(squared_response, narrow_peaks=((0.0, (1.0 - h) / (2.0 * np.pi * tau0_s)),)) + rest
 
     def start_transform(self, rate_hz: float, rng: np.random.Generator) -> "_RepeatedSamples":
-        """Return a transform that never repeats a sample from before its first call."""
+        """Start the repetition of samples. The first sample is never a repetition."""
         return _RepeatedSamples(self.fraction, rng)
 
 
@@ -72,7 +71,7 @@ class _RepeatedSamples(RunningTransform):
 
 @compiled
 def _repeat_samples(values: Floats, tosses: Floats, fraction: float, last: float) -> tuple[float, int]:
-    """Repeat samples in place at random, and return the last value and the number of repeated samples."""
+    """Repeat samples at random in place, and return the last value and the number of repeated samples."""
     held = 0
     for k in range(values.size):
         if tosses[k] < fraction and not np.isnan(last):

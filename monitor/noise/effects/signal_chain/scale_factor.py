@@ -11,7 +11,7 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class ScaleFactor(Transform):
-    """Scale factor f of the axis (IEEE Std 952). The factor multiplies Allan variance and spectrum by f².
+    """Scale factor f of the axis (IEEE Std 952), which multiplies Allan variance and power spectral density by f².
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> float(ScaleFactor(factor=2.0).transform_spectrum(white_noise_spectrum(1.0, 0.01)).avar(np.array([0.01]))[0])
@@ -25,9 +25,9 @@ class ScaleFactor(Transform):
     )
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum times f²."""
+        """Return the spectrum multiplied by f²."""
         return spectrum.scaled_by_amplitude(self.factor)
 
     def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
-        """Return a multiplying transform."""
+        """Start a multiplying transform."""
         return MemorylessTransform(lambda values: np.multiply(values, self.factor, out=values))

@@ -78,8 +78,8 @@ def test_any_cut_gives_the_same(cut):
     out, t, rest, _ = stream(values, list(edges))
     assert np.array_equal(out, np.where(mask[:, None], np.nan, values), equal_nan=True)
     assert np.array_equal(t, np.arange(4000))
-    assert rest.take() == motions
-    assert rest.take() == []
+    assert rest.take_motions() == motions
+    assert rest.take_motions() == []
     assert (rest.episodes, rest.samples_in_motion) == (2, mask.sum())
 
 

@@ -21,7 +21,7 @@ def feed(watch, values, size=250, lost=0):
     for at in range(0, len(values), size):
         part = values[at : at + size]
         t_ns = FIRST_NS + STEP_NS * (np.arange(at, at + len(part)) + lost)
-        out += watch.update(make_block(t_ns, part, lost=lost if at == 0 else 0))
+        out += watch.process_samples(make_block(t_ns, part, lost=lost if at == 0 else 0))
     return out
 
 
