@@ -1,8 +1,7 @@
 """Analysis of a whole recording: Allan deviations, confidence intervals, noise coefficients and detected events.
 
 ``analyze`` computes the Allan variance and fits the noise coefficients. ``detect_events`` searches the recording for
-motion, noise changes, spectral lines and outliers. The search is a separate function because it takes longer than the
-fit.
+motion, noise changes, spectral lines and outliers. The search takes longer than the fit.
 
 By default, samples in motion remain in the Allan variance, because the motion detector may mistake samples at rest for
 motion. The search for events always ignores samples in motion.

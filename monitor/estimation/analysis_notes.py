@@ -1,6 +1,6 @@
 """Notes for users on the results of an analysis.
 
-Each function returns a list of notes, which is empty if there is nothing to report. Times in notes are in seconds since
+All functions return lists of notes. Times in notes are in seconds since
 the first sample.
 """
 

@@ -5,8 +5,8 @@ For each gap, the median delays of ``ROWS_BESIDE_GAP`` rows before and after the
 median delay, rounded to whole periods, is the number of missing samples. The number is limited to the number that the
 clock reported.
 
-A delayed sender may send late rows until it has caught up. The range after the gap is therefore extended by twice the
-number of rows that seem to be missing. If other gaps follow within this range, the smallest median delay is used.
+A delayed sender may send many late rows. The range after the gap is therefore extended by twice the number of rows that
+seem to be missing. If the range contains other gaps, the smallest median delay is used.
 
 The sample period is the median over stretches without a gap, so missing samples do not bias the period.
 """

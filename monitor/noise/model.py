@@ -1,8 +1,8 @@
 """Noise model of an IMU with the effects of each axis.
 
-The same model is used for simulation, for comparison with measurements and for ``reconcile``. Allan variance and power
-spectral density include linear transforms and leaks. Both are NaN if they depend on the temperature, the length of the
-recording or another quantity that the model does not contain.
+Simulation, comparison with measurements and ``reconcile`` use the same model. Allan variance and power spectral density
+include linear transforms and leaks. Both quantities are NaN if they depend on the temperature or on the length of the
+recording.
 """
 
 from collections.abc import Iterator, Mapping

@@ -107,7 +107,7 @@ def format_display_table(
 
 @contextlib.contextmanager
 def prefix_config_errors(location: str) -> Iterator[None]:
-    """Prefix a ConfigError in the context with its location in the model file."""
+    """Prefix the message of a ConfigError with a location in the model file."""
     try:
         yield
     except ConfigError as error:

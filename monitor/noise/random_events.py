@@ -83,7 +83,7 @@ class RandomEvents:
     def drawn_random_values(self, size_key: str | None = None) -> dict[str, Any]:
         """Return the number of events, and the times of the first events in seconds.
 
-        If ``size_key`` is given, the dictionary also contains the sizes of the first events under this key.
+        If ``size_key`` is given, the dictionary also contains the sizes of the first events.
         """
         times: dict[str, Any] = {"count": self.count, "times": [time for time, _ in self._listed]}
         return times if size_key is None else times | {size_key: [height for _, height in self._listed]}

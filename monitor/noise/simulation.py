@@ -68,7 +68,7 @@ def check_effects_can_be_simulated(
     Raises
     ------
     ConfigError
-        If a frequency is too high for the sample rate, or if an effect requires another effect or a missing temperature.
+        If a frequency is too high for the sample rate, or if an effect requires a missing effect or temperature.
     """
     for axis in AXES:
         effects = axis_effects.get(axis, ())
@@ -251,7 +251,7 @@ class _AxisSimulator:
     def needs_leak_free_measurement(self) -> bool:
         """True if the measurement without leaks is needed.
 
-        Transforms with memory require this measurement for every block.
+        Transforms with memory require the measurement without leaks for every block.
         """
         return self.leaks_out or bool(self.leaks)
 

@@ -9,7 +9,7 @@ where τ0 is the sample interval and m = τ/τ0. Spectral lines and slopes are a
 
 For f < 0.1/τ, the trapezoidal rule is used on a logarithmic frequency grid. At higher frequencies, sin⁴(πfτ) is
 expanded to 3/8 − cos(2πfτ)/2 + cos(4πfτ)/8. The products of the cosines and the piecewise linear density are integrated
-exactly. The relative error is below 3·10⁻⁴ for the effects of this package.
+exactly. For all effects of noise models, the relative error is below 3·10⁻⁴.
 """
 
 from collections.abc import Callable

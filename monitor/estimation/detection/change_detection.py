@@ -1,8 +1,7 @@
 """Detection of noise changes, bias steps and bursts of outliers at a specified rate of false alarms.
 
 The variance of each axis is monitored in octaves of the averaging time. The reference variance of an octave is learned
-from the samples since the last change. A ``Change`` contains the changed noise coefficients or the changed frequency
-band, the bias before and after a step, or the number and the size of outliers.
+from the samples since the last change. A ``Change`` describes a noise change, a bias step or a burst of outliers.
 
 - **False alarms.** 80 % of the accepted false alarms are assigned to noise changes, 10 % to bias steps and 10 % to
   bursts. The threshold for noise changes is h = ln(tests per day · RATE_AT_ZERO / alarms per day). ``RATE_AT_ZERO`` was
@@ -15,8 +14,8 @@ band, the bias before and after a step, or the number and the size of outliers.
 - **A burst** of outliers increases the number of large differences, but not their median. Samples of a burst are
   removed from the reference.
 
-``reconcile`` does not use this detector. Its test for steps must give a likelihood ratio that can be compared with the
-likelihood ratios of other effects.
+``reconcile`` does not use this detector. Reconciliation compares the likelihood ratio of a step with the likelihood
+ratios of other effects.
 """
 
 from collections.abc import Mapping
@@ -254,8 +253,8 @@ class ChangeDetector:
     def _bulk_variance_ratio(self, axis: int, after: Floats) -> float:
         """Return the ratio of the variances after and before an alarm, computed from the share of small differences.
 
-        Outliers hardly affect the share of differences below a fixed limit. For Gaussian noise, this share determines
-        the variance.
+        Outliers hardly affect the share of differences below a fixed limit. For Gaussian noise, the share of small
+        differences determines the variance.
         """
         whole = self._state.cum[axis, 0] - after
         usual, now = whole[UNIT_INSIDE] / whole[UNIT_N], after[UNIT_INSIDE] / after[UNIT_N]

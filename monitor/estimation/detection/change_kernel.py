@@ -19,8 +19,8 @@ does not depend on the division of the input into blocks.
   4σ. For Gaussian noise, clipping affects a share of 6e-5 of the values and reduces the mean by 2e-4. The evidence is
   divided by the factor F, the variance of sums of z² relative to independent Gaussian z. Heavy tails, spectral lines
   and coarse resolution increase F.
-- **Steps** are detected by comparing a pair of blocks with the next but one pair. The pair between these pairs may
-  contain the step.
+- **Steps** are detected by comparing a pair of blocks with the next but one pair. The pair in between may contain the
+step.
 """
 
 from typing import Final, NamedTuple
@@ -325,9 +325,9 @@ def _look(
 def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: float) -> None:
     """Update the factor F of one octave.
 
-    F is estimated from the squared Haar differences of sums of z² over 1, 2, 4, … tests, relative to the expectation
-    for independent Gaussian z. An estimate that is not significantly above 1 is reduced by its standard deviation. The
-    largest estimate of all lengths is used.
+    F is the ratio of the squared Haar differences of sums of z² to the expectation for independent Gaussian z. The
+    largest ratio over sums of 1, 2, 4, … tests is used. A ratio that is not significantly above 1 is reduced by its
+    standard deviation.
     """
     v = band[axis, j, S] / band[axis, j, N]
     for level in range(spread.shape[2]):
@@ -400,9 +400,9 @@ def _relearn(s: ChangeState, axis: int, j: int) -> None:
 
 @compiled
 def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis: int, now: int) -> float:
-    """Update and return the CUSUM of the share of extreme values.
+    """Update and return the CUSUM of extreme values.
 
-    The share must be at least 1 % and ten times the share at rest.
+    The CUSUM tests for a share of extreme values of at least 1 % that is also ten times the share at rest.
     """
     outer = 2.0 * band[axis, 0, LIMIT] * (EXTREME / CLIP)  # (y − y')² is 2 z²
     if band[axis, 0, SEEDED] != SEED or outer == 0.0:
@@ -451,7 +451,7 @@ def set_next_decision_time(s: ChangeState) -> None:
 def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: int) -> None:
     """Search for a step between the newest pair of blocks and the next but one older pair.
 
-    Both pairs must be at rest, and a linear slope must not explain the difference.
+    A step is rejected if the sensor moves or if a linear slope explains the difference.
     """
     ring = s.ring[axis, j]
     height = mean - ring[0, 0]
@@ -485,7 +485,7 @@ def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: in
 
 @compiled
 def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
-    """Confirm a step after ``CONFIRM_PAIRS`` pairs at the new mean. Discard the step if the mean returns."""
+    """Confirm a step after ``CONFIRM_PAIRS`` pairs at the new mean. Discard the step if the mean changes again."""
     step = s.step[axis]
     if np.abs(mean - step[AFTER]) > 0.5 * np.abs(step[AFTER] - step[BEFORE]):
         step[0] = -1.0

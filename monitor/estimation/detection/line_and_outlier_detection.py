@@ -9,7 +9,7 @@ second. Stretches with more than ``MAX_MISSING_SHARE`` missing samples are skipp
   contributes A² sin⁴(πfτ) / (m sin(πf/rate))² to the Allan variance (IEEE Std 952 annex C, for a mean of m samples).
   Peaks that contribute less than ``MIN_LINE_SHARE`` at every averaging time are not reported.
 - **Outliers** deviate by more than ``OUTLIER_SIGMA`` σ from the median of a block of ``BLOCK`` samples. To exclude
-  slopes, an outlier must also deviate by half of this limit from the median of the neighbouring samples. σ is computed
+slopes, an outlier must also deviate by ``OUTLIER_SIGMA``/2 σ from the median of the neighbouring samples. σ is computed
   from the median absolute deviation, and is at least one quantization step.
 
 Lines with fewer than ``FIRST_BIN`` cycles per stretch and lines of short duration are not detected.

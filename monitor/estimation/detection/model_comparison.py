@@ -10,14 +10,14 @@ approximately normal (Wilson & Hilferty, PNAS 17, 1931), which gives
 
 The degrees of freedom are ν = 2 σ⁴_model/Var, where Var is the variance of the measured Allan variance under the model.
 For the noise terms Q, N, B and K, Var is computed exactly in ``uncertainty``. For other effects with the power spectral
-density S, Var is 4/M ∫ (S G)² df, where M is the number of terms and G the spectral kernel of the Allan variance. This
+density S, Var is 4/M ∫ (S G)² df, where M is the number of terms and G the spectral kernel of the Allan variance. The
 integral is accurate if the window is much longer than the correlation time of the noise.
 
 The limits of the gap account for the number of averaging times and axes by the inequality of Šidák (J. Am. Stat. Assoc.
 62, 1967), which holds for normal variables with any correlation. Of 100 independent windows of a true model, at most
-one exceeds ``threshold`` on any axis. In a simulation of 2500 windows of six axes and 14 octaves, 0.5 % exceeded
-``threshold`` with the noise terms Q, N, B and K, and 0.9 % with random walk only. Telegraph noise and random steps are
-not Gaussian and exceed ``threshold`` more often.
+one exceeds ``threshold`` on any axis. Of 2500 simulated windows of six axes and 14 octaves, 0.5 % exceeded
+``threshold``. With random walk only, the share was 0.9 %. Telegraph noise and random steps are not Gaussian and exceed
+``threshold`` more often.
 """
 
 from collections.abc import Mapping
@@ -176,7 +176,7 @@ class _Expected:
 
 
 def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Floats, NoiseModel]:
-    """Return Q², N², B² and K² of an axis at τ0 = 1, and a model of these terms only."""
+    """Return Q², N², B² and K² of an axis at τ0 = 1, and a model with only the terms Q, N, B and K."""
     letters = ("Q", "N", "B", "K")
     kinds = tuple(STANDARD_TERMS[letter] for letter in letters)
     powers = (2.0, 1.0, 0.0, -1.0)

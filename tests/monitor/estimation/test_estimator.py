@@ -196,7 +196,9 @@ def test_the_course_of_a_restarted_axis_is_that_of_a_young_window():
         def feed(estimators, first, last, values=values):
             for at in range(first, last, 2000):
                 for estimator in estimators:
-                    estimator.update(make_block(np.arange(at, at + 2000) * 10_000_000, values[at : at + 2000].copy()))
+                    estimator.add_samples(
+                        make_block(np.arange(at, at + 2000) * 10_000_000, values[at : at + 2000].copy())
+                    )
 
         feed([old], 0, 32_000)
         old.get_estimate()

@@ -2,7 +2,7 @@
 
 The simulated series is white noise after a filter. The power response of the filter is proportional to 1/f within 0.1 %
 from 1e-8 to 1/2 of the sample rate. All poles and zeros are real, and were fitted to the logarithm of the spectrum by
-least squares. The filter is the sum of its partial fractions and starts in the stationary state.
+least squares. The filter is implemented as a sum of partial fractions and starts in the stationary state.
 """
 
 from dataclasses import dataclass
