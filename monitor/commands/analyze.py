@@ -25,7 +25,7 @@ from monitor.estimation.allan.batch import TauGrid
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
 from monitor.estimation.allan.total import TotalCurve, total_curve
-from monitor.estimation.analysis import Analysis, analyze, detect_events
+from monitor.estimation.analysis import RecordingAnalysis, analyze, detect_events
 from monitor.estimation.regular_grid import resample_with_temperature
 from monitor.publishing.plots.allan_figure import additional_deviations
 from monitor.publishing.plots.dynamic_figure import ChangeMark
@@ -65,7 +65,7 @@ class Request:
 class Results:
     """Results of an analysis."""
 
-    analysis: Analysis
+    analysis: RecordingAnalysis
     total: TotalCurve | None = None
     hadamard: HadamardCurve | None = None
     dynamic: DynamicAllan | None = None
@@ -164,7 +164,7 @@ def draw_plots(results: Results, path: Path, title: str) -> None:
 
 
 def _without_temperature(
-    result: Analysis, blocks: Sequence[SampleBlock], rate_hz: float | None
+    result: RecordingAnalysis, blocks: Sequence[SampleBlock], rate_hz: float | None
 ) -> TemperatureRemoval | None:
     """Return the coefficients without the effect of temperature; None if the temperature is missing or constant."""
     if not temperature_varied(np.concatenate([samples.temperature_c for samples in blocks])):
@@ -173,7 +173,9 @@ def _without_temperature(
     return remove_temperature(result, temperature_c)
 
 
-def _dynamic_curves(result: Analysis, request: Request, tell: ProgressCallback) -> tuple[DynamicAllan | None, str]:
+def _dynamic_curves(
+    result: RecordingAnalysis, request: Request, tell: ProgressCallback
+) -> tuple[DynamicAllan | None, str]:
     """Return the dynamic curves if they are requested, or the reason why they are missing."""
     if request.window_s is None:
         return None, ""
@@ -187,7 +189,7 @@ def _dynamic_curves(result: Analysis, request: Request, tell: ProgressCallback) 
     return shown, ""
 
 
-def _total_and_hadamard(result: Analysis, tau: TauGrid) -> tuple[TotalCurve, HadamardCurve | None]:
+def _total_and_hadamard(result: RecordingAnalysis, tau: TauGrid) -> tuple[TotalCurve, HadamardCurve | None]:
     """Return total and Hadamard deviations at octaves, or at the listed τ if the recording is long enough."""
     values, rate_hz, theta = result.values, result.estimate.rate_hz, np.where(result.fit.entered, result.fit.theta, 0.0)
     listed = None if isinstance(tau, str) else result.estimate.curve.factors

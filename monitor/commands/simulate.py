@@ -122,10 +122,10 @@ def run_simulation(request: Request, tell: ProgressCallback = ignore_progress) -
     tell("preparing", None)
     temperature_c = _temperature(request, rate_hz, n)
     try:
-        stream = request.model.stream(rate_hz, request.seed, temperature_c)
+        stream = request.model.start_stream(rate_hz, request.seed, temperature_c)
     except ConfigError as error:
         raise ConfigError(f"{request.name}: {error}") from error
-    first = stream.draw_with_temperature(min(n, CHUNK_ROWS))
+    first = stream.draw_samples_with_temperature(min(n, CHUNK_ROWS))
     temperature = not bool(np.isnan(first.temperature_c).all())
     truth = request.out.with_name(request.out.name + ".truth.json") if request.truth else None
     result = Result(request.out, n, rate_hz, request.seed, axes, temperature, truth)
@@ -148,7 +148,7 @@ def _write(result: Result, stream: ModelStream, first: SimulatedSamples, tell: P
             tell("simulating", written / result.samples)
             if written == result.samples:
                 break
-            block = stream.draw_with_temperature(min(CHUNK_ROWS, result.samples - written))
+            block = stream.draw_samples_with_temperature(min(CHUNK_ROWS, result.samples - written))
         tell("finishing the file", None)  # some formats are compressed only at the end
 
 
@@ -200,7 +200,7 @@ def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:
             "seconds": result.seconds,
             "samples": result.samples,
             "axes": result.axes,
-            "drawn": stream.drawn_values(),
+            "drawn": stream.drawn_random_values(),
         }
     )
 

@@ -14,7 +14,7 @@ from drivers.zenoh.sample_message import encode_samples
 from monitor.common import topics
 from monitor.common.device_health import Health
 from monitor.daemon.output import Output
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.message import Message
 from monitor.publishing.messages.results import (
@@ -147,7 +147,7 @@ class TableOutput(Output):
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         """Keep the newest estimate and the newest comparison with the noise model until the next status."""
-        if isinstance(result, Estimate | ModelGap):
+        if isinstance(result, Estimate | ModelComparison):
             message: type[Message] = CoefficientsMessage if isinstance(result, Estimate) else ModelGapMessage
             self._newest.setdefault(device, {})[message] = (unix_s, received, result)
 

@@ -19,8 +19,8 @@ from monitor.daemon.operations.coefficient_limits import LimitMonitor
 from monitor.daemon.output import Output
 from monitor.daemon.schedule import Schedule
 from monitor.drift.compensation.live_compensation import LiveCompensation
-from monitor.estimation.detection.model_agreement_monitor import ModelAgreement
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_agreement_monitor import ModelAgreementMonitor
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings.loading import Device
@@ -72,7 +72,7 @@ class ResultPublisher:
         """Number of published samples."""
         self.withholds_coefficients = False
         """True while coefficients are withheld, because the sample rate is in doubt."""
-        self._agreement = ModelAgreement()
+        self._agreement = ModelAgreementMonitor()
         self._batch: list[SampleBlock] = []  # samples that are not published yet
         self._refitted = False  # True if the fit was updated since the last publication
 
@@ -107,7 +107,7 @@ class ResultPublisher:
         self._refitted = False
         self._result(self.latest.t_ns, self.latest)
         if self.pipeline.model_in_force is not None:
-            self._model_gap(self.pipeline.model_in_force.compare(self.latest))
+            self._model_gap(self.pipeline.model_in_force.compare_with_estimate(self.latest))
         self.publish_events(self.limits.check_estimate(self.latest))
         return True
 
@@ -166,7 +166,7 @@ class ResultPublisher:
         fitted = pipeline.fit_kernels_ready
         pipeline.advanced = not fitted  # a curve without coefficients is fitted as soon as the kernels are ready
         try:
-            latest = pipeline.estimator.get(fitted=fitted)
+            latest = pipeline.estimator.get_estimate(fit_coefficients=fitted)
         except NotReady:
             return
         if pipeline.fit_is_interpreted:
@@ -174,11 +174,11 @@ class ResultPublisher:
         self.latest = latest.without_coefficients() if self.withholds_coefficients else latest
         self._refitted = True
 
-    def _model_gap(self, gap: ModelGap) -> None:
+    def _model_gap(self, gap: ModelComparison) -> None:
         """Publish the comparison of the window with the noise model, and the resulting events."""
         if self.withholds_coefficients:
             gap = replace(gap, axes={})
-        events = self._agreement.update(gap)
-        gap = replace(gap, agrees=self._agreement.decisions)
+        events = self._agreement.update_decisions(gap)
+        gap = replace(gap, agrees=self._agreement.agreement_by_axis)
         self._result(gap.t_ns, gap)
         self.publish_events(events)

@@ -1,1 +1,1 @@
-"""Estimation from samples: windowed Allan variance, its uncertainty, fitted coefficients and event detection."""
+"""Estimation of Allan deviations and noise coefficients, and detection of motion and noise changes."""

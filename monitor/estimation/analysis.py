@@ -1,13 +1,10 @@
-"""Analysis of a whole recording, with Allan variance, confidence intervals and fitted coefficients.
+"""Analysis of a whole recording: Allan deviations, confidence intervals, noise coefficients and detected events.
 
-The results are the reference for the live estimator. The recording is first resampled to a regular grid, with the same
-clock as for live samples. Missing samples become NaN. ``Analysis.notes`` lists all irregularities of the time stamps.
+``analyze`` computes the Allan variance and fits the noise coefficients. ``detect_events`` searches the recording for
+motion, noise changes, spectral lines and outliers. The search takes longer than the fit.
 
-``analyze`` computes the Allan variance and the fit. ``detect_events`` searches the same samples for motion, noise
-changes, spectral lines and outliers. The search is a separate step because it takes longer than the fit.
-
-Samples in motion are removed from the Allan variance only on request, because the detector may take samples at rest for
-motion. ``detect_events`` always ignores samples in motion.
+By default, samples in motion remain in the Allan variance, because the motion detector may mistake samples at rest for
+motion. The search for events always ignores samples in motion.
 """
 
 from collections.abc import Iterable, Sequence
@@ -30,7 +27,7 @@ from monitor.estimation.allan.batch import (
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.uncertainty import covariance_table, deviation_intervals
 from monitor.estimation.detection.change_detection import Change, ChangeDetector
-from monitor.estimation.detection.line_and_outlier_detection import detect_lines, outlier_share
+from monitor.estimation.detection.line_and_outlier_detection import detect_spectral_lines, outlier_share_of_axes
 from monitor.estimation.detection.motion_detection import Motion, detect_motion
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import Fit, MeasuredCurve, fit, make_design
@@ -47,12 +44,12 @@ from monitor.estimation.regular_grid import resample_to_grid
 MIN_SAMPLES: Final = 50
 """Minimum number of samples of a recording."""
 DETECTOR_CHUNK_ROWS: Final = 65_536
-"""Number of rows passed to the change detector in one call."""
+"""Number of samples passed to the change detector in one call."""
 
 
 @dataclass(frozen=True, slots=True)
-class Analysis:
-    """Result of ``imu-monitor analyze``."""
+class RecordingAnalysis:
+    """Allan deviations, noise coefficients and events of one recording."""
 
     estimate: Estimate
     seconds: float
@@ -62,7 +59,7 @@ class Analysis:
     bandwidth_hz: Floats  # [6] cutoff of the sensor's low-pass filter; NaN if no filter has been found
     motions: tuple[Motion, ...] = ()
     changes: tuple[Change, ...] = ()
-    motion_removed: bool = False  # True if the samples in motion have been removed from ``values``
+    motion_removed: bool = False  # True if ``values`` contains no samples in motion
     axes_of_temperature: tuple[str, ...] = ()  # axes on which temperature explains most of the slow variance
 
 
@@ -70,11 +67,11 @@ def analyze(
     blocks: Sequence[SampleBlock],
     rate_hz: float | None,
     tau: TauGrid = "octave",
-    notes: Iterable[str] = (),
-    each: EachAxis = map,
+    reading_notes: Iterable[str] = (),
+    map_axes: EachAxis = map,
     remove_motion: bool = False,
-) -> Analysis:
-    """Compute the Allan curve of a recording and fit the coefficients to it.
+) -> RecordingAnalysis:
+    """Compute the Allan deviations of a recording, and fit the noise coefficients.
 
     Parameters
     ----------
@@ -84,19 +81,19 @@ def analyze(
         Stated sample rate in Hz. If None, the rate is estimated from the time stamps.
     tau : TauGrid
         Grid of averaging times, or a tuple of averaging times in seconds.
-    notes : iterable of str
-        Notes from reading the file, which precede the other notes of the result.
-    each : EachAxis
-        Function that maps over the axes. With the ``map`` method of a thread pool, the axes are computed in parallel.
+    reading_notes : iterable of str
+        Notes of the file reader. The analysis lists these notes first.
+    map_axes : EachAxis
+        Function that maps over the axes. The ``map`` method of a thread pool processes the axes in parallel.
     remove_motion : bool
-        True to remove the samples during which the sensor moved.
+        True to remove the samples in motion.
 
     Raises
     ------
     NotReady
-        If the recording has fewer than ``MIN_SAMPLES`` samples, or if fewer than ``MIN_SAMPLES`` samples are at rest.
+        If fewer than ``MIN_SAMPLES`` samples can be used.
     ConfigError
-        If no τ of the tuple lies between one sample and half the recording.
+        If every averaging time is shorter than one sample or longer than half the recording.
     """
     values, rate, found = resample_to_grid(blocks, rate_hz)
     if len(values) < MIN_SAMPLES:
@@ -104,19 +101,21 @@ def analyze(
     motions: tuple[Motion, ...] = ()
     if remove_motion:
         values, motions = _without_motion(values, rate)
-        found = [*found, *analysis_notes.of_motions(motions, rate, removed=True)]
-    curve, fitted, filters = _fit_curve(values, rate, cluster_sizes(len(values), rate, tau), each)
+        found = [*found, *analysis_notes.describe_motions(motions, rate, removed=True)]
+    curve, fitted, filters = _fit_curve(values, rate, cluster_sizes(len(values), rate, tau), map_axes)
     estimate = Estimate(
         int(blocks[-1].t_ns[-1]), rate, curve.n / rate, sum(len(samples) for samples in blocks),
         curve, fitted.fitted, fitted.coefficients, fitted.k_or_r,
     )  # fmt: skip
     bandwidth_hz = np.array([np.nan if one is None else one.cutoff * rate for one in filters])
     few = [f"{len(curve.tau_s)} averaging times are too few to fit five terms; at least {MIN_ROWS} are needed"]
-    said = few if len(curve.tau_s) < MIN_ROWS else analysis_notes.of_unexplained_curve(curve, fitted, filters, rate)
-    return Analysis(
+    said = (
+        few if len(curve.tau_s) < MIN_ROWS else analysis_notes.describe_unexplained_curve(curve, fitted, filters, rate)
+    )
+    return RecordingAnalysis(
         estimate,
         estimate.window_s,
-        (*notes, *found, *said),
+        (*reading_notes, *found, *said),
         values,
         fitted,
         bandwidth_hz,
@@ -125,12 +124,12 @@ def analyze(
     )
 
 
-def detect_events(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analysis:
-    """Add motion, noise changes, spectral lines and outliers to an analysis and to its notes.
+def detect_events(result: RecordingAnalysis, alarms_per_day: float = 1.0 / 30.0) -> RecordingAnalysis:
+    """Search a recording for motion, noise changes, spectral lines and outliers, and add the results to the analysis.
 
     Parameters
     ----------
-    result : Analysis
+    result : RecordingAnalysis
         Result of ``analyze``.
     alarms_per_day : float
         Accepted false alarms of the change detector per day, for all axes together.
@@ -141,38 +140,37 @@ def detect_events(result: Analysis, alarms_per_day: float = 1.0 / 30.0) -> Analy
     if not result.motion_removed:
         moving, listed = detect_motion(result.values, rate)
         motions = tuple(listed)
-        notes += analysis_notes.of_motions(motions, rate, removed=False)
+        notes += analysis_notes.describe_motions(motions, rate, removed=False)
     detector = ChangeDetector(rate, alarms_per_day)
     for begin in range(0, len(result.values), DETECTOR_CHUNK_ROWS):
         rows, struck = result.values[begin : begin + DETECTOR_CHUNK_ROWS], moving[begin : begin + DETECTOR_CHUNK_ROWS]
-        detector.update(np.where(struck[:, None], np.nan, rows) if struck.any() else rows)
-    changes = tuple(sorted(detector.take(), key=lambda change: change.since))
-    notes += analysis_notes.of_changes(changes, rate)
-    found = detect_lines(result.values, moving, rate, result.estimate.curve)
+        detector.process_samples(np.where(struck[:, None], np.nan, rows) if struck.any() else rows)
+    changes = tuple(sorted(detector.take_changes(), key=lambda change: change.since))
+    notes += analysis_notes.describe_changes(changes, rate)
+    found = detect_spectral_lines(result.values, moving, rate, result.estimate.curve)
     moved = bool(motions) and not result.motion_removed
     notes = analysis_notes.replace_guessed_causes(notes, result.estimate.curve, result.fit, found, moved)
-    notes += analysis_notes.of_lines_and_outliers(found, outlier_share(result.values, moving))
+    notes += analysis_notes.describe_lines_and_outliers(found, outlier_share_of_axes(result.values, moving))
     return replace(result, notes=tuple(notes), motions=motions, changes=changes)
 
 
-def fit_other_samples(result: Analysis, samples: Floats, each: EachAxis = map) -> Fit:
-    """Compute the Allan variance of other samples at the averaging times of an analysis, and fit the coefficients.
+def fit_other_samples(result: RecordingAnalysis, samples: Floats, map_axes: EachAxis = map) -> Fit:
+    """Fit the noise coefficients to other samples, with the sample rate and the averaging times of an analysis.
 
     Parameters
     ----------
-    result : Analysis
-        Result of ``analyze``, which gives the sample rate and the cluster sizes.
+    result : RecordingAnalysis
+        Analysis with the sample rate and the averaging times.
     samples : ndarray of float64, shape (n, 6)
-        Samples in rad/s and m/s², for example the samples of ``result`` after a correction. NaN means missing.
-    each : EachAxis
+        Samples in rad/s and m/s², for example after temperature compensation; NaN means missing.
+    map_axes : EachAxis
         Function that maps over the axes.
     """
-    _, found, _ = _fit_curve(samples, result.estimate.rate_hz, result.estimate.curve.factors, each)
+    _, found, _ = _fit_curve(samples, result.estimate.rate_hz, result.estimate.curve.factors, map_axes)
     return found
 
 
 def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motion, ...]]:
-    """Return the samples with NaN for samples in motion, and the episodes of motion."""
     moving, motions = detect_motion(values, rate_hz)
     left = len(values) - int(moving.sum())
     if left < MIN_SAMPLES:
@@ -183,7 +181,6 @@ def _without_motion(values: Floats, rate_hz: float) -> tuple[Floats, tuple[Motio
 def _fit_curve(
     values: Floats, rate_hz: float, factors: Ints, each: EachAxis
 ) -> tuple[AllanCurve, Fit, list[LowPass | None]]:
-    """Return the Allan curve with confidence intervals, the fit, and the low-pass filter of each axis or None."""
     n = len(values)
     avar, terms = overlapping_avar(values, factors, each)
     columns, covariances = make_design(factors, rate_hz), covariance_table(n, factors)

@@ -1,4 +1,4 @@
-"""Results of the estimator: ``Estimate`` at one moment, and the coefficients after every sample."""
+"""Results of the live estimator."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, replace
@@ -13,14 +13,14 @@ from monitor.estimation.fit.coefficient_values import Coefficients, Status
 
 @dataclass(frozen=True, slots=True)
 class PerSampleCoefficients:
-    """Coefficients after each of n consecutive samples."""
+    """Noise coefficients after each of n consecutive samples."""
 
     t_ns: Ints  # [n] host monotonic clock, nanoseconds
     value: Floats  # [n, 5, 6] Q N B K R in SI; NaN where not estimated
 
 
 def concatenate_coefficients(blocks: Collection[PerSampleCoefficients]) -> PerSampleCoefficients | None:
-    """Concatenate the coefficients of successive blocks of samples. Return None without blocks."""
+    """Concatenate the coefficients of successive blocks. Return None if there are no blocks."""
     if not blocks:
         return None
     return PerSampleCoefficients(
@@ -30,21 +30,23 @@ def concatenate_coefficients(blocks: Collection[PerSampleCoefficients]) -> PerSa
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Allan curve of the window and the fitted coefficients at one sample."""
+    """Allan deviations and fitted noise coefficients of one device at one moment."""
 
     t_ns: int  # time of the newest sample
     rate_hz: float
     window_s: float  # length of the full window
-    samples: int  # received since the start
+    samples: int  # number of samples received since the start
     curve: AllanCurve
-    fitted: Floats  # [m, 6] Allan variance of the fitted model at curve.tau_s; NaN without a fit, or at τ left out
+    fitted: Floats  # [m, 6] Allan variance of the fitted model; NaN without a fit or at excluded averaging times
     coefficients: Coefficients
-    k_or_r: NDArray[np.bool_]  # [6] True if the window drifts, but random walk and ramp cannot be distinguished
-    display_curve: AllanCurve | None = None  # curve at the same τ over shorter spans, see ``window.display_spans``
-    history: PerSampleCoefficients | None = None  # since the previous estimate, if the fit is updated with every sample
+    k_or_r: NDArray[np.bool_]  # [6] True if rate random walk and rate ramp cannot be distinguished
+    display_curve: AllanCurve | None = None  # Allan curve of the newest samples, see ``window.display_spans``
+    history: PerSampleCoefficients | None = (
+        None  # coefficients since the previous estimate, if computed after every sample
+    )
 
     def without_coefficients(self) -> "Estimate":
-        """Return a copy without the fit, in which every coefficient is unestimated."""
+        """Return a copy of the estimate without fitted coefficients."""
         shape = self.coefficients.status.shape
         nothing = np.full(shape, np.nan)
         return replace(

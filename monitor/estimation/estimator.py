@@ -1,14 +1,7 @@
-"""Live estimator of one device, with sliding window, Allan curve, confidence intervals and fitted coefficients.
+"""Live estimator of the Allan deviations and noise coefficients of one device in a sliding window.
 
-``Estimator.update`` advances the window by a block of samples. Missing samples keep their places in time.
-``Estimator.get`` returns the current curve and coefficients. This fit uses the full covariance of all τ.
-
-Optionally, ``continuous_refit`` also updates the coefficients after every sample.
-
-Cluster sizes are numbers of samples. The sample rate only determines τ in seconds and the units of the coefficients.
-
-The fit uses the same window for all τ. The displayed deviation of short τ uses fewer samples
-(``Estimate.display_curve``), so that it shows a change of N within half a minute.
+Cluster sizes are numbers of samples. The sample rate only determines the averaging times in seconds and the units of
+the coefficients.
 """
 
 from collections import deque
@@ -45,17 +38,17 @@ from monitor.estimation.fit.low_pass_search import (
 from monitor.estimation.window_snapshot import WindowSnapshot, copy_window
 
 SETTLING_FITS: Final = 10
-"""Number of successive fits after which a fit has converged. Each fit reduces the error to a quarter."""
+"""Number of successive fits until convergence. Each fit reduces the error to a quarter."""
 MIN_SAMPLES: Final = 8
-"""Minimum number of samples for an estimate. Eight samples give three τ with a few terms each."""
+"""Minimum number of samples for an estimate."""
 SPECTRUM_SAMPLES: Final = 65_536
-"""Number of newest samples whose spectrum is tested for a low-pass filter."""
+"""Number of newest samples in the search for a low-pass filter."""
 MAX_HISTORY_SAMPLES: Final = 65_536
-"""Maximum number of samples for which the per-sample coefficients are kept between two calls of ``Estimator.get``."""
+"""Maximum number of samples whose coefficients are stored between two calls of ``Estimator.get_estimate``."""
 
 
 class Estimator:
-    """Live estimator of the Allan curve and the noise coefficients of one device.
+    """Live estimator of the Allan deviations and noise coefficients of one device.
 
     Parameters
     ----------
@@ -66,12 +59,12 @@ class Estimator:
     tau : TauGrid
         Grid of averaging times, or a tuple of averaging times in seconds.
     every_sample : bool
-        True to update the coefficients after every sample, and not only at each call of ``get``.
+        True to fit the coefficients after every sample. False to fit them in ``get_estimate`` only.
 
     Raises
     ------
     ConfigError
-        If no τ of the tuple lies between one sample and half the window.
+        If every averaging time is shorter than one sample or longer than half the window.
     """
 
     def __init__(self, rate_hz: float, window_s: float, tau: TauGrid = "octave", every_sample: bool = False) -> None:
@@ -81,7 +74,7 @@ class Estimator:
         factors = cluster_sizes(length, rate_hz, tau)
         spans = display_spans(factors, rate_hz, length)
         self._m = factors.size
-        # The first m rows are fitted. The next m rows are only displayed.
+        # The first m rows are used for the fit, and the other m rows for the display.
         rows, lengths = np.tile(factors, 2), np.concatenate([np.full(self._m, length), spans])
         self._window = AllanWindow(length, rows, lengths)
         self._factors = factors
@@ -89,13 +82,13 @@ class Estimator:
         self._tables = AxisCovarianceTables(factors, length)
         self._spans = PerTauSpanDegreesOfFreedom(factors, spans, self._design.columns)
         self._entered: NDArray[np.bool_] = np.zeros((5, 6), np.bool_)
-        self._lengths = np.zeros(6, np.int64)  # samples in the window since the last restart of each axis
+        self._lengths = np.zeros(6, np.int64)  # number of samples in the window since the last restart of each axis
         self._refit = ContinuousRefit(self._window, self._m, self._tables) if every_sample else None
         self._history: deque[PerSampleCoefficients] = deque()
         self._history_samples = 0  # total number of samples in ``_history``
         self._total_hadamard = LiveTotalAndHadamard(self._window)
         self._theta = np.full((5, 6), np.nan)  # squared coefficients of the newest fit
-        # the curves that the five terms do not explain
+        # axes whose Allan variance the five noise terms do not explain
         self._contradicting: list[tuple[CovarianceTable, MeasuredCurve] | None] = [None] * 6
         self._low_passes: list[LowPass | None] = [None] * 6
         self._search_axis = 0  # axis of the current search for a low-pass filter
@@ -104,17 +97,17 @@ class Estimator:
         self._newest_ns = 0
 
     @property
-    def samples(self) -> int:
-        """Number of samples received since the start, including the samples before a reset."""
+    def samples_received(self) -> int:
+        """Total number of received samples. ``empty_window`` does not change this number."""
         return self._samples
 
     @property
     def samples_in_window(self) -> int:
-        """Number of samples in the window, including missing ones."""
+        """Number of samples in the window, including missing samples."""
         return self._window.samples_in_window
 
     @property
-    def window_samples(self) -> int:
+    def window_length_samples(self) -> int:
         """Number of samples in the full window."""
         return self._window.length
 
@@ -122,10 +115,10 @@ class Estimator:
         """Return a copy of the samples in the window."""
         return copy_window(self._window, self.rate_hz)
 
-    def update(self, samples: SampleBlock) -> None:
-        """Advance the window by the missing samples before a block, then by the block."""
+    def add_samples(self, samples: SampleBlock) -> None:
+        """Add a block of samples, and the missing samples before the block, to the window."""
         if samples.lost > self._window.length:
-            self.reset()
+            self.empty_window()
         elif samples.lost:
             self._window.skip(samples.lost)
             self._lengths += samples.lost
@@ -145,83 +138,83 @@ class Estimator:
         self._samples += len(samples)
         self._newest_ns = int(samples.t_ns[-1])
 
-    def reset(self) -> None:
-        """Empty the window."""
+    def empty_window(self) -> None:
+        """Remove all samples from the window."""
         self._window.reset()
         self._lengths[:], self._theta[:] = 0, np.nan
         self._entered[:] = False
         if self._refit is not None:
             self._refit.reset()
 
-    def restart(self, axis: int, samples: int) -> None:
-        """Discard all but the newest samples of one axis, because its noise has changed.
+    def restart_axis(self, axis: int, samples_to_keep: int) -> None:
+        """Discard old samples of one axis after a change of the noise.
 
         Parameters
         ----------
         axis : int
             Index into ``AXES``.
-        samples : int
+        samples_to_keep : int
             Number of newest samples to keep.
         """
-        self._window.keep_newest(axis, samples)
-        self._lengths[axis] = min(samples, self._lengths[axis])
+        self._window.keep_newest(axis, samples_to_keep)
+        self._lengths[axis] = min(samples_to_keep, self._lengths[axis])
         self._entered[:, axis], self._theta[:, axis] = False, np.nan
         if self._refit is not None:
             self._refit.restart(axis)
 
     def fit_state(self) -> tuple[NDArray[np.bool_], Floats]:
-        """Return the terms in the newest fit and the squared coefficients θ in SI, both of shape (5, 6).
+        """Return the fitted noise terms and the squared coefficients in SI units.
 
-        ``restore_fit`` accepts these arrays as the start of the next fit.
+        Both arrays have the shape (5, 6). ``restore_fit`` accepts both arrays.
         """
         return (self._entered if self._refit is None else self._refit.entered).copy(), self._theta.copy()
 
-    def restore_fit(self, entered: NDArray[np.bool_], theta: Floats) -> None:
-        """Use a fit from before a restart of the program as the start, and repeat the fit until it converges.
+    def restore_fit(self, terms_in_fit: NDArray[np.bool_], theta: Floats) -> None:
+        """Continue with a fit from before a restart of the program.
 
-        The threshold to drop a term is lower than the threshold to add a term, so the result depends on the previous
-        fit. A live fit recomputes the weights only once, so several fits are necessary.
+        The fit is repeated until convergence, because a live fit updates the weights only once. The result depends on
+        the previous fit, because the threshold for dropping a term is lower than the threshold for adding a term.
 
         Parameters
         ----------
-        entered : ndarray of bool, shape (5, 6)
-            True for each term that was in the fit.
+        terms_in_fit : ndarray of bool, shape (5, 6)
+            True for each noise term in the fit.
         theta : ndarray of float64, shape (5, 6)
             Squared coefficients Q², N², B², K², R² in SI.
         """
-        self._entered, self._theta = entered.copy(), theta.copy()
+        self._entered, self._theta = terms_in_fit.copy(), theta.copy()
         if self._window.samples_in_window >= MIN_SAMPLES:
             for _ in range(SETTLING_FITS):
-                self.get()
+                self.get_estimate()
 
     def refine_rate(self, rate_hz: float) -> None:
         """Set a more accurate sample rate.
 
-        The cluster sizes in samples stay the same. τ and the units are recomputed.
+        Cluster sizes in samples do not change. Averaging times in seconds and the units of the coefficients change.
         """
         self.rate_hz = rate_hz
         self.window_s = self._window.length / rate_hz
         self._design = make_design(self._factors, rate_hz)
 
-    def get(self, fitted: bool = True) -> Estimate:
-        """Return the Allan curve of the window and the coefficients fitted to it.
+    def get_estimate(self, fit_coefficients: bool = True) -> Estimate:
+        """Return the Allan deviations of the window and the fitted noise coefficients.
 
         Parameters
         ----------
-        fitted : bool
-            False to return the deviations without a fit.
+        fit_coefficients : bool
+            False to compute the Allan deviations without a fit.
 
         Raises
         ------
         NotReady
-            If the window holds fewer than ``MIN_SAMPLES`` samples.
+            If the window contains fewer than ``MIN_SAMPLES`` samples.
         """
         n = self._window.samples_in_window
         if n < MIN_SAMPLES:
             raise NotReady(f"{n} of at least {MIN_SAMPLES} samples")
         avar, terms = self._window.avar(), self._window.terms()
         own, recent = slice(0, self._m), slice(self._m, None)
-        result = self._fit(avar[own], terms[own]) if fitted else empty_fit(avar[own])
+        result = self._fit(avar[own], terms[own]) if fit_coefficients else empty_fit(avar[own])
         curve = self._curve(avar[own], terms[own], result.edf, n)
         quick_edf = self._spans.edf(result.theta, self.rate_hz, terms[recent])
         quick = self._curve(avar[recent], terms[recent], quick_edf, n)
@@ -234,15 +227,12 @@ class Estimator:
         )  # fmt: skip
 
     def step_slow_statistics(self) -> tuple[TotalCurve, HadamardCurve] | None:
-        """Run one step of the slow computations.
-
-        The slow computations are the total and Hadamard deviations (``live_total_and_hadamard``) and the search for the
-        low-pass filter of the sensor.
+        """Run one step of the total deviation, the Hadamard deviation and the search for a low-pass filter.
 
         Returns
         -------
         tuple of TotalCurve and HadamardCurve, or None
-            Both curves if this step has completed a round, otherwise None.
+            Total and Hadamard deviations if the step completes the computation, otherwise None.
         """
         rounds = self._total_hadamard.rounds
         self._total_hadamard.step()
@@ -254,10 +244,7 @@ class Estimator:
         )
 
     def _fit(self, avar: Floats, terms: Ints) -> Fit:
-        """Fit all axes with a full history in one call, and fit each restarted axis separately.
-
-        The covariances depend on the number of samples of an axis.
-        """
+        """Fit restarted axes separately, because the covariances depend on the number of samples."""
         lengths = np.minimum(self._lengths, self._window.samples_in_window)
         slope, slopes = self._window.slopes_of_axes_and_taus(lengths)
         before = self._entered if self._refit is None else self._refit.entered
@@ -284,10 +271,6 @@ class Estimator:
         return result
 
     def _step_low_pass_search(self) -> None:
-        """Run one part of the low-pass search of one axis.
-
-        When a search ends, the next search is for an axis whose curve the five terms do not explain.
-        """
         if self._search is not None:
             try:
                 next(self._search)
@@ -308,6 +291,5 @@ class Estimator:
             self._low_passes[self._search_axis] = None
 
     def _curve(self, avar: Floats, terms: Ints, edf: Floats, n: int) -> AllanCurve:
-        """Build an ``AllanCurve`` with confidence intervals."""
         lo, hi = deviation_intervals(avar, edf)
         return AllanCurve(self._factors / self.rate_hz, self._factors, avar, terms, edf, lo, hi, n)

@@ -1,19 +1,14 @@
-"""Number of missing samples in a recording, determined from the time stamps.
+"""Number of missing samples in each gap of a recording, determined from the time stamps.
 
-A missing sample shifts all later time stamps permanently. A late sample has no effect on later time stamps. The live
-clock treats every time step of two periods as a gap, because later time stamps are unknown. In a recording, the time
-stamps after the gap are known as well.
+A missing sample delays all later time stamps by one period, whereas a late sample does not affect later time stamps.
+For each gap, the median delays of ``ROWS_BESIDE_GAP`` rows before and after the gap are compared. The increase of the
+median delay, rounded to whole periods, is the number of missing samples. The number is limited to the number that the
+clock reported.
 
-For each gap, the time stamps on both sides are compared with those of a constant rate. The medians over 60 rows
-tolerate a few late rows. If a sender was delayed, it may need many rows to catch up, at most twice the number of rows
-that seemed to be missing. The range after the gap is extended accordingly. If gaps follow each other closely, the
-sender may still be delayed after a gap. The lowest median in the range is then used, because no sample is early. The
-number of missing samples is the shift of the time stamps, rounded to a whole number between zero and the number claimed
-by the clock.
+A delayed sender may send many late rows. The range after the gap is therefore extended by twice the number of rows that
+seem to be missing. If the range contains other gaps, the smallest median delay is used.
 
-The rate is the median over stretches without a gap, so missing and late samples do not bias the rate. If the rate
-varies by half a percent, the time stamps within the range shift by a quarter of a period. Such a shift does not count
-as a missing sample.
+The sample period is the median over stretches without a gap, so missing samples do not bias the period.
 """
 
 from typing import Final
@@ -29,42 +24,38 @@ ROWS_BESIDE_GAP: Final = 60
 Some bus adapters send twenty rows late at once.
 """
 MIN_SHIFT_PERIODS: Final = 2.0 / 3.0
-"""Minimum shift in periods that counts as missing samples. Time stamps may shift by half a period without a loss.
-"""
+"""Minimum increase of the delay, in periods, that counts as missing samples."""
 MAX_CATCH_UP_ROWS: Final = 10_000
 """Maximum number of rows that a delayed sender may need to catch up."""
 MAX_RATE_VARIATION: Final = 0.01
-"""Maximum relative variation of the rate after a gap.
+"""Maximum relative variation of the sample rate after a gap.
 
-A larger decrease of the median shows that a sender was delayed.
+A larger decrease of the median delay indicates a delayed sender.
 """
 STRETCH_ROWS: Final = (256, 128, 64, 32, 16, 8, 4, 2)
-"""Distances in rows between two time stamps for the rate. The longest distance with enough stretches is used."""
+"""Distances in rows between two time stamps for the sample rate, from preferred to last."""
 MIN_STRETCH_RATIO: Final = 4
-"""A distance is used if at least one row in this number of rows begins a stretch without a gap."""
+"""A distance is used if at least one in this many rows starts a stretch without a gap."""
 
 
-def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -> Ints:
-    """Return the number of samples that are missing before each gap.
-
-    The clock also reports late samples as missing.
+def count_missing_samples(t_ns: Ints, rows_after_gaps: Ints, missing_by_clock: Ints, rows_after_jumps: Ints) -> Ints:
+    """Return the number of missing samples before each gap.
 
     Parameters
     ----------
     t_ns : ndarray of int64, shape (n,)
         Time stamps in nanoseconds, in the order of the rows.
-    rows : ndarray of int64, shape (k,)
-        Rows after the gaps, ascending.
-    claimed : ndarray of int64, shape (k,)
-        Number of samples that the clock reports as missing before each of ``rows``.
-    breaks : ndarray of int64
-        Rows after jumps of the time stamps and after long pauses. Time stamps before and after such a row are not
-        compared.
+    rows_after_gaps : ndarray of int64, shape (k,)
+        Indices of the first row after each gap, in ascending order.
+    missing_by_clock : ndarray of int64, shape (k,)
+        Number of missing samples before each gap, as reported by the clock. The clock counts late samples as missing.
+    rows_after_jumps : ndarray of int64
+        Indices of rows after a jump of the time stamps. Only rows between two jumps are compared.
 
     Returns
     -------
     ndarray of int64, shape (k,)
-        Number of missing samples, at most ``claimed``.
+        Number of missing samples, at most ``missing_by_clock``.
 
     >>> t_ns = 10_000_000 * np.arange(300)
     >>> t_ns[100:110] += 10_000_000  # late
@@ -72,17 +63,16 @@ def count_missing_samples(t_ns: Ints, rows: Ints, claimed: Ints, breaks: Ints) -
     >>> count_missing_samples(t_ns, np.array([100, 200]), np.array([1, 1]), np.array([], int)).tolist()
     [0, 1]
     """
-    period_ns = _period_ns(t_ns, np.concatenate([rows, breaks]))
+    period_ns = _period_ns(t_ns, np.concatenate([rows_after_gaps, rows_after_jumps]))
     if not period_ns > 0.0:
-        return claimed
-    # relative to the first time stamp, because a double cannot hold Unix time and fractions of a period
+        return missing_by_clock
+    # A double cannot represent Unix time with a resolution of a fraction of a period.
     late = (t_ns - t_ns[0]) / period_ns - np.arange(t_ns.size)
-    ends = np.unique(np.concatenate([[0], rows, breaks, [t_ns.size]]))
-    return _count_missing(late, rows, claimed, ends, np.searchsorted(ends, rows))
+    ends = np.unique(np.concatenate([[0], rows_after_gaps, rows_after_jumps, [t_ns.size]]))
+    return _count_missing(late, rows_after_gaps, missing_by_clock, ends, np.searchsorted(ends, rows_after_gaps))
 
 
 def _period_ns(t_ns: Ints, edges: Ints) -> float:
-    """Return the median period over stretches without an edge, or over all steps if there are too few stretches."""
     part = np.zeros(t_ns.size, np.int64)
     part[edges] = 1
     part = np.cumsum(part)
@@ -97,9 +87,9 @@ def _period_ns(t_ns: Ints, edges: Ints) -> float:
 
 @compiled
 def _count_missing(late: Floats, rows: Ints, claimed: Ints, ends: Ints, at: Ints) -> Ints:
-    """Count the missing samples before each gap. ``late`` [n] is the delay of each row in periods.
+    """Count the missing samples before each gap.
 
-    Gap k begins at row ``ends[at[k]]``.
+    ``late`` [n] is the delay of each row in periods. Gap k begins at row ``ends[at[k]]``.
     """
     holes = rows.size
     reach = np.empty(holes, np.int64)

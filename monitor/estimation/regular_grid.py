@@ -1,13 +1,11 @@
-"""Resampling of a recording to a regular grid, with the clock that also stamps live samples.
+"""Resampling of a recording to a regular time grid.
 
-Missing samples become NaN. The clock treats every time step of two periods as a gap. In a recording, each gap is
-checked again, because the sample after the gap may only have been late (``missing_sample_count``).
+The clock for live samples also assigns the times of recorded samples. Missing samples become NaN.
+``missing_sample_count`` then corrects the number of missing samples, because the clock cannot distinguish a late sample
+from a missing one.
 
-Rows with the values and the time stamp of an earlier row are removed. Rows that repeat the previous values at a later
-time are kept, because the sensor returned these values. A stated rate is used even if it contradicts the time stamps.
-
-Irregularities of the time stamps and the values are returned as notes, with at most ``MAX_CLOCK_NOTES`` notes of the
-clock.
+Rows with the same values and the same time stamp as an earlier row are removed. Rows that repeat the previous values at
+a later time are kept. A sample rate stated by the user has priority over the time stamps.
 """
 
 from collections.abc import Sequence
@@ -23,37 +21,37 @@ from drivers.timing.arrival_timeline import JUMP_S
 from drivers.timing.sample_clock import SampleClock
 from drivers.timing.sender_times import FORWARD_JUMP_S
 from monitor.common.units import format_rate, format_two_digits
-from monitor.estimation.detection.coarse_quantization import QuantizationStep, find_coarse_axes
-from monitor.estimation.detection.repeated_share import estimate_repeated_share
+from monitor.estimation.detection.coarse_quantization import QuantizationStep, find_coarsely_quantized_axes
+from monitor.estimation.detection.repeated_share import estimate_repeated_row_share
 from monitor.estimation.missing_sample_count import count_missing_samples
 
 MIN_RATE_DEVIATION: Final = 0.002
-"""Smallest reported deviation of the stated rate from the time stamps, relative to the rate."""
+"""Minimum reported deviation of the stated rate from the time stamps, relative to the rate."""
 LARGE_RATE_DEVIATION: Final = 0.02
 """Relative deviation of the stated rate that is reported even if the time stamps are inaccurate."""
 STEP_TOLERANCE: Final = 0.02
-"""Relative difference up to which time steps count as equal."""
+"""Maximum relative difference of equal time steps."""
 MAX_CLOCK_NOTES: Final = 10
-"""Maximum number of notes of the clock. Further notes are counted."""
+"""Maximum number of notes of the clock."""
 MIN_REPEATED_SHARE: Final = 0.01
-"""Shares of repeated rows below this value are not reported."""
+"""Minimum reported share of repeated rows."""
 MAX_GAP_SAMPLES: Final = 1_000_000
-"""Longest gap in samples that is kept at full length, at 48 bytes per sample.
+"""Maximum number of missing samples that are stored for one gap, at 48 bytes per sample.
 
-A longer pause is replaced by one missing sample, which excludes all differences across the pause.
+A longer gap is replaced by one missing sample, which excludes all differences across the gap.
 """
 SEGMENTS: Final = 8
-"""Number of segments of a recording, whose different rates give the standard error of the mean rate."""
+"""Number of segments of a recording. The rates of the segments give the standard error of the mean rate."""
 RATE_SIGMA: Final = 5.0
-"""Number of standard errors of the mean rate beyond which a deviation is significant."""
+"""Minimum significant deviation of the rate, in standard errors of the mean rate."""
 UNIT_TOLERANCE: Final = 0.05
-"""A time step counts as a whole number of units if it deviates by less than this share of the unit."""
+"""Maximum deviation of a time step from a multiple of the time unit, as a share of the unit."""
 UNEVEN_STEP_SHARE: Final = 0.5
-"""Share of a period. Time steps are reported as uneven if the outer fifth of them deviates by more than this."""
+"""Minimum reported deviation of the outer fifth of the time steps, as a share of a period."""
 
 
 def resample_to_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[Floats, float, list[str]]:
-    """Place the samples of a recording on a grid of constant rate, with NaN for missing samples.
+    """Place the samples of a recording on a regular time grid, with NaN for missing samples.
 
     Parameters
     ----------
@@ -65,7 +63,7 @@ def resample_to_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tu
     Returns
     -------
     values : ndarray of float64, shape (n, 6)
-        Samples in rad/s and m/s². The array may share memory with ``blocks`` and must not be modified.
+        Samples in rad/s and m/s². Do not modify the array, which may share memory with ``blocks``.
     rate_hz : float
         Sample rate in Hz.
     notes : list of str
@@ -78,7 +76,7 @@ def resample_to_grid(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tu
 def resample_with_temperature(
     blocks: Sequence[SampleBlock], rate_hz: float | None
 ) -> tuple[Floats, Floats, float, list[str]]:
-    """Do the same as ``resample_to_grid``, and also return the temperature.
+    """Place the samples and the temperatures of a recording on a regular time grid.
 
     Parameters
     ----------
@@ -90,7 +88,7 @@ def resample_with_temperature(
     values, rate_hz, notes
         As for ``resample_to_grid``.
     temperature_c : ndarray of float64, shape (n,)
-        Second result. Temperature in °C; NaN where not measured and for missing samples.
+        Second result: temperature in °C; NaN means not measured.
     """
     stamped, lost, values, rate, notes = _resample(blocks, rate_hz)
     missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost).tolist()
@@ -105,15 +103,15 @@ def resample_with_temperature(
 def _resample(
     blocks: Sequence[SampleBlock], rate_hz: float | None
 ) -> tuple[list[SampleBlock], Ints, Floats, float, list[str]]:
-    """Return the stamped blocks, the missing samples before each block, the samples, the rate, and all notes."""
     stamped, lost, rate, notes = _stamp(blocks, rate_hz)
     values = _place_on_grid(stamped, lost)
-    notes += _repeated_notes(values) + _resolution_notes(find_coarse_axes(values)) + _missing_notes(lost, rate)
+    notes += (
+        _repeated_notes(values) + _resolution_notes(find_coarsely_quantized_axes(values)) + _missing_notes(lost, rate)
+    )
     return stamped, lost, values, rate, notes
 
 
 def _stamp(blocks: Sequence[SampleBlock], rate_hz: float | None) -> tuple[list[SampleBlock], Ints, float, list[str]]:
-    """Return the stamped blocks, the missing samples before each block, the rate, and the notes on the time stamps."""
     clock = SampleClock(SenderTimedFormat(), rate_hz)
     stamped = [one for samples in blocks for one in clock.assign_times(samples)]
     clock_notes = [event.text for event in clock.take_events(ended=True)]
@@ -135,7 +133,7 @@ def _count_missing(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, in
     lost = np.array([samples.lost for samples in stamped], np.int64)
     short = (lost > 0) & (lost <= MAX_GAP_SAMPLES)
     rows = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
-    short &= rows > 0  # the time before the first sample is unknown
+    short &= rows > 0
     if not short.any():
         return lost, 0
     steps = np.diff(t_ns)
@@ -147,7 +145,7 @@ def _count_missing(stamped: Sequence[SampleBlock], t_ns: Ints) -> tuple[Ints, in
 
 
 def _place_on_grid(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
-    """Return all rows in one array [n, 6] with NaN for missing samples. Contiguous blocks are not copied."""
+    """Return all samples in one array [n, 6]. Contiguous blocks are not copied."""
     missing = np.where(lost > MAX_GAP_SAMPLES, 1, lost)
     if not missing.any() and (whole := _contiguous([samples.values for samples in stamped])) is not None:
         return whole
@@ -162,7 +160,7 @@ def _place_on_grid(stamped: Sequence[SampleBlock], lost: Ints) -> Floats:
 
 
 def _contiguous(parts: Sequence[Floats]) -> Floats | None:
-    """Return the rows of the common base array if the parts are contiguous in this array, otherwise None."""
+    """Return the parts as a view of their common base array, or None if the parts are not contiguous."""
     whole = parts[0].base
     if len(parts) == 1:
         return parts[0]
@@ -180,12 +178,10 @@ def _contiguous(parts: Sequence[Floats]) -> Floats | None:
 
 
 def _address(array: Floats) -> int:
-    """Return the memory address of the first element."""
     return int(array.__array_interface__["data"][0])
 
 
 def _missing_notes(lost: Ints, rate_hz: float) -> list[str]:
-    """Format the notes on long pauses and on missing samples."""
     long, short = lost[lost > MAX_GAP_SAMPLES], lost[(lost > 0) & (lost <= MAX_GAP_SAMPLES)]
     notes = [
         f"a pause of {n / rate_hz:.6g} s is too long to be kept and is replaced by one missing sample" for n in long
@@ -198,7 +194,6 @@ def _missing_notes(lost: Ints, rate_hz: float) -> list[str]:
 
 
 def _late_notes(late: int) -> list[str]:
-    """Format the note on late samples."""
     if not late:
         return []
     times = "once" if late == 1 else f"{late} times"
@@ -206,8 +201,7 @@ def _late_notes(late: int) -> list[str]:
 
 
 def _repeated_notes(values: Floats) -> list[str]:
-    """Format the note on rows that repeat the previous row."""
-    share = estimate_repeated_share(values)
+    share = estimate_repeated_row_share(values)
     if share < MIN_REPEATED_SHARE:
         return []
     percent = 100.0 * share
@@ -218,7 +212,6 @@ def _repeated_notes(values: Floats) -> list[str]:
 
 
 def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
-    """Format the notes on coarse resolution, grouped by unit and step size."""
     alike: dict[str, list[QuantizationStep]] = {}
     for one in found:
         alike.setdefault(format_rate(AXES[one.axis], one.step), []).append(one)
@@ -235,7 +228,6 @@ def _resolution_notes(found: Sequence[QuantizationStep]) -> list[str]:
 
 
 def _step_notes(steps: Ints, progress: tuple[Floats, Floats] | None, rate_hz: float) -> list[str]:
-    """Format the notes on uneven time steps and on a rate that contradicts the time stamps."""
     if not steps.size:
         return []
     if progress is None:
@@ -253,7 +245,6 @@ def _step_notes(steps: Ints, progress: tuple[Floats, Floats] | None, rate_hz: fl
 
 
 def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
-    """Format the note on uneven time steps, or on the resolution of the time stamps that causes them."""
     if _is_even(steps):
         return []
     low, middle, high = (np.quantile(steps, [0.1, 0.5, 0.9]) / NS_PER_S).tolist()
@@ -271,19 +262,16 @@ def _uneven_notes(steps: Ints, rate_hz: float) -> list[str]:
 
 
 def _is_even(steps: Ints) -> bool:
-    """Return True if all steps are equal within ``STEP_TOLERANCE``.
-
-    With a wrong time stamp, the difference of two steps may exceed int64, so it is computed in floating point.
-    """
+    """Return True if all time steps are equal within ``STEP_TOLERANCE``. Integer differences could overflow."""
     return float(steps.max()) - float(steps.min()) <= STEP_TOLERANCE * float(steps.min())
 
 
 def _unit_s(steps: Ints) -> float:
-    """Return the time unit in seconds of which all steps are whole multiples, or 0 if there is none."""
+    """Return the largest time unit in seconds that divides all time steps, or 0 if there is none."""
     on = steps[steps > 0]
     if not on.size:
         return 0.0
-    # a mean, because a third of a second is not a whole number of nanoseconds
+    # The mean is more accurate than a single step, because time stamps are rounded to nanoseconds.
     unit = float(on[on < 1.5 * on.min()].mean())
     whole = np.abs(steps / unit - np.rint(steps / unit)) < UNIT_TOLERANCE
     return unit / NS_PER_S if whole.all() else 0.0
@@ -292,9 +280,9 @@ def _unit_s(steps: Ints) -> float:
 def _count_and_time(
     stamped: Sequence[SampleBlock], t_ns: Ints, lost: Ints, steps: Ints
 ) -> tuple[Floats, Floats] | None:
-    """Return the number of samples and the time in seconds from the start to the end of each segment.
+    """Return the cumulative number of samples and the elapsed time in seconds at the segment boundaries.
 
-    The number includes missing samples. Jumps of the time stamps are left out. The result is None if no time passes.
+    The number includes missing samples. Jumps of the time stamps are excluded. The result is None if no time passes.
     """
     rows = np.unique(np.linspace(0, steps.size, SEGMENTS + 1).astype(np.int64))
     starts = np.cumsum([0, *(len(samples) for samples in stamped[:-1])])
@@ -303,7 +291,6 @@ def _count_and_time(
     jumps = np.zeros(0, np.int64)
     if low <= -JUMP_S * NS_PER_S or high >= FORWARD_JUMP_S * NS_PER_S:
         jumps = np.flatnonzero((steps <= -JUMP_S * NS_PER_S) | (steps >= FORWARD_JUMP_S * NS_PER_S)) + 1
-    # The time and the samples of a jump are not counted.
     over = np.concatenate([[0], np.cumsum(steps[jumps - 1])])[np.searchsorted(jumps, rows, "right")]
     at_jumps = np.where(np.isin(jumps, starts), lost[np.searchsorted(starts, jumps, "right") - 1], 0) + 1
     left_out = np.concatenate([[0], np.cumsum(at_jumps)])[np.searchsorted(jumps, rows, "right")]
@@ -313,7 +300,6 @@ def _count_and_time(
 
 
 def _rate(came: Floats, passed_s: Floats) -> tuple[float, float]:
-    """Return the mean rate in Hz and the relative standard error, which is 1 if there are too few samples."""
     mean_hz = float(came[-1] / passed_s[-1])
     if came[-1] < 2 * SEGMENTS or (np.diff(came) <= 0.0).any():
         return mean_hz, 1.0
@@ -322,7 +308,6 @@ def _rate(came: Floats, passed_s: Floats) -> tuple[float, float]:
 
 
 def _mean_rate(progress: tuple[Floats, Floats] | None) -> float:
-    """Return the rate of a recording without a stated rate."""
     if progress is None:
         raise NotReady(
             "the times of the recording do not increase, so the rate is unknown; state the rate with --rate HZ"

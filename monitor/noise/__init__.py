@@ -1,1 +1,1 @@
-"""Noise models of an IMU: effects with their Allan variance, spectrum and time series."""
+"""Noise models of an IMU, with the Allan variance, the spectrum and the simulation of all effects."""

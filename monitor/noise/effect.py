@@ -1,17 +1,14 @@
 """Base classes of the effects of a noise model.
 
-An effect is a frozen dataclass of parameters with units. There are four kinds of effects:
+An effect is a frozen dataclass of parameters. There are four kinds of effects:
 
-- A ``Source`` adds to the rate of its axis. The spectrum and the Allan variance of a source describe the sampled series
-  that the source simulates, so fit, simulation and comparison use the same physics.
-- A ``Leak`` adds the measurement of another axis times a coefficient.
-- ``NoiseStep`` changes the size of white noise.
-- A ``Transform`` acts on the sum of sources and leaks, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
+- A ``Source`` adds noise or a bias to an axis.
+- An ``AxisLeak`` adds the measurement of another axis times a coefficient.
+- ``NoiseStep`` multiplies the white noise of an axis.
+- A ``Transform`` modifies the sum of sources and leaks, in the order of ``monitor.noise.effects.TRANSFORM_ORDER``.
 
-``start`` begins an endless series. A ``NoiseSeries`` adds samples to a block. A ``RunningTransform`` changes a block
-in place. The samples depend only on the random generator and on the index of the sample, not on how the series is
-divided into blocks. The memory of a series does not grow. No effect does I/O, reads a clock or keeps global random
-state.
+Simulated samples depend only on the random generator and the sample index, not on the division into blocks. Effects do
+not read files or clocks, and have no global state.
 """
 
 from abc import ABC, abstractmethod
@@ -29,102 +26,102 @@ from drivers.number_ranges import DELAY_S, EFFECT_FREQUENCY_HZ, PARAMETER, Numbe
 from monitor.noise.spectrum import Spectrum
 
 QUANTITIES: Final = {"s": DELAY_S, "Hz": EFFECT_FREQUENCY_HZ, "1/s": EFFECT_FREQUENCY_HZ}
-"""Unit of a parameter -> its quantity. All other parameters use PARAMETER."""
+"""Number range of the parameters with a given unit. Parameters with other units use ``PARAMETER``."""
 MAX_EVENTS_PER_SAMPLE: Final = 1000.0
-"""Largest mean number of random events per sample. Each event takes time and memory."""
+"""Maximum mean number of random events per sample, which limits time and memory."""
 GYROS, ACCELEROMETERS = AXES[:3], AXES[3:]
 
 
 @dataclass(slots=True)
 class SampleBlockContext:
-    """Context of the block of samples that is being simulated."""
+    """Sample index, temperature and work array of the simulated block."""
 
     first: int  # index of the first sample, counted from the start of the stream
-    temperature_c: Floats  # [n] °C; NaN if the model has no temperature
-    scratch: Floats  # [n] work array, free for use during a call
+    temperature_c: Floats  # [n] °C; NaN without a temperature
+    scratch: Floats  # [n] work array with arbitrary content
 
 
 class RunningEffect:
-    """Effect that is being simulated on one axis."""
+    """Simulated effect of one axis."""
 
-    def drawn_values(self) -> dict[str, Any]:
-        """Return the random values drawn so far that the parameters do not contain."""
+    def drawn_random_values(self) -> dict[str, Any]:
+        """Return the random values drawn so far, such as phases and event times."""
         return {}
 
 
 class NoiseSeries(RunningEffect, ABC):
-    """Endless time series of a source."""
+    """Simulated time series of a source."""
 
     @abstractmethod
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
-        """Add the next ``values.size`` samples (at least one) to the values, in the unit of the axis.
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
+        """Add the next samples of the series to ``values``, in the unit of the axis.
 
         Parameters
         ----------
-        values : ndarray, shape (n,), float64
-            Sum of the sources of the axis. It is updated in place.
+        values : ndarray of float64, shape (n,)
+            Sum of the sources of the axis, updated in place. The array must not be empty.
         block : SampleBlockContext
             Index, temperature and work array of the block.
         """
 
-    def draw(self, n: int, first: int = 0) -> Floats:
-        """Return the next samples of this series alone, without a temperature.
+    def draw_samples(self, n: int, first_index: int = 0) -> Floats:
+        """Return the next samples of the series.
 
         Parameters
         ----------
         n : int
             Number of samples.
-        first : int
+        first_index : int
             Index of the first sample, counted from the start of the stream.
         """
         values = np.zeros(n)
         if n:
-            self.add(values, SampleBlockContext(first, np.full(n, np.nan), np.empty(n)))
+            self.add_next_samples(values, SampleBlockContext(first_index, np.full(n, np.nan), np.empty(n)))
         return values
 
 
 class StatelessSeries(NoiseSeries):
-    """Series without a state. A function adds the samples of a block."""
+    """Time series that a function of the block computes."""
 
     def __init__(self, function: Callable[[Floats, SampleBlockContext], object]) -> None:
         self._function = function
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
-        """Call the function."""
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
+        """Call the function with ``values`` and ``block``."""
         self._function(values, block)
 
 
 class RunningTransform(RunningEffect, ABC):
-    """Transform that runs on one axis."""
+    """Simulated transform of one axis."""
 
     @abstractmethod
-    def apply(self, values: Floats) -> None:
-        """Transform the next values [n] in place."""
+    def transform_in_place(self, values: Floats) -> None:
+        """Transform the next samples [n] in place."""
 
 
 class MemorylessTransform(RunningTransform):
-    """Transform whose output depends only on the present sample. A function changes the values in place."""
+    """Transform whose output depends only on the current sample."""
 
     def __init__(self, function: Callable[[Floats], object]) -> None:
         self._function = function
 
-    def apply(self, values: Floats) -> None:
-        """Call the function."""
+    def transform_in_place(self, values: Floats) -> None:
+        """Call the function with ``values``."""
         self._function(values)
 
 
 class ParameterTable:
-    """Table of parameters in a model file. A subclass is a frozen dataclass with fields from ``parameter``.
+    """Table of parameters in a model file. Subclasses are frozen dataclasses with ``parameter_field`` fields.
 
     Raises
     ------
     ConfigError
-        If a parameter is not a finite number, or lies outside the range of its field.
+    If a parameter is not a finite number or is outside the allowed range.
     """
 
     __slots__ = ()
 
-    name: ClassVar[str]  # name in model files, which is the name of the module
+    name: ClassVar[str]  # name in model files, equal to the module name
 
     def __init_subclass__(cls) -> None:
         cls.name = cls.__module__.rpartition(".")[2]
@@ -138,22 +135,22 @@ class ParameterTable:
 
 
 class Effect(ParameterTable, ABC):
-    """Effect on one axis. The name of an effect is the name of its module."""
+    """Effect on one axis."""
 
     __slots__ = ()
 
-    description: ClassVar[str]  # one sentence that explains the effect to users
+    description: ClassVar[str]  # description of the effect for users, one sentence
 
     @property
     def events_hz(self) -> float:
-        """Return the mean number of random events per second."""
+        """Mean number of random events per second."""
         return 0.0
 
     def check_axis(self, axis: str) -> None:
-        """Raise ConfigError if the effect cannot be on this axis."""
+        """Raise ConfigError if the effect is not possible on the given axis."""
 
     def check_rate(self, rate_hz: float) -> None:
-        """Raise ConfigError if samples at ``rate_hz`` cannot show the effect."""
+        """Raise ConfigError if the effect cannot be simulated at the given sample rate."""
         for f in fields(self):  # type: ignore[arg-type]
             value = getattr(self, f.name)
             if f.metadata.get("below_nyquist") and not value < 0.5 * rate_hz:
@@ -168,7 +165,7 @@ class Effect(ParameterTable, ABC):
 
 
 class Source(Effect):
-    """Effect that adds to the rate."""
+    """Effect that adds noise or a bias to an axis."""
 
     __slots__ = ()
 
@@ -176,21 +173,21 @@ class Source(Effect):
 
     @abstractmethod
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return spectral density, lines, slope and Allan variance of samples at intervals of ``tau0_s`` seconds.
+        """Return the spectrum of samples with the interval ``tau0_s`` in seconds.
 
-        The spectrum is NaN if it depends on the temperature or on the length of the recording.
+        The spectrum is NaN if the temperature or the length of the recording determines the spectrum.
         """
 
     @abstractmethod
-    def start(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
-        """Return a new series.
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+        """Start a simulated time series.
 
         Parameters
         ----------
         rate_hz : float
             True sample rate, Hz.
         rng : numpy.random.Generator
-            Generator of this effect alone.
+            Random generator of the effect.
         """
 
     def avar(self, tau_s: Floats, tau0_s: float) -> Floats:
@@ -205,8 +202,8 @@ class Source(Effect):
         """
         return self.spectrum(tau0_s).avar(tau_s)
 
-    def psd(self, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return the two-sided spectral density in unit²/Hz. The density of a spectral line or a slope is zero.
+    def two_sided_psd(self, f_hz: Floats, tau0_s: float) -> Floats:
+        """Return the two-sided power spectral density in unit²/Hz, without spectral lines and slopes.
 
         Parameters
         ----------
@@ -218,11 +215,10 @@ class Source(Effect):
         return self.spectrum(tau0_s).density(f_hz)
 
 
-class Leak(Effect):
+class AxisLeak(Effect):
     """Effect that adds ``coefficient`` times the measurement of the axis ``source``.
 
-    Leaks into the source axis are left out of this measurement. Axes that leak into each other therefore need no order,
-    and there is no circular dependence.
+    The added measurement does not contain leaks into the source axis, so axes can leak into each other.
     """
 
     __slots__ = ()
@@ -232,91 +228,91 @@ class Leak(Effect):
 
 
 class Transform(Effect):
-    """Effect that acts on the sum of all sources and leaks, after the transforms that precede it."""
+    """Effect that modifies the sum of all sources and leaks of an axis."""
 
     __slots__ = ()
 
     @abstractmethod
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum after the transform. The spectrum is NaN if no formula for it is known."""
+        """Return the spectrum after the transform, or a spectrum of NaN if no formula is known."""
 
     @abstractmethod
-    def start(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
-        """Return a new running transform.
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> RunningTransform:
+        """Start a simulated transform.
 
         Parameters
         ----------
         rate_hz : float
             True sample rate, Hz.
         rng : numpy.random.Generator
-            Generator of this effect alone.
+            Random generator of the effect.
         """
 
 
-def parameter(
+def parameter_field(
     gyro_unit: str,
     accelerometer_unit: str | None = None,
     *,
     signed: bool = False,
     positive: bool = False,
-    whole: bool = False,
+    whole_number: bool = False,
     optional: bool = False,
     below_nyquist: bool = False,
-    most: float = inf,
-    quantity: NumberRange | None = None,
+    maximum: float = inf,
+    number_range: NumberRange | None = None,
 ) -> Any:
-    """Return a dataclass field with its units and its allowed range. The default range is all numbers ≥ 0.
+    """Return a dataclass field with units and an allowed range. By default, all numbers ≥ 0 are allowed.
 
     Parameters
     ----------
     gyro_unit, accelerometer_unit : str
-        SI units on the two kinds of axes. A dimensionless number has the unit "1". None means that the unit is the same
-        on both kinds of axes.
+        SI units for gyroscopes and accelerometers. The unit of dimensionless parameters is "1". With None,
+        accelerometers have the unit of gyroscopes.
     signed : bool
         True if negative values are allowed.
     positive : bool
         True if zero is not allowed.
-    whole : bool
+    whole_number : bool
         True if only whole numbers are allowed.
     optional : bool
-        True if the parameter may be absent (None).
+        True if the parameter may be None.
     below_nyquist : bool
         True if the parameter is a frequency that must be below half the sample rate.
-    most : float
+    maximum : float
         Largest allowed value.
-    quantity : NumberRange or None
-        NumberRange with the supported range. None selects the quantity by the unit.
+    number_range : NumberRange or None
+        Supported range. With None, the unit determines the range.
     """
     metadata = {
         "units": (gyro_unit, accelerometer_unit or gyro_unit),
         "signed": signed,
         "positive": positive,
-        "whole": whole,
+        "whole": whole_number,
         "optional": optional,
         "below_nyquist": below_nyquist,
-        "most": most,
-        "quantity": quantity or QUANTITIES.get(gyro_unit, PARAMETER),
+        "most": maximum,
+        "quantity": number_range or QUANTITIES.get(gyro_unit, PARAMETER),
     }
     return field(default=None, metadata=metadata) if optional else field(metadata=metadata)
 
 
 def source_axis_field() -> Any:
-    """Return a dataclass field that names another axis."""
+    """Return a dataclass field for the name of another axis."""
     return field(metadata={"units": ("axis", "axis"), "axis": True})
 
 
 def gyro_and_accel_units(table: type[ParameterTable]) -> Mapping[str, tuple[str, str]]:
-    """Return the units of every parameter of an effect: first on a gyroscope, then on an accelerometer."""
+    """Return the units of every parameter of an effect, for gyroscopes and accelerometers."""
     return {f.name: f.metadata["units"] for f in fields(table)}  # type: ignore[arg-type]
 
 
 def required_parameters(table: type[ParameterTable]) -> tuple[str, ...]:
-    """Return the parameters that a model file must give."""
+    """Return the names of the parameters without a default value."""
     return tuple(f.name for f in fields(table) if f.default is MISSING)  # type: ignore[arg-type]
 
 
-def first_sample_index(time_s: float, rate_hz: float) -> int:
-    """Return the index of the first sample at or after a time. A millionth of a sample is allowed for rounding.
+def first_sample_at_or_after(time_s: float, rate_hz: float) -> int:
+    """Return the index of the first sample at or after a time. Rounding errors of 1e-6 samples are allowed.
 
     Parameters
     ----------
@@ -329,7 +325,7 @@ def first_sample_index(time_s: float, rate_hz: float) -> int:
 
 
 def _find_mistake(value: Any, allows: Mapping[str, Any]) -> str:
-    """Return a message if the value of a parameter is not allowed, else an empty text."""
+    """Return an error message if the value is not allowed, otherwise an empty string."""
     if allows.get("axis"):
         return "" if value in AXES else f"must be one of {', '.join(AXES)}"
     if value is None and allows["optional"]:

@@ -1,9 +1,8 @@
-"""Allan variance and spectrum of processes with a geometric, real or complex autocorrelation.
+"""Allan variance and spectrum of first-order Gauss–Markov noise, random telegraph noise and resonances.
 
-The autocovariance is σ² Re φ^|n| with φ = exp(−(1/T_c − iω) τ0). A real φ gives first-order Gauss–Markov noise. A
-random telegraph signal has the same second moments. A complex φ gives a resonance. The closed forms of Allan variance
-and spectrum are exact for the samples. Near φ = 1, the closed form of the Allan variance loses digits by cancellation,
-so a series is used instead.
+The autocovariance is σ² Re φ^|n| with φ = exp(−(1/T_c − iω) τ0). A real φ describes Gauss–Markov noise, and a complex φ
+a resonance. The closed forms are exact for samples. Near φ = 1, a power series replaces the closed form of the Allan
+variance, which loses digits by cancellation.
 """
 
 from typing import Final
@@ -15,19 +14,21 @@ from drivers.data_types import Floats
 from monitor.noise.spectrum import Spectrum
 
 MAX_SERIES_ARGUMENT: Final = 1e-3
-"""Largest |τ(1/T_c − iω)| for which the series is used. At this value, the relative error of the Allan variance is
-2.5·10⁻⁴ for the series and 10⁻⁷ for the closed form."""
+"""Maximum |τ(1/T_c − iω)| for which the power series is used.
+
+At this value, the relative error of the Allan variance is 2.5·10⁻⁴ for the series and 10⁻⁷ for the closed form.
+"""
 
 
-def gauss_markov_spectrum(sigma: float, decay: complex, tau0_s: float) -> Spectrum:
-    """Return the spectrum of a process with a geometric autocorrelation.
+def gauss_markov_spectrum(sigma: float, decay_rate: complex, tau0_s: float) -> Spectrum:
+    """Return the spectrum of noise with a geometric autocorrelation.
 
     Parameters
     ----------
     sigma : float
-        Standard deviation of the process.
-    decay : complex
-        1/T_c − iω, 1/s.
+        Standard deviation of the noise.
+    decay_rate : complex
+        Complex decay rate 1/T_c − iω in 1/s.
     tau0_s : float
         Sample interval, s.
 
@@ -37,11 +38,13 @@ def gauss_markov_spectrum(sigma: float, decay: complex, tau0_s: float) -> Spectr
     >>> print(f"{gauss_markov_spectrum(0.5**0.5, 1.0, 1e-4).avar(tau)[0] ** 0.5:.3f}")  # peak: 0.437 q √T_c
     0.437
     """
-    return Spectrum(lambda f: _psd(sigma, decay, f, tau0_s), lambda tau: _avar(sigma, decay, tau, tau0_s), tau0_s)
+    return Spectrum(
+        lambda f: _psd(sigma, decay_rate, f, tau0_s), lambda tau: _avar(sigma, decay_rate, tau, tau0_s), tau0_s
+    )
 
 
 def _avar(sigma: float, decay: complex, tau_s: Floats, tau0_s: float) -> Floats:
-    """Return the overlapping Allan variance σ² Re{[n(1 − φ²) − φ(1 − q)(3 − q)] / (n²(1 − φ)²)}, q = φⁿ, n = τ/τ0.
+    """Return the Allan variance σ² Re{[n(1 − φ²) − φ(1 − q)(3 − q)] / (n²(1 − φ)²)} with q = φⁿ and n = τ/τ0.
 
     The formula is rearranged from Zhang, Metrologia 45 (2008) 549.
     """
@@ -53,21 +56,18 @@ def _avar(sigma: float, decay: complex, tau_s: Floats, tau0_s: float) -> Floats:
 
 
 def _closed(n: Floats, step: complex) -> Floats:
-    """Return the Allan variance of a process of variance 1 in closed form."""
     phi, d, u = np.exp(-step), -np.expm1(-step), -np.expm1(-n * step)
     return np.asarray(np.real((n * d * (1.0 + phi) - phi * u * (2.0 + u)) / (n * d) ** 2))
 
 
 def _series(n: Floats, x: NDArray[np.complex128]) -> Floats:
-    """Return the Allan variance of a process of variance 1, as a power series in 1 − φ."""
-    # If the correlation decreases linearly with the lag k, the first term (a random walk) dominates. If the correlation
-    # decreases with k², the second term (a slope of random size) dominates.
+    """Return the Allan variance for σ = 1 as a power series in 1 − φ."""
     return np.asarray(np.real(2.0 / 3.0 * x * (1.0 + 0.5 / n**2) - 0.5 * x**2 + 7.0 / 30.0 * x**3))
 
 
 def _psd(sigma: float, decay: complex, f_hz: Floats, tau0_s: float) -> Floats:
-    """Return the two-sided spectrum σ²τ0 Re{(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)}."""
+    """Return the two-sided power spectral density σ²τ0 Re{(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)}."""
     phi, d = np.exp(-decay * tau0_s), -np.expm1(-decay * tau0_s)
-    # 1 − 2φ cos θ + φ² = (1 − φ)² + 4φ sin²(θ/2), a form without cancellation
+    # 1 − 2φ cos θ + φ² = (1 − φ)² + 4φ sin²(θ/2) avoids cancellation.
     below = d**2 + 4.0 * phi * np.sin(np.pi * f_hz * tau0_s) ** 2
     return np.asarray(sigma**2 * tau0_s * np.real(d * (1.0 + phi) / below))

@@ -1,12 +1,8 @@
-"""Noise model of an IMU: the effects of each axis in one object, for fit, simulation and comparison.
+"""Noise model of an IMU with the effects of each axis.
 
-Sources and leaks of an axis add up. Its transforms act on the sum in the order of ``TRANSFORM_ORDER``. ``avar`` and
-``psd`` describe the whole axis, including linear transforms and leaks. Closed forms are used where they exist. After a
-filter, the Allan variance is an integral over the spectrum. The result is NaN if it depends on a quantity that a model
-does not contain. Examples are the temperature, the length of a recording, and the position of a rate between two
-quantisation steps.
-
-``model_file`` converts a model to text and back. ``simulation`` generates time series.
+Simulation, comparison with measurements and ``reconcile`` use the same model. Allan variance and power spectral density
+include linear transforms and leaks. Both quantities are NaN if they depend on the temperature or on the length of the
+recording.
 """
 
 from collections.abc import Iterator, Mapping
@@ -17,34 +13,34 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 from drivers.errors import ConfigError
 from drivers.module_lookup import format_suggestion
-from monitor.noise.effect import Effect, Leak, Source, Transform
+from monitor.noise.effect import AxisLeak, Effect, Source, Transform
 from monitor.noise.effects import TRANSFORM_ORDER
 from monitor.noise.effects.disturbances.noise_step import NoiseStep
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.signal_chain.sample_rate_error import SampleRateError
-from monitor.noise.model_toml import error_location, format_display_table, format_model, parse_model
-from monitor.noise.simulation import ModelStream, check_effects
-from monitor.noise.spectrum import Spectrum, undefined_spectrum, zero_spectrum
+from monitor.noise.model_toml import format_display_table, format_model_toml, parse_model_toml, prefix_config_errors
+from monitor.noise.simulation import ModelStream, check_effects_can_be_simulated
+from monitor.noise.spectrum import Spectrum, nan_spectrum, zero_spectrum
 from monitor.noise.temperature import Temperature
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseModel:
-    """Effects of each axis; an axis that is not named has none.
+    """Noise model of an IMU. Axes that are not in ``effects`` have no noise.
 
     Parameters
     ----------
     effects : mapping of str to tuple of Effect
-        Axis -> its effects.
+        Effects of each axis.
     sample_rate_hz : float or None
-        Default sample rate of a simulation, Hz.
+        Default sample rate of simulations in Hz.
     temperature : Temperature or None
-        Simulated temperature, used if no recording provides one.
+        Simulated temperature, used if no recording provides a temperature.
 
     Raises
     ------
     ConfigError
-        If an axis is unknown, an effect cannot be on its axis, or two sample rate errors differ.
+        If an axis is unknown, an effect is not possible on an axis, or two sample rate errors differ.
 
     Examples
     --------
@@ -67,7 +63,7 @@ class NoiseModel:
             if axis not in AXES:
                 raise ConfigError(f'unknown axis "{axis}"{format_suggestion(axis, AXES)}')
             for effect in effects:
-                with error_location(f"{axis}.{effect.name}"):
+                with prefix_config_errors(f"{axis}.{effect.name}"):
                     effect.check_axis(axis)
         ratios = sorted({effect.ratio for _, effect in self if isinstance(effect, SampleRateError)})
         if len(ratios) > 1:
@@ -75,14 +71,16 @@ class NoiseModel:
             raise ConfigError(f"sample_rate_error: a recording has one clock, but ratio is {given}")
 
     def __iter__(self) -> Iterator[tuple[str, Effect]]:
-        """Yield axis and effect of each effect, in the order of the axes."""
+        """Yield the axis name and the effect for all effects, in the order of the axes."""
         for axis in AXES:
             for effect in self.effects.get(axis, ()):
                 yield axis, effect
 
     def __add__(self, other: "NoiseModel") -> "NoiseModel":
-        """Return a model with the effects of both models. Sample rate and temperature are those of the first model that
-        has them."""
+        """Return a model with the effects of both models.
+
+        The sample rate and the temperature of the left model have priority.
+        """
         if not isinstance(other, NoiseModel):
             return NotImplemented
         added = {
@@ -96,19 +94,19 @@ class NoiseModel:
         return format_display_table(self.effects, self.sample_rate_hz, self.temperature)
 
     @property
-    def true_to_stated_rate(self) -> float:
-        """Return the true sample rate divided by the stated sample rate."""
+    def true_to_stated_rate_ratio(self) -> float:
+        """Ratio of the true sample rate to the stated sample rate."""
         return self._clock.ratio
 
     @property
     def _clock(self) -> SampleRateError:
-        """Return the sample rate error of the model, or a sample rate error of ratio 1."""
+        """Sample rate error of the model. The ratio is 1 if the model has none."""
         return next((e for _, e in self if isinstance(e, SampleRateError)), SampleRateError(ratio=1.0))
 
     # --- second moments
 
     def avar(self, axis: str, tau_s: Floats, tau0_s: float) -> Floats:
-        """Return the overlapping Allan variance of one axis in unit²; NaN = not known.
+        """Return the overlapping Allan variance of one axis in unit²; NaN means unknown.
 
         Parameters
         ----------
@@ -121,8 +119,8 @@ class NoiseModel:
         """
         return self.spectrum(axis, tau0_s).avar(np.asarray(tau_s, np.float64))
 
-    def psd(self, axis: str, f_hz: Floats, tau0_s: float) -> Floats:
-        """Return the two-sided spectrum of one axis in unit²/Hz, up to half the sample rate, without lines and slopes.
+    def two_sided_psd(self, axis: str, f_hz: Floats, tau0_s: float) -> Floats:
+        """Return the two-sided power spectral density of one axis in unit²/Hz, without spectral lines and slopes.
 
         Parameters
         ----------
@@ -145,107 +143,106 @@ class NoiseModel:
         tau0_s : float
             Stated sample interval, s.
         """
-        true_s = tau0_s / self.true_to_stated_rate
+        true_s = tau0_s / self.true_to_stated_rate_ratio
         leaking: dict[str, float] = {}
         for effect in self.effects.get(axis, ()):
-            if isinstance(effect, Leak):
+            if isinstance(effect, AxisLeak):
                 leaking[effect.source] = leaking.get(effect.source, 0.0) + effect.coefficient
         total = self._own(axis, true_s)
         for source, coefficient in leaking.items():
-            total += self._measured(source, self._own(source, true_s)).scaled(coefficient)
-        return self._clock.restate_spectrum(self._measured(axis, total))
+            total += self._measured(source, self._own(source, true_s)).scaled_by_amplitude(coefficient)
+        return self._clock.convert_to_stated_rate(self._measured(axis, total))
 
     def _own(self, axis: str, tau0_s: float) -> Spectrum:
-        """Return the spectrum of the axis' own sources."""
+        """Return the spectrum of the sources of an axis, without leaks."""
         effects = self.effects.get(axis, ())
         stepped = any(isinstance(effect, NoiseStep) for effect in effects)
         total = zero_spectrum(tau0_s)
         for effect in effects:
             if isinstance(effect, Source):
                 once = stepped and isinstance(effect, AngleRandomWalk)
-                total += undefined_spectrum(tau0_s) if once else effect.spectrum(tau0_s)
+                total += nan_spectrum(tau0_s) if once else effect.spectrum(tau0_s)
         return total
 
     def _measured(self, axis: str, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum after all transforms of the axis."""
-        for transform in self.transforms(axis):
+        for transform in self.transforms_in_order(axis):
             spectrum = transform.transform_spectrum(spectrum)
         return spectrum
 
-    def transforms(self, axis: str) -> list[Transform]:
-        """Return the transforms of an axis in the order in which they act."""
+    def transforms_in_order(self, axis: str) -> list[Transform]:
+        """Return the transforms of an axis in the order of execution."""
         found = [effect for effect in self.effects.get(axis, ()) if isinstance(effect, Transform)]
         return sorted(found, key=lambda transform: TRANSFORM_ORDER.index(type(transform)))
 
     # --- time series
 
-    def check(self, rate_hz: float, *, temperature: bool = True) -> None:
-        """Check that the model can be simulated at a stated rate.
+    def check_can_be_simulated(self, rate_hz: float, *, has_temperature: bool = True) -> None:
+        """Check that the model can be simulated at a stated sample rate.
 
         Parameters
         ----------
         rate_hz : float
             Stated sample rate, Hz.
-        temperature : bool
+        has_temperature : bool
             True if a temperature is available, from the model or from a recording.
 
         Raises
         ------
         ConfigError
-            If ``check_effects`` finds a mistake.
+            If an effect cannot be simulated at the sample rate.
         """
-        check_effects(self.effects, rate_hz * self.true_to_stated_rate, temperature)
+        check_effects_can_be_simulated(self.effects, rate_hz * self.true_to_stated_rate_ratio, has_temperature)
 
-    def stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> ModelStream:
-        """Return an endless series of six axes. The same rate and seed give the same series.
+    def start_stream(self, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> ModelStream:
+        """Start an endless simulation of six axes. The same rate and seed produce the same samples.
 
         Parameters
         ----------
         rate_hz : float
-            Sample rate that the recording will state, Hz.
+            Stated sample rate, Hz.
         seed : int
             Seed of the random generators.
         temperature_c : ndarray, shape (n,), or None
-            Temperature of a recording in °C, used instead of the model's. Its last value continues beyond its end.
+            Temperature of a recording in °C, used instead of the simulated temperature. The last value is repeated.
 
         Raises
         ------
         ConfigError
-            If ``check_effects`` finds a mistake.
+            If the model cannot be simulated at the sample rate.
         """
-        return ModelStream(self.effects, self.temperature, rate_hz, self.true_to_stated_rate, seed, temperature_c)
+        return ModelStream(self.effects, self.temperature, rate_hz, self.true_to_stated_rate_ratio, seed, temperature_c)
 
     def simulate(self, n: int, rate_hz: float, seed: int, temperature_c: Floats | None = None) -> Floats:
-        """Return the first ``n`` samples [n, 6] of ``stream``, in rad/s and m/s².
+        """Simulate ``n`` samples [n, 6] in rad/s and m/s².
 
         Parameters
         ----------
         n : int
             Number of samples.
         rate_hz, seed, temperature_c
-            As in ``stream``.
+            As for ``start_stream``.
         """
-        return self.stream(rate_hz, seed, temperature_c).draw(n)
+        return self.start_stream(rate_hz, seed, temperature_c).draw_samples(n)
 
     # --- text
 
     @classmethod
     def from_toml(cls, text: str) -> "NoiseModel":
-        """Read a model from the text of a model file.
+        """Read a noise model from the text of a model file.
 
         Raises
         ------
         ConfigError
-            If the text is not valid. The message names the place in the file.
+            If the text is not a valid model. Each line of the message names a table of the file.
         """
-        effects, rate_hz, temperature = parse_model(text)
+        effects, rate_hz, temperature = parse_model_toml(text)
         model = cls(sample_rate_hz=rate_hz, temperature=temperature)
         for axes, given in effects:
             model += cls(dict.fromkeys(axes, given))
         if rate_hz is not None:
-            model.check(rate_hz)
+            model.check_can_be_simulated(rate_hz)
         return model
 
     def to_toml(self) -> str:
-        """Return the model as text; ``from_toml`` reads it back to an equal model."""
-        return format_model(self.effects, self.sample_rate_hz, self.temperature)
+        """Return the text of a model file. ``from_toml`` converts the text back to an equal model."""
+        return format_model_toml(self.effects, self.sample_rate_hz, self.temperature)

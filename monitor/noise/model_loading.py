@@ -1,4 +1,4 @@
-"""Noise models by name: from the catalogue in ``config/models``, or from a user's file."""
+"""Reading of noise models from the catalogue ``config/models`` or from a user's file."""
 
 from pathlib import Path
 
@@ -9,12 +9,12 @@ from monitor.noise.model import NoiseModel
 
 
 def read_model(path: Path) -> NoiseModel:
-    """Return the model in a file.
+    """Read a noise model from a file.
 
     Raises
     ------
     ConfigError
-        If the file cannot be read or is not valid. Each line names the file and the table.
+        If the file cannot be read or is not a valid model.
     """
     try:
         return NoiseModel.from_toml(file_access.read_small_file(path).decode("utf-8"))
@@ -26,19 +26,19 @@ def read_model(path: Path) -> NoiseModel:
         raise ConfigError(*(f"{path}: {line}" for line in error.lines)) from error
 
 
-def load_model(name: str, folder: Path) -> NoiseModel:
-    """Return a model of the catalogue by its name, or the model in a file.
+def load_model(name_or_path: str, base_folder: Path) -> NoiseModel:
+    """Read a noise model from the catalogue or from a file.
 
     Parameters
     ----------
-    name : str
-        Name in the catalogue, or path of a file.
-    folder : Path
-        Folder to which relative paths refer.
+    name_or_path : str
+        Name of a model in the catalogue, or path of a model file.
+    base_folder : Path
+        Folder for relative paths.
 
     Raises
     ------
     ConfigError
-        If there is no such model, or if it is not valid.
+        If the model does not exist or is not valid.
     """
-    return read_model(model_path(name, folder))
+    return read_model(model_path(name_or_path, base_folder))

@@ -1,8 +1,8 @@
-"""Model files: conversion of TOML text to effects and back, and a table for display.
+"""Conversion of model files (TOML) to effects and back.
 
-A model file has ``sample_rate`` (Hz), optionally ``[temperature]``, and one table per axis. Each axis has one table per
-effect, or an array of tables if an effect occurs several times. ``g*`` and ``a*`` stand for all axes of a kind. A
-ConfigError has one line for each mistake. The line names the table and suggests the nearest known word.
+A model file contains ``sample_rate`` in Hz, an optional table ``[temperature]`` and one table for each effect of an
+axis. ``g*`` and ``a*`` stand for all gyroscopes and all accelerometers. A ConfigError has one line for each mistake in
+the file.
 """
 
 import contextlib
@@ -22,21 +22,21 @@ from monitor.settings import toml_parser
 T = TypeVar("T", bound=ParameterTable)
 
 WILDCARDS: Final = {"g*": AXES[:3], "a*": AXES[3:]}
-"""Keys that stand for all axes of a kind."""
+"""Keys for all gyroscopes and for all accelerometers."""
 AXIS_KEYS: Final = (*AXES, *WILDCARDS)
 TOP_LEVEL_KEYS: Final = ("sample_rate", "temperature")
 
 AxisEffects = tuple[tuple[str, ...], tuple[Effect, ...]]
-"""Names of axes, and the effects of each of these axes."""
+"""Names of axes, and the effects that these axes have in common."""
 
 
-def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature | None]:
-    """Return the effects, the sample rate in Hz and the temperature of a model file's text.
+def parse_model_toml(text: str) -> tuple[list[AxisEffects], float | None, Temperature | None]:
+    """Return the effects, the sample rate in Hz and the temperature from the text of a model file.
 
     Raises
     ------
     ConfigError
-        If the text is not valid, with one line for each mistake.
+        If the text is not a valid model. The message has one line for each mistake.
     """
     tables = toml_parser.parse_toml(text)
     mistakes: list[str] = []
@@ -45,7 +45,7 @@ def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature
         with _collect_errors(mistakes):
             if isinstance(rate_hz, bool) or not isinstance(rate_hz, int | float):
                 raise ConfigError(f"sample_rate must be a number of Hz, is {rate_hz!r}")
-            with error_location("sample_rate"):
+            with prefix_config_errors("sample_rate"):
                 RATE_HZ.check(rate_hz)
     temperature = None
     with _collect_errors(mistakes):
@@ -60,7 +60,7 @@ def parse_model(text: str) -> tuple[list[AxisEffects], float | None, Temperature
     return effects, None if rate_hz is None else float(rate_hz), temperature
 
 
-def format_model(
+def format_model_toml(
     axis_effects: Mapping[str, tuple[Effect, ...]], sample_rate_hz: float | None, temperature: Temperature | None
 ) -> str:
     """Return the text of a model file.
@@ -68,7 +68,7 @@ def format_model(
     Parameters
     ----------
     axis_effects : mapping of str to tuple of Effect
-        Axis -> its effects.
+        Effects of each axis.
     sample_rate_hz : float or None
         Sample rate, Hz.
     temperature : Temperature or None
@@ -90,9 +90,9 @@ def format_model(
 def format_display_table(
     axis_effects: Mapping[str, tuple[Effect, ...]], sample_rate_hz: float | None, temperature: Temperature | None
 ) -> str:
-    """Return a table for display, with one line per effect: axis, name, and parameters with units.
+    """Return a table for display, with one line for each effect.
 
-    Sample rate and temperature are printed above the table. The arguments are those of ``format_model``.
+    The parameters are those of ``format_model_toml``.
     """
     head = [] if sample_rate_hz is None else [f"sample rate {sample_rate_hz:g} Hz"]
     if temperature is not None:
@@ -106,17 +106,17 @@ def format_display_table(
 
 
 @contextlib.contextmanager
-def error_location(place: str) -> Iterator[None]:
-    """Add the place in the file to a ConfigError that is raised inside the context."""
+def prefix_config_errors(location: str) -> Iterator[None]:
+    """Prefix the message of a ConfigError with a location in the model file."""
     try:
         yield
     except ConfigError as error:
-        raise ConfigError(f"{place}: {str(error).removeprefix(place.rpartition('.')[2] + ': ')}") from error
+        raise ConfigError(f"{location}: {str(error).removeprefix(location.rpartition('.')[2] + ': ')}") from error
 
 
 @contextlib.contextmanager
 def _collect_errors(mistakes: list[str]) -> Iterator[None]:
-    """Collect a ConfigError and continue, so that all mistakes are reported together."""
+    """Append the lines of a ConfigError in the context to ``mistakes``, and continue."""
     try:
         yield
     except ConfigError as error:
@@ -124,7 +124,6 @@ def _collect_errors(mistakes: list[str]) -> Iterator[None]:
 
 
 def _format_parameters(table: ParameterTable, axis: str = GYROS[0]) -> str:
-    """Return the parameters of a table with their units on an axis."""
     texts = []
     for name, value in _set_fields(table):
         unit = gyro_and_accel_units(type(table))[name][axis not in GYROS]
@@ -134,7 +133,7 @@ def _format_parameters(table: ParameterTable, axis: str = GYROS[0]) -> str:
 
 
 def _set_fields(table: Any) -> Iterator[tuple[str, Any]]:
-    """Yield name and value of the fields that are not None."""
+    """Yield the name and the value of all fields that are not None."""
     for f in fields(table):
         value = getattr(table, f.name)
         if value is not None:
@@ -142,7 +141,6 @@ def _set_fields(table: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _assignments(table: Any) -> Iterator[str]:
-    """Yield the TOML lines of the fields."""
     for name, value in _set_fields(table):
         if isinstance(value, str):
             yield f'{name} = "{value}"'
@@ -151,7 +149,6 @@ def _assignments(table: Any) -> Iterator[str]:
 
 
 def _parse_axis(axis: str, effects: Any, mistakes: list[str]) -> Iterator[Effect]:
-    """Yield the effects of one axis, and collect the mistakes."""
     if axis not in AXIS_KEYS:
         what = "axis" if isinstance(effects, dict) else "key"
         raise ConfigError(f'unknown {what} "{axis}"{format_suggestion(axis, (*AXIS_KEYS, *TOP_LEVEL_KEYS))}')
@@ -167,7 +164,6 @@ def _parse_axis(axis: str, effects: Any, mistakes: list[str]) -> Iterator[Effect
 
 
 def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
-    """Return the effect or the temperature model that one table describes."""
     known = tuple(gyro_and_accel_units(kind))
     if not isinstance(parameters, dict):
         raise ConfigError(f"{place} must be a table with {', '.join(known)}")
@@ -176,12 +172,12 @@ def _parse_table(place: str, kind: type[T], parameters: Any) -> T:
         for name in parameters
         if name not in known
     ]
-    # A misspelt parameter would otherwise be reported twice: as unknown and as missing.
+    # A misspelt parameter is not also reported as missing.
     mistakes = mistakes or [
         f"{place}: {name} is missing" for name in required_parameters(kind) if name not in parameters
     ]
     if mistakes:
         raise ConfigError(*mistakes)
-    with error_location(place):
+    with prefix_config_errors(place):
         return kind(**parameters)
     raise AssertionError  # not reached: the context manager does not suppress exceptions

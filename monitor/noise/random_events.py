@@ -1,7 +1,7 @@
-"""Events at random samples. Gaps and sizes of the events are drawn in batches.
+"""Random events of a simulation, such as outliers and steps.
 
-All batches have the same length, so the events do not depend on the division into blocks. All events are counted. The
-times of the first events are stored for the truth file of a simulation.
+The gaps between events and the sizes of events are drawn in batches of constant length, so the events do not depend on
+the division into blocks. The times of the first events are stored for the truth file of a simulation.
 """
 
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from drivers.data_types import Floats, Ints
 
 BATCH_SIZE: Final = 64
 MAX_LISTED_EVENTS: Final = 1000
-"""Largest number of events whose times are listed. Later events are only counted."""
+"""Maximum number of events with a stored time. Later events are only counted."""
 
 
 class RandomEvents:
@@ -22,14 +22,13 @@ class RandomEvents:
     Parameters
     ----------
     gaps : callable
-        Draws the gaps of a batch, in samples; inf = no event.
+        Function that draws the gaps between events in samples. An infinite gap means no further event.
     sizes : callable
-        Draws the sizes of a batch.
+        Function that draws the sizes of events.
     rate_hz : float
-        Sample rate in Hz, for the times in ``truth``.
+        Sample rate in Hz.
     before : float
-        Sample index at which the first gap begins. The value -1 allows an event at sample 0 if gaps are whole numbers
-        of at least 1.
+        Sample index at the start of the first gap. With -1, whole gaps of at least 1 allow an event at sample 0.
     """
 
     def __init__(
@@ -45,12 +44,12 @@ class RandomEvents:
         self.count = 0
         self._listed: list[tuple[float, float]] = []
 
-    def take(self, first: int, n: int) -> tuple[Ints, Floats]:
-        """Return the events before sample ``first + n`` that have not been returned yet.
+    def take_block_events(self, first_index: int, n: int) -> tuple[Ints, Floats]:
+        """Return the next events, up to the end of a block.
 
         Parameters
         ----------
-        first : int
+        first_index : int
             Index of the first sample of the block.
         n : int
             Number of samples of the block.
@@ -58,13 +57,13 @@ class RandomEvents:
         Returns
         -------
         indices : ndarray, int64
-            Sample of each event, counted from ``first``.
+            Index of the sample of each event, relative to the block.
         sizes : ndarray, float64
             Size of each event.
         """
         if self._first_index is None:
-            self._first_index = first
-        end = first - self._first_index + n - 1  # an event between two samples is visible at the later one
+            self._first_index = first_index
+        end = first_index - self._first_index + n - 1  # an event between two samples affects the later sample
         taken, sizes = [], []
         while True:
             k = int(np.searchsorted(self._next, end, "right"))
@@ -79,12 +78,12 @@ class RandomEvents:
         self.count += when.size
         for one in range(min(when.size, MAX_LISTED_EVENTS - len(self._listed))):
             self._listed.append(((self._first_index + float(when[one])) / self._rate_hz, float(size[one])))
-        return np.ceil(when - (first - self._first_index)).astype(np.int64), size
+        return np.ceil(when - (first_index - self._first_index)).astype(np.int64), size
 
-    def drawn_values(self, size: str | None = None) -> dict[str, Any]:
-        """Return the number of events, and the times of the listed events in seconds since the start of the stream.
+    def drawn_random_values(self, size_key: str | None = None) -> dict[str, Any]:
+        """Return the number of events, and the times of the first events in seconds.
 
-        If ``size`` is given, the sizes of the listed events are returned under this key.
+        If ``size_key`` is given, the dictionary also contains the sizes of the first events.
         """
         times: dict[str, Any] = {"count": self.count, "times": [time for time, _ in self._listed]}
-        return times if size is None else times | {size: [height for _, height in self._listed]}
+        return times if size_key is None else times | {size_key: [height for _, height in self._listed]}

@@ -1,18 +1,15 @@
-"""Spectrum of the sampled series of one axis, and the Allan variance that follows from the spectrum.
+"""Spectrum of the simulated samples of one axis, and the corresponding Allan variance.
 
-A ``Spectrum`` is created from the closed forms of a source. Spectra can be added. A gain scales a spectrum. A filter
-multiplies its density and its lines, and does not change its slope. Without a filter, the Allan variance is the sum of
-the closed forms of the sources. After a filter, the Allan variance is an integral over the density, plus the
-contributions of lines and slope.
+Without a filter, the Allan variance is the sum of the closed forms of the sources. With a filter, the Allan variance is
+the integral
 
-The integral, for samples τ0 apart with m = τ/τ0, is
+    σ²(τ) = 4 ∫ S(f) sin⁴(πfτ) / (m² sin²(πfτ0)) df   from 0 to 1/(2 τ0),
 
-    σ²(τ) = 4 ∫ S(f) sin⁴(πfτ) / (m² sin²(πfτ0)) df   from 0 to 1/(2 τ0).
+where τ0 is the sample interval and m = τ/τ0. Spectral lines and slopes are added in closed form.
 
-It is computed on a grid in log f, which is finer around narrow peaks. Below f = 0.1/τ the kernel is smooth, and the
-trapezoidal rule suffices. At higher frequencies, sin⁴(πfτ) is written as 3/8 − cos(2πfτ)/2 + cos(4πfτ)/8. The product
-of a cosine and the piecewise linear remainder is integrated exactly, so a long τ needs no finer grid. Errors stay below
-3·10⁻⁴ for the effects of this package.
+For f < 0.1/τ, the trapezoidal rule is used on a logarithmic frequency grid. At higher frequencies, sin⁴(πfτ) is
+expanded to 3/8 − cos(2πfτ)/2 + cos(4πfτ)/8. The products of the cosines and the piecewise linear density are integrated
+exactly. For all effects of noise models, the relative error is below 3·10⁻⁴.
 """
 
 from collections.abc import Callable
@@ -24,26 +21,29 @@ import numpy as np
 from drivers.data_types import Floats
 
 Curve = Callable[[Floats], Floats]
-"""Function of frequency (Hz) or averaging time (s)."""
+"""Function of frequency in Hz or of averaging time in seconds."""
 
 POINTS_PER_DECADE: Final = 400
 MIN_FREQUENCY_CYCLES: Final = 1e-5
-"""Lower end of the frequency grid, times the longest τ. For a random walk, 3·10⁻⁵ of σ² lies below it."""
+"""Lowest frequency of the integral, times the longest averaging time.
+
+For a random walk, a share of 3·10⁻⁵ of the Allan variance is below this frequency.
+"""
 MAX_SMOOTH_CYCLES: Final = 0.1
-"""Largest f·τ at which the kernel is smooth on the grid."""
+"""Maximum f·τ for which the trapezoidal rule is sufficient."""
 
 
 @dataclass(frozen=True, slots=True)
 class Spectrum:
-    """Second moments of a sampled series."""
+    """Power spectral density and Allan variance of the samples of one axis."""
 
-    density: Curve  # f (Hz) -> two-sided density, unit²/Hz, without lines and slope
-    closed_form_avar: Curve | None  # τ (s) -> Allan variance, unit², including lines and slope; None after a filter
+    density: Curve  # two-sided density in unit²/Hz as a function of f in Hz, without lines and slope
+    closed_form_avar: Curve | None  # Allan variance in unit² as a function of τ in s; None after a filter
     tau0_s: float  # sample interval, s
-    lines: tuple[tuple[float, float], ...] = ()  # (Hz, mean square in unit²) of sinusoids
-    slope: float = 0.0  # root of the sum of squares of constant slopes, unit/s
+    lines: tuple[tuple[float, float], ...] = ()  # frequency in Hz and mean square in unit² of sinusoids
+    slope: float = 0.0  # root sum square of constant slopes, unit/s
     level: float = 0.0  # sum of the constant biases, unit
-    peaks: tuple[tuple[float, float], ...] = ()  # (centre, width) in Hz of peaks narrower than an octave
+    peaks: tuple[tuple[float, float], ...] = ()  # centre and width in Hz of narrow peaks
 
     def __add__(self, other: "Spectrum") -> "Spectrum":
         """Return the spectrum of the sum of two independent series."""
@@ -58,8 +58,8 @@ class Spectrum:
             self.peaks + other.peaks,
         )
 
-    def scaled(self, factor: float) -> "Spectrum":
-        """Return the spectrum of the series times ``factor``."""
+    def scaled_by_amplitude(self, factor: float) -> "Spectrum":
+        """Return the spectrum after multiplication of the samples by ``factor``."""
         power, closed = factor**2, self.closed_form_avar
         return replace(
             self,
@@ -70,56 +70,58 @@ class Spectrum:
             level=factor * self.level,
         )
 
-    def filtered(self, gain: Curve, around: tuple[tuple[float, float], ...] = ()) -> "Spectrum":
-        """Return the spectrum of the series after a filter that passes constants.
+    def filtered_by(self, power_gain: Curve, narrow_peaks: tuple[tuple[float, float], ...] = ()) -> "Spectrum":
+        """Return the spectrum after a filter with unit gain at zero frequency.
 
         Parameters
         ----------
-        gain : callable
+        power_gain : callable
             Squared magnitude response as a function of frequency in Hz.
-        around : tuple of (float, float)
+        narrow_peaks : tuple of (float, float)
             Centres and widths in Hz of narrow peaks of the filter.
         """
         return replace(
             self,
-            density=lambda f: gain(f) * self.density(f),
+            density=lambda f: power_gain(f) * self.density(f),
             closed_form_avar=None,
-            lines=tuple((f, float(gain(np.array([f]))[0]) * size) for f, size in self.lines),
-            peaks=self.peaks + around,
+            lines=tuple((f, float(power_gain(np.array([f]))[0]) * size) for f, size in self.lines),
+            peaks=self.peaks + narrow_peaks,
         )
 
     def without_lines(self) -> "Spectrum":
-        """Return the spectrum without its lines."""
+        """Return a copy of the spectrum without spectral lines."""
         return replace(self, lines=())
 
     def avar(self, tau_s: Floats) -> Floats:
         """Return the overlapping Allan variance in unit² at averaging times in seconds."""
         if self.closed_form_avar is not None:
             return self.closed_form_avar(tau_s)
-        total = allan_of_density(self.density, tau_s, self.tau0_s, self.peaks)
+        total = allan_variance_of_density(self.density, tau_s, self.tau0_s, self.peaks)
         total += 0.5 * (self.slope * tau_s) ** 2
         for f_hz, mean_square in self.lines:
-            total += allan_of_line(f_hz, mean_square, tau_s, self.tau0_s)
+            total += allan_variance_of_line(f_hz, mean_square, tau_s, self.tau0_s)
         return total
 
-    def mean_square(self, lowest_hz: float, gain: Curve | None = None) -> float:
-        """Return 2 ∫ S gain df from ``lowest_hz`` to half the sample rate, plus the lines, in unit².
+    def mean_square(self, lowest_hz: float, weight: Curve | None = None) -> float:
+        """Return the mean square in unit² of all frequencies above ``lowest_hz``: 2 ∫ S w df plus the spectral lines.
 
         Parameters
         ----------
         lowest_hz : float
             Lower end of the integral, Hz.
-        gain : callable or None
-            Weight as a function of frequency in Hz; None = 1.
+        weight : callable or None
+            Weight w as a function of frequency in Hz. None means a weight of 1.
         """
         f = frequency_grid(lowest_hz, self.tau0_s, self.peaks)
-        weighted = self.density(f) if gain is None else self.density(f) * gain(f)
-        lines = sum(size * (1.0 if gain is None else float(gain(np.array([f]))[0])) for f, size in self.lines)
+        weighted = self.density(f) if weight is None else self.density(f) * weight(f)
+        lines = sum(size * (1.0 if weight is None else float(weight(np.array([f]))[0])) for f, size in self.lines)
         return 2.0 * _integrate_log_trapezoid(weighted, f) + lines
 
 
 def white_noise_spectrum(mean_square: float, tau0_s: float) -> Spectrum:
-    """Return the spectrum of independent samples: S = σ²τ0, σ²(τ) = σ²τ0/τ (IEEE Std 952 eq. C.18–C.19).
+    """Return the spectrum of white noise.
+
+    The density is S = σ²τ0, and the Allan variance is σ²τ0/τ (IEEE Std 952 eq. C.18–C.19).
 
     Parameters
     ----------
@@ -137,15 +139,15 @@ def zero_spectrum(tau0_s: float) -> Spectrum:
     return Spectrum(np.zeros_like, np.zeros_like, tau0_s)
 
 
-def undefined_spectrum(tau0_s: float) -> Spectrum:
-    """Return a spectrum of NaN, for a series without known stationary second moments."""
+def nan_spectrum(tau0_s: float) -> Spectrum:
+    """Return a spectrum of NaN, for series without a known stationary spectrum."""
     return Spectrum(_nan, _nan, tau0_s)
 
 
-def allan_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float) -> Floats:
-    """Return the Allan variance of a sampled sinusoid: A² sin⁴(πfτ)/(m² sin²(πfτ0)), A² = 2·mean square.
+def allan_variance_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float) -> Floats:
+    """Return the Allan variance of a sampled sinusoid.
 
-    The formula is the sampled form of the sinusoidal noise of IEEE Std 952 annex C.
+    The formula is A² sin⁴(πfτ)/(m² sin²(πfτ0)) with A² = 2·mean square (IEEE Std 952 annex C, sampled form).
 
     Parameters
     ----------
@@ -163,8 +165,10 @@ def allan_of_line(f_hz: float, mean_square: float, tau_s: Floats, tau0_s: float)
     return np.asarray(2.0 * mean_square * ratio**2)
 
 
-def allan_of_density(density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[tuple[float, float], ...]) -> Floats:
-    """Return the Allan variance of a spectral density by numerical integration, see the module's docstring.
+def allan_variance_of_density(
+    density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[tuple[float, float], ...]
+) -> Floats:
+    """Return the Allan variance of a power spectral density by numerical integration.
 
     Parameters
     ----------
@@ -180,7 +184,7 @@ def allan_of_density(density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[
     Examples
     --------
     >>> tau = np.array([0.01, 0.02, 1.0, 50.0])
-    >>> flat = allan_of_density(lambda f: np.full_like(f, 4.0), tau, 0.01, ())
+    >>> flat = allan_variance_of_density(lambda f: np.full_like(f, 4.0), tau, 0.01, ())
     >>> bool(np.all(np.abs(flat * tau / 4.0 - 1.0) < 3e-4))
     True
     """
@@ -192,7 +196,7 @@ def allan_of_density(density: Curve, tau_s: Floats, tau0_s: float, peaks: tuple[
 
 
 def frequency_grid(lowest_hz: float, tau0_s: float, peaks: tuple[tuple[float, float], ...]) -> Floats:
-    """Return the frequency grid in Hz: uniform in log f up to half the sample rate, and finer around peaks.
+    """Return a logarithmic frequency grid in Hz up to half the sample rate, with a finer grid around peaks.
 
     Parameters
     ----------
@@ -204,7 +208,7 @@ def frequency_grid(lowest_hz: float, tau0_s: float, peaks: tuple[tuple[float, fl
         Centres and widths of narrow peaks, Hz.
     """
     nyquist = 0.5 / tau0_s
-    # The linear points are needed near half the sample rate, where the kernel of short τ varies fast.
+    # Linear points resolve the kernel of short averaging times near half the sample rate.
     parts = [
         np.geomspace(lowest_hz, nyquist, max(2, round(POINTS_PER_DECADE * np.log10(nyquist / lowest_hz)))),
         np.linspace(0.1 * nyquist, nyquist, 2 * POINTS_PER_DECADE),
@@ -217,7 +221,7 @@ def frequency_grid(lowest_hz: float, tau0_s: float, peaks: tuple[tuple[float, fl
 
 
 def _allan_variance_at(tau: float, f: Floats, rest: Floats, tau0_s: float) -> float:
-    """Return the Allan variance at one averaging time; ``rest`` is the density divided by sin²(πfτ0)."""
+    """Return the Allan variance at one averaging time. ``rest`` is the density divided by sin²(πfτ0)."""
     split = int(np.clip(np.searchsorted(f, MAX_SMOOTH_CYCLES / tau), 1, f.size - 1))
     low = slice(0, split + 1)
     total = _integrate_log_trapezoid(rest[low] * np.sin(np.pi * f[low] * tau) ** 4, f[low])
@@ -231,7 +235,7 @@ def _allan_variance_at(tau: float, f: Floats, rest: Floats, tau0_s: float) -> fl
 
 
 def _integrate_cosine(omega: float, f: Floats, rest: Floats, slopes: Floats) -> float:
-    """Return the exact integral over f of a piecewise linear function times cos(ωf)."""
+    """Return the exact integral of a piecewise linear function times cos(ωf)."""
     ends = rest[-1] * np.sin(omega * f[-1]) - rest[0] * np.sin(omega * f[0])
     return float(ends / omega + (slopes * np.diff(np.cos(omega * f))).sum() / omega**2)
 
@@ -243,5 +247,4 @@ def _integrate_log_trapezoid(values: Floats, f: Floats) -> float:
 
 
 def _nan(x: Floats) -> Floats:
-    """Return NaN for every x."""
     return np.full_like(x, np.nan)

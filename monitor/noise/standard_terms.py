@@ -1,7 +1,6 @@
-"""Five noise terms of IEEE Std 952: their symbols, effects and Allan variances.
+"""Five noise terms of IEEE Std 952 and their Allan variances.
 
-The Allan variance of an axis is σ²(τ) = 3Q²/τ² + N²/τ + (2 ln 2/π) B² + K²τ/3 + R²τ²/2. The class of each effect has
-the formula and the units of the term.
+The Allan variance is σ²(τ) = 3Q²/τ² + N²/τ + (2 ln 2/π) B² + K²τ/3 + R²τ²/2.
 """
 
 from typing import Final
@@ -19,13 +18,13 @@ STANDARD_TERMS: Final[dict[str, type[Source]]] = {
     "K": RateRandomWalk,
     "R": RateRamp,
 }
-"""Symbol of a coefficient -> its effect, whose only parameter has the same symbol."""
+"""Effect of each noise coefficient. The parameter of the effect has the same symbol."""
 UNIT_SOURCES: Final = tuple(term(**{symbol: 1.0}) for symbol, term in STANDARD_TERMS.items())
-"""Noise terms with unit coefficients."""
+"""Noise terms with coefficients of 1."""
 
 
-def unit_allan_variances(tau_s: Floats, tau0_s: float) -> Floats:
-    """Return the Allan variances [m, 5] of the five terms with unit coefficients.
+def unit_coefficient_allan_variances(tau_s: Floats, tau0_s: float) -> Floats:
+    """Return the Allan variances [m, 5] of the five noise terms with coefficients of 1.
 
     Parameters
     ----------
@@ -36,7 +35,7 @@ def unit_allan_variances(tau_s: Floats, tau0_s: float) -> Floats:
 
     Examples
     --------
-    >>> unit_allan_variances(np.array([2.0]), 1e-6).round(4).tolist()
+    >>> unit_coefficient_allan_variances(np.array([2.0]), 1e-6).round(4).tolist()
     [[0.75, 0.5, 0.4413, 0.6667, 2.0]]
     """
     return np.stack([source.avar(tau_s, tau0_s) for source in UNIT_SOURCES], axis=1)

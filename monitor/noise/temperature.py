@@ -1,7 +1,7 @@
-"""Temperature of a simulated sensor: a periodic swing, such as day and night, plus slow random wander.
+"""Temperature of a simulated sensor.
 
-T(t) = mean + swing sin(2πt/period) + first-order Gauss–Markov noise of standard deviation ``wander`` and correlation
-time ``wander_time``. If a recording has its own temperature, it is used instead.
+The temperature is T(t) = mean + swing sin(2πt/period) plus first-order Gauss–Markov noise. ``wander`` is the standard
+deviation of the noise, and ``wander_time`` the correlation time.
 """
 
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ import numpy as np
 from drivers.data_types import Floats
 from drivers.errors import ConfigError
 from drivers.number_ranges import DURATION_S, TEMPERATURE_C
-from monitor.noise.effect import NoiseSeries, ParameterTable, SampleBlockContext, StatelessSeries, parameter
+from monitor.noise.effect import NoiseSeries, ParameterTable, SampleBlockContext, StatelessSeries, parameter_field
 from monitor.noise.effects.ieee952.exponentially_correlated import ExponentiallyCorrelated
 from monitor.noise.effects.ieee952.sinusoidal import Sinusoidal
 
@@ -22,12 +22,12 @@ PAIRS: Final = (("swing", "period"), ("wander", "wander_time"))
 
 @dataclass(frozen=True, slots=True)
 class Temperature(ParameterTable):
-    """Parameters of the table ``[temperature]`` of a model file.
+    """Parameters of the table ``[temperature]`` in a model file.
 
     Raises
     ------
     ConfigError
-        If a parameter is not allowed, or if one parameter of a pair is missing.
+        If a parameter is out of range, or if one parameter of a pair is missing.
 
     Examples
     --------
@@ -36,11 +36,15 @@ class Temperature(ParameterTable):
     drivers.errors.ConfigError: temperature: swing needs a period
     """
 
-    mean: float = parameter("°C", signed=True, quantity=TEMPERATURE_C)
-    swing: float | None = parameter("°C", optional=True, quantity=TEMPERATURE_C)  # amplitude of the periodic part
-    period: float | None = parameter("s", positive=True, optional=True, quantity=DURATION_S)
-    wander: float | None = parameter("°C", optional=True, quantity=TEMPERATURE_C)  # standard deviation
-    wander_time: float | None = parameter("s", positive=True, optional=True, quantity=DURATION_S)  # correlation time
+    mean: float = parameter_field("°C", signed=True, number_range=TEMPERATURE_C)
+    swing: float | None = parameter_field(
+        "°C", optional=True, number_range=TEMPERATURE_C
+    )  # amplitude of the periodic part
+    period: float | None = parameter_field("s", positive=True, optional=True, number_range=DURATION_S)
+    wander: float | None = parameter_field("°C", optional=True, number_range=TEMPERATURE_C)  # standard deviation
+    wander_time: float | None = parameter_field(
+        "s", positive=True, optional=True, number_range=DURATION_S
+    )  # correlation time
 
     def __post_init__(self) -> None:
         ParameterTable.__post_init__(self)
@@ -49,47 +53,47 @@ class Temperature(ParameterTable):
                 if getattr(self, given) is not None and getattr(self, needed) is None:
                     raise ConfigError(f"temperature: {given} needs a {needed}")
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
-        """Return a new series in °C.
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> NoiseSeries:
+        """Start a simulated temperature series in °C.
 
         Parameters
         ----------
         rate_hz : float
             Sample rate, Hz.
         rng : numpy.random.Generator
-            Generator of the temperature alone.
+            Random generator of the temperature.
         """
         parts: list[NoiseSeries] = []
         if self.swing is not None and self.period is not None:
             swing = Sinusoidal(amplitude=self.swing, frequency=1.0 / self.period, phase=0.0)
             swing.check_rate(rate_hz)
-            parts.append(swing.start(rate_hz, rng))
+            parts.append(swing.start_series(rate_hz, rng))
         if self.wander is not None and self.wander_time is not None:
             wander = ExponentiallyCorrelated(sigma=self.wander, correlation_time=self.wander_time)
-            parts.append(wander.start(rate_hz, rng))
+            parts.append(wander.start_series(rate_hz, rng))
 
-        def add(values: Floats, block: SampleBlockContext) -> None:
+        def add_temperature(values: Floats, block: SampleBlockContext) -> None:
             values += self.mean
             for part in parts:
-                part.add(values, block)
+                part.add_next_samples(values, block)
 
-        return StatelessSeries(add)
+        return StatelessSeries(add_temperature)
 
 
 def recorded_temperature(temperature_c: Floats) -> NoiseSeries:
     """Return the temperature of a recording as a series.
 
-    A missing value is replaced by the previous value. The last value continues beyond the end of the recording.
+    Missing values are replaced by the previous value. The last value is repeated after the end of the recording.
 
     Parameters
     ----------
     temperature_c : ndarray, shape (n,)
-        Temperature in °C; NaN = missing.
+        Temperature in °C; NaN means missing.
 
     Raises
     ------
     ConfigError
-        If there is no value at all.
+        If all values are missing.
     """
     given = np.asarray(temperature_c, np.float64).ravel()
     known = np.flatnonzero(np.isfinite(given))
@@ -98,8 +102,8 @@ def recorded_temperature(temperature_c: Floats) -> NoiseSeries:
     before = np.searchsorted(known, np.arange(given.size), "right") - 1
     filled = given[known[np.maximum(before, 0)]]
 
-    def add(values: Floats, block: SampleBlockContext) -> None:
+    def add_recorded_temperature(values: Floats, block: SampleBlockContext) -> None:
         index = np.arange(block.first, block.first + values.size)
         values += filled[np.minimum(index, filled.size - 1)]
 
-    return StatelessSeries(add)
+    return StatelessSeries(add_recorded_temperature)

@@ -13,7 +13,7 @@ from drivers.data_types import Event, Floats
 from monitor.common.device_health import Health
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate, concatenate_coefficients
 from monitor.publishing.messages.message import Message
 from monitor.publishing.messages.results import (
@@ -139,7 +139,7 @@ RESULT_KINDS: Final = (
     ResultKind(DriftUpdate, drawings=(DrawingRule("DriftPanel"),)),
     ResultKind(TotalAndHadamardCurves, (TotalAndHadamardMessage,)),
     ResultKind(
-        ModelGap,  # precedes the estimate, because the Allan plot also shows the model
+        ModelComparison,  # precedes the estimate, because the Allan plot also shows the model
         (ModelGapMessage,),
         (DrawingRule("GapPanel", keep_newest_and_spaced, period_s=1.0),),
         size_bytes=lambda one: 6 * 4 * int(one.tau_s.nbytes),

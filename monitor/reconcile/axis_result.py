@@ -4,7 +4,7 @@ from math import erf, exp, inf, log
 from typing import Final
 
 from monitor.common.distributions import Z95
-from monitor.noise.effect import Effect, Leak
+from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import (
     EFFECTS,
     BandwidthLimit,
@@ -235,7 +235,7 @@ def _parameters_with_bounds(
     if kind == "added" and trial.intervals and trial.name == effect.name:
         return dict(trial.intervals)
     found: dict[str, ParameterInterval] = {}
-    if isinstance(effect, Leak):
+    if isinstance(effect, AxisLeak):
         found["source"] = ParameterInterval(effect.source)
     size_name = SIZE_PARAMETERS.get(type(effect))
     if size_name is not None:

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import expit
 
 from drivers.data_types import AXES
-from monitor.noise.effect import Leak
+from monitor.noise.effect import AxisLeak
 from monitor.noise.effects import (
     AngleRandomWalk,
     Bias,
@@ -246,7 +246,7 @@ def _reversed_leak_sources(
         (name, effect.source): step.trials[0].score
         for name, one in found.items()
         for step in one.rounds
-        if isinstance(effect := step.trials[0].effect, Leak)
+        if isinstance(effect := step.trials[0].effect, AxisLeak)
     }
     back: dict[str, frozenset[str]] = {}
     for (name, source), gain in gains.items():

@@ -51,13 +51,13 @@ def check_sensor(table: VirtualTable) -> None:
         stream = None
         if table.model:
             model = read_model(Path(table.model))
-            stream = model.stream(model.sample_rate_hz or DEFAULT_RATE_HZ, table.seed)
+            stream = model.start_stream(model.sample_rate_hz or DEFAULT_RATE_HZ, table.seed)
     except ConfigError as error:
         wrong += error.lines
     for text, axis, effect in coming:
         try:
             if stream is not None:
-                stream.add(axis, effect)
+                stream.add_effect(axis, effect)
         except ConfigError as error:
             wrong += [f'effect "{text}": {line}' for line in error.lines]
     if wrong:
@@ -99,7 +99,7 @@ class SimulatedSensor:
         """Start the clock of the sensor, after the kernels of the simulation have been compiled."""
         trial = self._create_stream(0)
         self._add_effects(trial)
-        trial.draw_with_temperature(1)
+        trial.draw_samples_with_temperature(1)
         self._unix_ns = time.time_ns()
 
     def skip_samples(self, n: int) -> None:
@@ -125,26 +125,26 @@ class SimulatedSensor:
         """Return values [n, 6] and temperature [n] of the next samples, with the effects from their start on."""
         before = max(self._effects_begin_at - self._made, 0)
         if not self._pending_effects or before >= n:
-            drawn = self._stream.draw_with_temperature(n)
+            drawn = self._stream.draw_samples_with_temperature(n)
             return drawn.values, drawn.temperature_c
-        parts = [self._stream.draw_with_temperature(before)] if before else []
+        parts = [self._stream.draw_samples_with_temperature(before)] if before else []
         self._add_effects(self._stream)
         at_s = (self._made + before) / self.rate_hz
         for text, axis, _ in self._pending_effects:
             _log.info("effect added", device=self._name, axis=axis, effect=text, at_s=at_s)
         self._pending_effects = []
-        parts.append(self._stream.draw_with_temperature(n - before))
+        parts.append(self._stream.draw_samples_with_temperature(n - before))
         return np.concatenate([p.values for p in parts]), np.concatenate([p.temperature_c for p in parts])
 
     def _create_stream(self, seed: int) -> ModelStream:
         """Create a random series of the noise model."""
-        return self._model.stream(self.rate_hz, seed)
+        return self._model.start_stream(self.rate_hz, seed)
 
     def _add_effects(self, stream: ModelStream) -> None:
         """Add the effects that have not begun to a random series."""
         for text, axis, effect in self._pending_effects:
             try:
-                stream.add(axis, effect)
+                stream.add_effect(axis, effect)
             except ConfigError as error:
                 raise ConfigError(f'effect "{text}": {error}') from error
 

@@ -16,7 +16,7 @@ from scipy.signal import welch
 import monitor.noise.effects as folder
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
-from monitor.noise.effect import Effect, Leak, Source, Transform, gyro_and_accel_units, required_parameters
+from monitor.noise.effect import AxisLeak, Effect, Source, Transform, gyro_and_accel_units, required_parameters
 from monitor.noise.effects import EFFECTS, TRANSFORM_ORDER, NoiseStep
 from monitor.noise.model import NoiseModel
 from tests.contracts.effect_examples import AXIS, RATE_HZ, effect, example, model, without
@@ -74,7 +74,7 @@ def test_says_what_it_is(name):
     assert all(gyro and accelerometer for gyro, accelerometer in gyro_and_accel_units(kind).values())
     assert inspect.getdoc(inspect.getmodule(kind))
     assert ">>>" in inspect.getdoc(kind)
-    assert issubclass(kind, (Source, Leak, Transform, NoiseStep))
+    assert issubclass(kind, (Source, AxisLeak, Transform, NoiseStep))
     assert issubclass(kind, Transform) == (kind in TRANSFORM_ORDER)
 
 
@@ -104,12 +104,12 @@ def test_simulated_spectrum_is_the_stated_one(name):
     keep = (f > 0.4) & (f < 0.5 * RATE_HZ)
     for line_hz, mean_square in spectrum.lines:
         near = np.abs(f - line_hz) < 0.3
-        floor = model(name).psd(AXIS, f[near], TAU0_S)
+        floor = model(name).two_sided_psd(AXIS, f[near], TAU0_S)
         power = 2.0 * np.sum(measured[near] - floor) * (f[1] - f[0])
         assert power == pytest.approx(mean_square, rel=0.02)
         keep &= ~near
     f, measured = f[keep], measured[keep]
-    expected = model(name).psd(AXIS, f, TAU0_S)
+    expected = model(name).two_sided_psd(AXIS, f, TAU0_S)
     if not expected.any():
         assert measured.max() < (1e-5 if spectrum.lines else 1e-12)  # the window's skirt of a line
         return
@@ -123,7 +123,7 @@ def test_simulated_spectrum_is_the_stated_one(name):
 @pytest.mark.parametrize("name", EXACT)
 def test_series_is_the_one_written_down_a_second_time(name):
     n = 5000
-    drawn = model(name).stream(RATE_HZ, 3).draw_with_temperature(n)
+    drawn = model(name).start_stream(RATE_HZ, 3).draw_samples_with_temperature(n)
     base = without(name).simulate(n, RATE_HZ, 3)[:, COLUMN]
     expected = example(name).exact(base, np.arange(n) / RATE_HZ, drawn.temperature_c)
     np.testing.assert_allclose(drawn.values[:, COLUMN], expected, rtol=1e-9, atol=1e-12)
@@ -135,9 +135,9 @@ def test_series_is_the_one_written_down_a_second_time(name):
 @settings(max_examples=12, deadline=None)
 def test_any_cut_into_blocks_gives_the_same_series(name, cuts):
     n = 4500  # longer than what a stream makes at once
-    stream = model(name).stream(RATE_HZ, 5)
-    pieces = [stream.draw_with_temperature(size) for size in [*cuts, max(0, n - sum(cuts))]]
-    whole = model(name).stream(RATE_HZ, 5).draw_with_temperature(max(n, sum(cuts)))
+    stream = model(name).start_stream(RATE_HZ, 5)
+    pieces = [stream.draw_samples_with_temperature(size) for size in [*cuts, max(0, n - sum(cuts))]]
+    whole = model(name).start_stream(RATE_HZ, 5).draw_samples_with_temperature(max(n, sum(cuts)))
     np.testing.assert_array_equal(np.concatenate([piece.values for piece in pieces]), whole.values)
     np.testing.assert_array_equal(np.concatenate([piece.temperature_c for piece in pieces]), whole.temperature_c)
 
@@ -146,9 +146,9 @@ def test_any_cut_into_blocks_gives_the_same_series(name, cuts):
     "name", [n for n in NAMES if issubclass(EFFECTS[n], Source) and not EFFECTS[n].uses_temperature]
 )
 def test_a_source_by_itself_gives_what_the_stream_adds(name):
-    started = effect(name).start(RATE_HZ, np.random.default_rng(5))
-    pieces = [started.draw(size, first) for size, first in ((1, 0), (0, 1), (900, 1), (99, 901))]
-    whole = effect(name).start(RATE_HZ, np.random.default_rng(5)).draw(1000)
+    started = effect(name).start_series(RATE_HZ, np.random.default_rng(5))
+    pieces = [started.draw_samples(size, first) for size, first in ((1, 0), (0, 1), (900, 1), (99, 901))]
+    whole = effect(name).start_series(RATE_HZ, np.random.default_rng(5)).draw_samples(1000)
     np.testing.assert_array_equal(np.concatenate(pieces), whole)
 
 
@@ -188,9 +188,9 @@ def test_what_may_be_absent_stays_absent(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_truth_is_ready_for_json_and_the_same_for_the_same_seed(name):
     def told() -> str:
-        stream = model(name).stream(RATE_HZ, 4)
-        stream.draw(500)
-        return json.dumps(stream.drawn_values(), allow_nan=False)
+        stream = model(name).start_stream(RATE_HZ, 4)
+        stream.draw_samples(500)
+        return json.dumps(stream.drawn_random_values(), allow_nan=False)
 
     assert told() == told()
 

@@ -183,7 +183,7 @@ def temperature(out: Path, folder: Path) -> Path:
     source = folder / "warm.npz"
     model = read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "stim300.toml") + NoiseModel.from_toml(WARM)
     n = round(WARM_S * WARM_HZ)
-    drawn = model.stream(WARM_HZ, 1).draw_with_temperature(n)
+    drawn = model.start_stream(WARM_HZ, 1).draw_samples_with_temperature(n)
     save_samples(source, T0 + np.arange(n) / WARM_HZ, drawn.values, drawn.temperature_c)
     devices = REPLAY.format(recording=source, speed=WARM_SPEED).replace("rate = 100.0", f"rate = {WARM_HZ}")
     with window() as (port, shoot):
@@ -203,8 +203,8 @@ def drift(out: Path, folder: Path) -> Path:
     t_s = np.arange(n) / 100.0
     values = (
         read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "adis16470.toml")
-        .stream(100.0, 1)
-        .draw_with_temperature(n)
+        .start_stream(100.0, 1)
+        .draw_samples_with_temperature(n)
         .values.copy()
     )
     for axis, since_s in enumerate(TURNS_S):
@@ -228,8 +228,8 @@ def compensation(out: Path, folder: Path) -> Path:
     n = 1_080_000
     values = (
         read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "adis16470.toml")
-        .stream(100.0, 2)
-        .draw_with_temperature(n)
+        .start_stream(100.0, 2)
+        .draw_samples_with_temperature(n)
         .values
     )
     save_samples(source, np.arange(n) / 100.0, values)
@@ -506,7 +506,7 @@ def recording(folder: Path, seconds: float, changed: bool = False) -> Path:
         rate_hz = model.sample_rate_hz
         assert rate_hz is not None
         since_s = np.arange(round(seconds * rate_hz)) / rate_hz
-        values = model.stream(rate_hz, 1).draw(since_s.size)
+        values = model.start_stream(rate_hz, 1).draw_samples(since_s.size)
         if changed:
             after = since_s >= CHANGED_S
             values[after, 2] += MORE_N * rate_hz**0.5 * np.random.default_rng(1).standard_normal(after.sum())

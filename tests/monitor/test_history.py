@@ -73,7 +73,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """With a hole of two seconds in it."""
     path = tmp_path_factory.mktemp("recording") / "r.npz"
     n = round(SECONDS * RATE_HZ)
-    drawn = read_model(MODEL).stream(RATE_HZ, 3).draw_with_temperature(n)
+    drawn = read_model(MODEL).start_stream(RATE_HZ, 3).draw_samples_with_temperature(n)
     rows = np.delete(np.arange(n), slice(5000, 5100))
     save_samples(path, T0 + rows / RATE_HZ, drawn.values[rows], 20.0 + rows / 1000.0)
     return path

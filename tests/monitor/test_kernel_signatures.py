@@ -51,17 +51,17 @@ PROGRAM = """
         samples = make_block(np.arange(start, start + 50), values[start : start + 50])
         gyro.compensate(samples.values, lost=3 if start == 5000 else 0)
         gyro.compensate(np.asfortranarray(values[start : start + 50]))
-        for still in watch.update(samples):
+        for still in watch.process_samples(samples):
             for one in estimators:
-                one.update(still)
+                one.add_samples(still)
                 if start % 1000 == 0:
-                    one.get()
+                    one.get_estimate()
         if start == 8000:
             gyro.identify_due_models()
-    watch.flush()
+    watch.flush_delayed_samples()
     found = watch.take_events()
     for one in estimators:
-        one.restart(2, 1000)
+        one.restart_axis(2, 1000)
         while one.step_slow_statistics() is None:
             pass
     gyro.bias_standard_error

@@ -18,7 +18,7 @@ from monitor.daemon.output import Output
 from monitor.daemon.service import Service
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.messages.results import TotalAndHadamardCurves
 from monitor.settings import loading
@@ -32,7 +32,7 @@ class Caught(Output):
         self.blocks: dict[str, list[SampleBlock]] = {}
         self.estimates: dict[str, Estimate] = {}
         self.totals: dict[str, TotalAndHadamardCurves] = {}
-        self.gaps: dict[str, ModelGap] = {}
+        self.gaps: dict[str, ModelComparison] = {}
         self.thermals: dict[str, list[ThermalIntervalResult]] = {}
         self.rates: dict[str, list[SampleBlock]] = {}
         self.drifts: dict[str, list[DriftUpdate]] = {}
@@ -46,7 +46,7 @@ class Caught(Output):
         match result:
             case Estimate():
                 self.estimates[device] = result
-            case ModelGap():
+            case ModelComparison():
                 self.gaps[device] = result
             case ThermalIntervalResult():
                 self.thermals.setdefault(device, []).append(result)

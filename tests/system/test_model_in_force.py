@@ -17,7 +17,7 @@ from monitor.common import topics
 from monitor.common.shipped_config_paths import CONFIG_FOLDER
 from monitor.daemon.operations.reconcile_on_request import Reconciler
 from monitor.daemon.service import Service
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.settings.loading import Config, VirtualTable, ZenohTable
 from monitor.simulator.demo_config import demo_config
 from tests.support.paced_sensor import follow_reader
@@ -51,13 +51,13 @@ class Watching(Caught):
     """Ends the service when the model is contradicted."""
 
     service: Service | None = None
-    before: ModelGap | None = None  # the last look without the effect
+    before: ModelComparison | None = None  # the last look without the effect
     told_s = 0.0  # of the sensor's time
     looked = 0  # samples that have been looked at
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         super().publish_result(device, unix_s, received, result)
-        if isinstance(result, ModelGap):
+        if isinstance(result, ModelComparison):
             self.looked = result.samples
             if result.samples / RATE_HZ < AT_S:
                 self.before = result

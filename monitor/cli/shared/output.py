@@ -10,7 +10,7 @@ from drivers.errors import ConfigError
 from monitor.commands.progress import ProgressCallback, ignore_progress
 
 if TYPE_CHECKING:
-    from monitor.estimation.analysis import Analysis
+    from monitor.estimation.analysis import RecordingAnalysis
 
 
 def check_output_file(option: str, path: Path | None, *suffixes: str) -> None:
@@ -93,7 +93,7 @@ def compile_analysis_kernels(tell: ProgressCallback) -> None:
                     pass
 
 
-def print_analysis(result: "Analysis") -> None:
+def print_analysis(result: "RecordingAnalysis") -> None:
     """Print the number of samples, the coefficients and the notes of an analysis."""
     from rich.console import Console
 

@@ -58,8 +58,8 @@ class DeviceStatus:
             uptime_s=time.monotonic() - self._started_s,
             repeated=clock.dropped_repeated_rows,
             late=clock.dropped_late_rows + driver.counts.late,
-            moving=signal_monitor is not None and signal_monitor.moving,
-            moved=signal_monitor.moved_samples if signal_monitor is not None else 0,
+            moving=signal_monitor is not None and signal_monitor.is_moving,
+            moved=signal_monitor.samples_in_motion if signal_monitor is not None else 0,
             crossed=self._publisher.limits.limits_crossed_now,
         )
 

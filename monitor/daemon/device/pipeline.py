@@ -144,13 +144,15 @@ class DevicePipeline:
         ]
         while self._pieces and (drain or not self._replayed or self.thermal is None or not self.thermal.choosing):
             piece = self._pieces.popleft()
-            self._update_estimator(self.signal_monitor.update(piece) if self.signal_monitor is not None else [piece])
+            self._update_estimator(
+                self.signal_monitor.process_samples(piece) if self.signal_monitor is not None else [piece]
+            )
             self._restart_changed_axes()
             self._update_thermal()
 
     def process_held_samples(self) -> None:
         """Process the samples that the motion detector holds back. Called after the last sample."""
-        self._update_estimator(self.signal_monitor.flush() if self.signal_monitor is not None else [])
+        self._update_estimator(self.signal_monitor.flush_delayed_samples() if self.signal_monitor is not None else [])
         self._restart_changed_axes()
         self._update_thermal()
 
@@ -190,7 +192,7 @@ class DevicePipeline:
     def empty_window(self) -> None:
         """Empty the window."""
         if self.estimator is not None:
-            self.estimator.reset()
+            self.estimator.empty_window()
             self.since_ns = [self.newest_ns + 1] * len(AXES)
 
     def refine_rate(self, rate_hz: float) -> None:
@@ -231,9 +233,9 @@ class DevicePipeline:
         device = self._device
         try:
             self.estimator = Estimator(rate_hz, device.window_s, device.tau, every_sample=device.refit_s == 0.0)
-            self._temperatures = TemperatureRing(self.estimator.window_samples)
+            self._temperatures = TemperatureRing(self.estimator.window_length_samples)
             if self._model is not None:
-                self.model_in_force = PreparedModel(self._model, self.estimator.window_samples)
+                self.model_in_force = PreparedModel(self._model, self.estimator.window_length_samples)
         except (
             ConfigError
         ) as error:  # the configured averaging times do not suit the measured rate; samples are still published
@@ -258,17 +260,17 @@ class DevicePipeline:
         if self.estimator is None or self._temperatures is None:
             return
         for samples in blocks:
-            self.estimator.update(samples)
-            self._temperatures.push(samples.lost, samples.temperature_c)
+            self.estimator.add_samples(samples)
+            self._temperatures.push_temperatures(samples.lost, samples.temperature_c)
             self.advanced = True
 
     def _restart_changed_axes(self) -> None:
         """Restart the axes in which a change of the noise was detected."""
-        restarts = self.signal_monitor.take_restarts() if self.signal_monitor is not None else []
+        restarts = self.signal_monitor.take_restart_requests() if self.signal_monitor is not None else []
         if self.estimator is None or not self._device.restart or self._replaying:
             return
         for restart in restarts:
-            self.estimator.restart(restart.axis, restart.samples)
+            self.estimator.restart_axis(restart.axis, restart.samples)
             back_ns = round((restart.samples - 0.5) / self.estimator.rate_hz * 1e9)
             self.since_ns[restart.axis] = self.newest_ns - back_ns
 

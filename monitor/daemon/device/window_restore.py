@@ -114,7 +114,7 @@ class WindowRestore:
             # these times replace the times of the changes that were detected in the replay
             pipeline.since_ns[axis] = None if unix_s is None else round(unix_s * 1e9) - offset_ns
             if unix_s is not None:
-                pipeline.estimator.restart(axis, int(counted[axis]))
+                pipeline.estimator.restart_axis(axis, int(counted[axis]))
         if state.theta:
             shape = (-1, len(AXES))
             theta = np.array(state.theta, np.float64).reshape(shape)

@@ -41,22 +41,22 @@ def _samples(n: int) -> SampleBlock:
 
 
 def _call_window() -> None:
-    Estimator(100.0, 1.0).update(_samples(100))
+    Estimator(100.0, 1.0).add_samples(_samples(100))
 
 
 def _call_fit() -> None:
     estimator = Estimator(100.0, 1.0)
-    estimator.update(_samples(100))
-    estimator.get()
+    estimator.add_samples(_samples(100))
+    estimator.get_estimate()
 
 
 def _call_motion_detection() -> None:
-    SignalMonitor(100.0, alarms_per_day=0.0).update(_samples(100))
+    SignalMonitor(100.0, alarms_per_day=0.0).process_samples(_samples(100))
 
 
 def _call_change_detection() -> None:
-    SignalMonitor(100.0).update(_samples(100))
-    ChangeDetector(100.0).restart()
+    SignalMonitor(100.0).process_samples(_samples(100))
+    ChangeDetector(100.0).restart_references()
 
 
 def _call_compensation() -> None:
@@ -69,14 +69,14 @@ def _call_compensation() -> None:
 
 def _call_slow_statistics() -> None:
     estimator = Estimator(100.0, 1.0)
-    estimator.update(_samples(100))
-    estimator.restart(0, 10)
+    estimator.add_samples(_samples(100))
+    estimator.restart_axis(0, 10)
     while estimator.step_slow_statistics() is None:
         pass
 
 
 def _call_refit() -> None:
-    Estimator(100.0, 1.0, every_sample=True).update(_samples(100))
+    Estimator(100.0, 1.0, every_sample=True).add_samples(_samples(100))
 
 
 def _call_temperature_lag() -> None:

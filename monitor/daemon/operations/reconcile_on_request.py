@@ -185,7 +185,7 @@ class Reconciler:
 
 def _write_window(path: Path, job: Job) -> None:
     """Write the measured axes, the temperature and the sample rate of a window as a recording."""
-    values = job.window.values()
+    values = job.window.restore_samples()
     columns = {axis: values[:, i] for i, axis in enumerate(AXES) if not np.isnan(values[:, i]).all()}
     if not np.isnan(job.temperature_c).all():
         columns["temperature"] = job.temperature_c

@@ -32,7 +32,7 @@ from monitor.drift.compensation.carrier_rate_filter_bank import (
     update_rest_noise,
 )
 from monitor.estimation.detection import motion_kernel
-from monitor.estimation.detection.motion_detection import block_size
+from monitor.estimation.detection.motion_detection import samples_per_block
 
 GYROS: Final = 3
 """Number of gyro axes. They are the first columns of the samples."""
@@ -132,7 +132,7 @@ class Compensator:
 
     def __init__(self, rate_hz: float, adapts: bool = True, orders: Sequence[Order] = ORDERS) -> None:
         self.rate_hz = rate_hz
-        self.block_samples = block_size(rate_hz)
+        self.block_samples = samples_per_block(rate_hz)
         self.models: list[ArmaModel | None] = [None] * GYROS
         self._orders = tuple(orders)
         self._state = _initial_state(rate_hz, adapts)
@@ -301,7 +301,7 @@ def _initial_state(rate_hz: float, adapts: bool) -> CompensatorState:
     drift = np.zeros(GYROS, sage_husa.DRIFT_FILTER)
     drift["adaptive"] = adapts
     return CompensatorState(
-        rest=motion_kernel.make_state(),
+        rest=motion_kernel.make_motion_state(),
         current=np.full(1, -1, np.int64),
         learned=np.zeros(GYROS, np.int64),
         drift=drift,
@@ -329,7 +329,7 @@ def _advance(values: Floats, index: int, size: int, s: CompensatorState, out: Fl
     while i < n:
         number = (index + i) // size
         end = min(n, (number + 1) * size - index)
-        decisions = motion_kernel.advance(
+        decisions = motion_kernel.advance_motion_detection(
             values[i:end], index + i, size, False, s.rest, s.decisions[0], s.decisions[1], s.episodes
         )
         for v in range(decisions[0]):

@@ -23,7 +23,7 @@ from monitor.drift.thermal.thermal_fit import MIN_SWING_C, check_means_suffice, 
 from monitor.drift.thermal.thermal_model import predict
 from monitor.drift.thermal.thermal_results import choose_interval_s
 from monitor.estimation.allan.batch import EachAxis
-from monitor.estimation.analysis import Analysis, fit_other_samples
+from monitor.estimation.analysis import RecordingAnalysis, fit_other_samples
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
 
 SLOW_LETTERS: Final = ("K", "R")
@@ -91,12 +91,14 @@ def temperature_varied(temperatures_c: Floats) -> bool:
     )
 
 
-def remove_temperature(result: Analysis, temperature_c: Floats, each: EachAxis = map) -> TemperatureRemoval | None:
+def remove_temperature(
+    result: RecordingAnalysis, temperature_c: Floats, each: EachAxis = map
+) -> TemperatureRemoval | None:
     """Return the coefficients of an analysis without the temperature part of the bias.
 
     Parameters
     ----------
-    result : Analysis
+    result : RecordingAnalysis
         Analysis of a recording.
     temperature_c : ndarray, shape (n,)
         Temperature of each sample, °C.

@@ -1,1 +1,1 @@
-"""Detection of motion, noise changes, spectral lines, outliers, repeated samples and disagreement with a model."""
+"""Detection of motion, noise changes, spectral lines, outliers and disagreement with the noise model."""

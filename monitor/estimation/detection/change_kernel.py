@@ -1,31 +1,26 @@
-"""Compiled kernel of the change detector, with the Haar differences of every octave, the CUSUMs and the alarms.
+"""Compiled kernel of the change detector: Haar differences, cumulative sums (CUSUM) and alarms.
 
-Samples are processed in groups of 32, which are called ticks. Missing samples are NaN. The kernel stops when the
-waiting time after an alarm has passed. The decision is therefore made at the same sample for any division of the input
-into blocks.
+Samples are processed in ticks of 32 samples. The kernel stops when a decision about an alarm is due, so the decision
+does not depend on the division of the input into blocks.
 
-- **Cascade.** Octave j combines two blocks of m = 2^j samples to a Haar difference z = (mean − mean')/√2. The mean
-  square of z is the Allan variance at m. The sum of the two blocks is a block of the next octave. Differences of one
-  octave do not overlap, and Haar functions of different octaves are orthogonal. For white noise and random walk, all z
-  are therefore independent. The cost is two additions per sample and axis, for any number of octaves.
-- **Evidence.** The n squares z² since the start of the reference have the sum S, and the n₁ squares since a suspected
-  onset have the sum S₁. The hypothesis that the variance has been multiplied by r since the onset is compared with the
-  hypothesis of no change. The likelihood ratio uses only quantities that do not depend on the unknown variance (the
-  maximal invariant under scale). The logarithm of the likelihood ratio, called the evidence g, is
+- **Cascade.** Octave j combines the means of two successive blocks of m = 2^j samples to a Haar difference z = (mean −
+  mean')/√2. The mean square of z is the Allan variance at cluster size m. For white noise and random walk, all z are
+  independent. The cost is two additions per sample and axis.
+- **Evidence.** Let S be the sum of the n squares z² since the start of the reference, and S₁ the sum of the n₁ squares
+  since a suspected change. The log-likelihood ratio of "variance multiplied by r" and "no change" is called the
+  evidence g:
 
       g = −(n/2) ln(1 − (1 − 1/r) S₁/S) − (n₁/2) ln r.
 
-  With a long reference, g is Page's CUSUM, the sum of ½[u(1 − 1/r) − ln r] with u = z² over the reference variance.
-  With a short reference, g is smaller, because the reference is uncertain. Without a change, the mean of e^g is 1 for
-  every onset. The probability of an alarm at threshold h within k tests is therefore at most k e^−h (Shiryaev–Roberts).
-  If g ≤ 0, the suspected onset is set to the current sample.
-- **Non-Gaussian and dependent noise.** z² is clipped at ``CLIP`` times the reference variance, which corresponds to 4σ.
-  For Gaussian noise, clipping affects a share of 6e-5 of the values and lowers the mean by 2e-4, both in the reference
-  and after the onset. The evidence g is divided by a factor F, the ratio of the measured variance of sums of z² to the
-  variance for independent Gaussian z. F is estimated from the Haar differences of successive sums of z². F exceeds 1
-  for heavy tails, spectral lines and coarse resolution.
-- **Steps** are detected by comparing a pair of blocks with the next but one pair. The pair between them may contain the
-  step.
+  The evidence does not depend on the unknown variance. With a long reference, g is Page's CUSUM. Without a change, the
+  mean of e^g is 1, so the probability of an alarm at threshold h within k tests is at most k e^−h (Shiryaev–Roberts).
+  If g ≤ 0, the suspected change is set to the current sample.
+- **Non-Gaussian and correlated noise.** z² is clipped at ``CLIP`` times the reference variance, which corresponds to
+  4σ. For Gaussian noise, clipping affects a share of 6e-5 of the values and reduces the mean by 2e-4. The evidence is
+  divided by the factor F, the variance of sums of z² relative to independent Gaussian z. Heavy tails, spectral lines
+  and coarse resolution increase F.
+- **Steps** are detected by comparing a pair of blocks with the next but one pair. The pair in between may contain the
+step.
 """
 
 from typing import Final, NamedTuple
@@ -37,21 +32,21 @@ from monitor.common.compiled import compiled
 
 AXES: Final = 6
 RATIOS: Final = np.array([1.2, 1.44, 2.25, 1 / 1.2, 1 / 1.44, 1 / 2.25])
-"""Ratios of the variance after and before a change to which the CUSUMs are tuned."""
+"""Ratios of the variance after and before a change for which the evidence is computed."""
 GAIN: Final = 1.0 - 1.0 / RATIOS
 """The factor 1 − 1/r of each ratio r."""
 HALF_LOG: Final = 0.5 * np.log(RATIOS)
 """The term ½ ln r of each ratio r."""
 TICK_SAMPLES: Final = 32
-"""Number of samples in a tick. The z² of the shortest octaves are summed over a tick, because logarithms are slow."""
+"""Number of samples in a tick. The evidence is updated once per tick, because logarithms are slow."""
 SHORT: Final = 5
-"""Number of octaves within a tick."""
+"""Number of octaves that are shorter than a tick."""
 RAREST: Final = 1e-6
-"""Minimum share of extreme values that is assumed for the reference."""
+"""Minimum share of extreme values in the reference."""
 HUGE: Final = 1e150
-"""Samples at or above this absolute value count as missing, because their square overflows."""
+"""Absolute value at or above which samples count as missing, because their square overflows."""
 CLIP: Final = 16.0
-"""Level at which z² is clipped, relative to the reference."""
+"""Maximum of z² relative to the reference variance. Larger values are clipped."""
 EXTREME: Final = 36.0
 """Ratio of z² to the reference variance above which a difference is an outlier.
 
@@ -60,27 +55,27 @@ The limit is 6σ, which a share of 2e-9 of Gaussian values exceeds.
 MEDIAN: Final = 0.45494
 """Median of χ² with one degree of freedom."""
 SEED: Final = 31
-"""Number of first z² of an octave, whose median determines the clip level. An outlier at the start has no effect."""
+"""Number of first z² of an octave. The median of these values determines the clip level."""
 SETTLED: Final = 256
-"""Number of z² after which the clip level is final."""
+"""Number of z² after which the clip level is constant."""
 MIN_REFERENCE_TERMS: Final = 64
 """Minimum number of terms of a reference for an alarm, multiplied by F².
 
-With the first factor F, correlated terms contain as much information as this number of independent terms. With the
-second factor, F is known for sums that are much longer than the correlation of the terms.
+F terms contain the information of one independent term. The second factor F ensures that F is known for sums that are
+much longer than the correlation of the terms.
 """
 MIN_BAND_TERMS: Final = 16
-"""Minimum number of terms of a longer octave from which the variation of the mean by slow noise is estimated."""
+"""Minimum number of terms of a longer octave for the estimate of slow noise."""
 MIN_SPREAD_PAIRS: Final = 8
-"""Minimum number of pairs for a valid spread F."""
+"""Minimum number of pairs for an estimate of the factor F."""
 MAX_FLANK: Final = 12.0
-"""Ratio of z² to the reference variance above which a pair of blocks beside a step is not at rest."""
+"""Maximum ratio of z² to the reference variance beside a step."""
 CONFIRM_PAIRS: Final = 2
-"""Number of pairs after a step whose means must stay at the new level."""
+"""Number of block pairs after a step that must confirm the step."""
 SLOTS: Final = 4
-"""Number of snapshots per level in ``ChangeState.snap``."""
+"""Number of stored sums per level in ``ChangeState.snap``."""
 NEVER: Final = 1 << 62
-"""Sample number that means "no decision is due"."""
+"""Sample number that means that no decision is due."""
 
 N, S, LIMIT, SEEDED, F = range(5)
 """Columns of ``ChangeState.band``."""
@@ -103,32 +98,32 @@ H_NOISE, H_BURST, STEP_SIGMA, DWELL, LONGEST_DWELL, LEARN_TIME = range(6)
 
 
 class ChangeState(NamedTuple):
-    """State of the change detector for A = 6 axes, J octaves and L = 12 levels. The size of the state is constant."""
+    """State of the change detector for A = 6 axes, J octaves and L = 12 levels."""
 
     levels: Floats  # [6] thresholds, and times in samples; see H_NOISE
     clock: Ints  # [2] samples since the start; sample of the next decision
-    born: Ints  # [A] sample at which the reference began
-    stage: Floats  # [A, TICK] samples of the current tick
-    half: Floats  # [A, J, 2] sum and count of the block that waits for its partner
-    fill: Ints  # [A, J] number of complete pairs stored for the detection of steps; −1: do not use the current pair
+    born: Ints  # [A] first sample of the reference
+    stage: Floats  # [A, 32] samples of the current tick
+    half: Floats  # [A, J, 2] sum and number of samples of the first block of a pair
+    fill: Ints  # [A, J] number of complete pairs for the detection of steps; −1 excludes the current pair
     ring: Floats  # [A, J, 2, 2] mean and block difference of the last two pairs
     seeds: Floats  # [A, J, SEED] first z²
-    band: Floats  # [A, J, 5] reference: number and sum of clipped z², clip level, number of seeds, F
+    band: Floats  # [A, J, 5] reference: number and sum of clipped z², clip level, number of first z², F
     unit: (
         Floats  # [A, J, 5] since the last test: number, sum of clipped z², sum of z², number below the median, extremes
     )
-    cum: Floats  # [A, J, 5] the same since the start
-    cusum: Floats  # [A, J, 6, 4] n1, S1, sample of the suspected onset, evidence g
+    cum: Floats  # [A, J, 5] columns of ``unit`` since the start
+    cusum: Floats  # [A, J, 6, 4] n₁, S₁, first sample of the suspected change, evidence g
     spread: Floats  # [A, J, L, 5] sums of z²: stored sum, 1 if stored, squared differences, pairs, spread F
-    burst: Floats  # [A, 2] CUSUM of extremes, and the last sample at which the CUSUM was zero
-    alarm: Floats  # [A, 5] pending alarm, see KIND; kind 0 means none
-    step: Floats  # [A, 6] octave (−1 means none), mean before and after, position, sigma, pairs left to confirm
-    snap: Floats  # [levels, SLOTS, A, J, 5] snapshots of ``cum``, with a spacing proportional to their age
-    snap_at: Ints  # [levels, SLOTS] sample numbers of the snapshots
+    burst: Floats  # [A, 2] CUSUM of extreme values, and the last sample with a CUSUM of zero
+    alarm: Floats  # [A, 5] pending alarm, see KIND; kind 0 means no alarm
+    step: Floats  # [A, 6] octave or −1, mean before and after, position, significance, number of remaining pairs
+    snap: Floats  # [levels, SLOTS, A, J, 5] copies of ``cum``; older copies have larger intervals
+    snap_at: Ints  # [levels, SLOTS] sample numbers of the copies
 
 
-def make_state(octaves: int) -> ChangeState:
-    """Return the initial state. The caller must set ``levels``."""
+def make_change_state(octaves: int) -> ChangeState:
+    """Return the initial state of the change detector. The caller must set ``levels``."""
     a, j = AXES, octaves
     state = ChangeState(
         np.zeros(6), np.array([0, NEVER], np.int64), np.zeros(a, np.int64),
@@ -144,22 +139,22 @@ def make_state(octaves: int) -> ChangeState:
 
 
 @compiled
-def advance(s: ChangeState, rows: Floats, first: int) -> int:
-    """Process rows until a decision is due, and return the row after the last one processed.
+def advance_until_decision(s: ChangeState, samples: Floats, first_row: int) -> int:
+    """Process samples until a decision about an alarm is due, and return the next row to process.
 
     Parameters
     ----------
     s : ChangeState
-        State, updated in place.
-    rows : ndarray of float64, shape (n, 6)
+        State of the change detector, updated in place.
+    samples : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s²; NaN means missing.
-    first : int
+    first_row : int
         First row to process.
     """
-    for row in range(first, len(rows)):
+    for row in range(first_row, len(samples)):
         place = s.clock[TOTAL] % TICK_SAMPLES
         for axis in range(AXES):
-            s.stage[axis, place] = rows[row, axis]
+            s.stage[axis, place] = samples[row, axis]
         s.clock[TOTAL] += 1
         if place == TICK_SAMPLES - 1:
             now = s.clock[TOTAL]
@@ -168,12 +163,11 @@ def advance(s: ChangeState, rows: Floats, first: int) -> int:
             _remember(s, now // TICK_SAMPLES)
             if now >= s.clock[NEXT_DUE]:
                 return row + 1
-    return len(rows)
+    return len(samples)
 
 
 @compiled
 def _tick(s: ChangeState, axis: int, now: int) -> None:
-    """Process a tick of one axis, first the octaves shorter than a tick, then the longer octaves."""
     sums = s.stage[axis]
     total, count = 0.0, 0.0
     for i in range(TICK_SAMPLES):
@@ -212,10 +206,8 @@ def _tick(s: ChangeState, axis: int, now: int) -> None:
 def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: int, j: int) -> None:
     """Add the squared Haar differences of one octave within a tick.
 
-    On input, ``sums`` begins with the sums over blocks of 2^j samples. On return, it begins with the sums over blocks
-    of twice the length.
-
-    The code uses indices, because array views would cost more than the arithmetic.
+    ``sums`` contains the sums over blocks of 2^j samples, and is replaced by the sums over blocks of twice the length.
+    Array views would be slower than the index arithmetic.
     """
     scale = 0.5 / (1 << j) ** 2
     limit = band[axis, j, LIMIT]
@@ -244,7 +236,7 @@ def _differences(sums: Floats, band: Floats, unit: Floats, seeds: Floats, axis: 
 
 @compiled
 def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: float, count2: float, now: int) -> None:
-    """Process two blocks of 2^j samples. A block with more than a sixteenth of the samples missing is not used."""
+    """Process two blocks of 2^j samples. Blocks with more than 1/16 of the samples missing are ignored."""
     m = 1 << j
     least = m - m // 16
     fill = s.fill[axis, j]
@@ -253,7 +245,7 @@ def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: f
         return
     d = sum2 / count2 - sum1 / count1
     mean = (sum1 + sum2) / (count1 + count2)
-    # scaled as for white noise, with 1/count1 + 1/count2 instead of 2/m
+    # For white noise, the variance of d is proportional to 1/count1 + 1/count2.
     z2 = d * d * count1 * count2 / ((count1 + count2) * m)
     _gather(s.band, s.unit, s.seeds, axis, j, z2)
     if s.step[axis, 0] == j:
@@ -267,7 +259,7 @@ def _pair(s: ChangeState, axis: int, j: int, sum1: float, count1: float, sum2: f
 
 @compiled
 def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: float) -> None:
-    """Add one z² to the sums of an octave. The first values are stored and determine the clip level."""
+    """Add one z² to the sums of an octave. The first ``SEED`` values determine the clip level."""
     if band[axis, j, SEEDED] == SEED:
         limit = band[axis, j, LIMIT]
         unit[axis, j, UNIT_N] += 1.0
@@ -284,9 +276,9 @@ def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: fl
         if scale == 0.0:
             for value in first:
                 scale += value
-            scale /= SEED  # the resolution is coarser than the noise
+            scale /= SEED  # more than half of the differences are zero, because the resolution is coarse
         if scale == 0.0:
-            one[SEEDED] = 0.0  # a constant axis has no noise that could change
+            one[SEEDED] = 0.0  # a constant axis has no noise
         one[LIMIT] = CLIP * scale
         one[N], one[S] = SEED, 0.0
         for value in first:
@@ -295,7 +287,6 @@ def _gather(band: Floats, unit: Floats, seeds: Floats, axis: int, j: int, z2: fl
 
 @compiled
 def _median_of_seeds(first: Floats) -> float:
-    """Return the median by counting smaller and equal values."""
     for value in first:
         below, equal = 0, 0
         for other in first:
@@ -310,9 +301,9 @@ def _median_of_seeds(first: Floats) -> float:
 def _look(
     unit: Floats, cum: Floats, band: Floats, spread: Floats, cusum: Floats, axis: int, j: int, now: int, h: float
 ) -> int:
-    """Add the new z² of one octave to the reference and to the CUSUMs.
+    """Add new z² of one octave to the reference and to the evidence.
 
-    Return the index of the variance ratio with the largest evidence above the threshold h, or −1 if there is none.
+    Return the index of the variance ratio with the largest evidence above the threshold h, or −1.
     """
     k, q = unit[axis, j, UNIT_N], unit[axis, j, UNIT_S]
     if k == 0.0:
@@ -334,9 +325,9 @@ def _look(
 def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: float) -> None:
     """Update the factor F of one octave.
 
-    F is estimated from the squared Haar differences of sums of z² over 1, 2, 4, … tests, relative to the expectation
-    for independent Gaussian z. An estimate that is not significantly above 1 is reduced by its standard deviation. The
-    largest estimate of all lengths is used.
+    F is the ratio of the squared Haar differences of sums of z² to the expectation for independent Gaussian z. The
+    largest ratio over sums of 1, 2, 4, … tests is used. A ratio that is not significantly above 1 is reduced by its
+    standard deviation.
     """
     v = band[axis, j, S] / band[axis, j, N]
     for level in range(spread.shape[2]):
@@ -365,9 +356,9 @@ def _feed_spread(spread: Floats, band: Floats, axis: int, j: int, q: float, k: f
 def _raise_cusums(
     cusum: Floats, band: Floats, axis: int, j: int, k: float, q: float, now: int, threshold: float
 ) -> int:
-    """Update the evidence g of each variance ratio, as described in the module docstring.
+    """Update the evidence of all variance ratios.
 
-    Return the index of the ratio with the largest evidence above the threshold, or −1 if there is none.
+    Return the index of the ratio with the largest evidence above the threshold, or −1.
     """
     n, total, spread = band[axis, j, N], band[axis, j, S], band[axis, j, F]
     best, largest = -1, threshold
@@ -388,7 +379,7 @@ def _raise_cusums(
 
 @compiled
 def _suspect(s: ChangeState, axis: int, j: int, i: int, now: int) -> None:
-    """Raise an alarm for a noise change if the reference is long enough, otherwise restart the reference."""
+    """Raise an alarm for a noise change. If the reference is too short, restart the reference instead."""
     since = s.cusum[axis, j, i, SINCE]
     enough = s.band[axis, j, N] - s.cusum[axis, j, i, N1] >= MIN_REFERENCE_TERMS * s.band[axis, j, F] ** 2
     if enough and since - s.born[axis] >= s.levels[LEARN_TIME]:
@@ -409,9 +400,9 @@ def _relearn(s: ChangeState, axis: int, j: int) -> None:
 
 @compiled
 def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis: int, now: int) -> float:
-    """Update and return the CUSUM of extreme values, which are treated as Bernoulli trials.
+    """Update and return the CUSUM of extreme values.
 
-    The CUSUM tests whether the share of extreme values is ten times the share at rest, and at least 1 %.
+    The CUSUM tests for a share of extreme values of at least 1 % that is also ten times the share at rest.
     """
     outer = 2.0 * band[axis, 0, LIMIT] * (EXTREME / CLIP)  # (y − y')² is 2 z²
     if band[axis, 0, SEEDED] != SEED or outer == 0.0:
@@ -434,9 +425,9 @@ def _count_extremes(sums: Floats, band: Floats, cum: Floats, burst: Floats, axis
 
 @compiled
 def _alarm(s: ChangeState, axis: int, kind: float, since: float, evidence: float, now: int) -> None:
-    """Record an alarm of an axis that has none.
+    """Record an alarm, unless the axis already has an alarm.
 
-    The waiting time before the decision is the time from the onset to the alarm, within limits.
+    Within limits, the waiting time before the decision equals the time from the onset to the alarm.
     """
     alarm = s.alarm[axis]
     if alarm[KIND] != 0.0 and not (alarm[FOUND] == now and evidence > alarm[EVIDENCE]):
@@ -444,11 +435,11 @@ def _alarm(s: ChangeState, axis: int, kind: float, since: float, evidence: float
     wait = np.ceil(min(max(now - since, s.levels[DWELL]), s.levels[LONGEST_DWELL]) / TICK_SAMPLES) * TICK_SAMPLES
     alarm[KIND], alarm[START], alarm[FOUND], alarm[EVIDENCE], alarm[DUE] = kind, since, now, evidence, now + wait
     s.step[axis, 0] = -1.0
-    set_due(s)
+    set_next_decision_time(s)
 
 
 @compiled
-def set_due(s: ChangeState) -> None:
+def set_next_decision_time(s: ChangeState) -> None:
     """Set the sample at which the kernel stops for the next decision."""
     s.clock[NEXT_DUE] = NEVER
     for axis in range(AXES):
@@ -458,9 +449,9 @@ def set_due(s: ChangeState) -> None:
 
 @compiled
 def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: int) -> None:
-    """Test for a step between the newest pair of blocks and the next but one older pair.
+    """Search for a step between the newest pair of blocks and the next but one older pair.
 
-    The two pairs must be at rest, and a linear slope must not explain the difference.
+    A step is rejected if the sensor moves or if a linear slope explains the difference.
     """
     ring = s.ring[axis, j]
     height = mean - ring[0, 0]
@@ -479,7 +470,7 @@ def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: in
     for above in range(j + 1, j + 4):
         if s.band[axis, above, N] < MIN_BAND_TERMS:
             return
-        # Random walk and flicker also change the means of blocks that are four blocks apart.
+        # Random walk and flicker noise also change the mean within four blocks.
         v = max(v, 2.0 * s.band[axis, above, S] / s.band[axis, above, N])
     sigma = np.abs(height) / np.sqrt(v * band[F])
     straight = height - 2.0 * (d + ring[0, 1])  # without the part that the slopes on both sides explain
@@ -494,7 +485,7 @@ def _seek_step(s: ChangeState, axis: int, j: int, mean: float, d: float, now: in
 
 @compiled
 def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
-    """Confirm a step if the mean stays at the new level for ``CONFIRM_PAIRS`` pairs, and discard the step otherwise."""
+    """Confirm a step after ``CONFIRM_PAIRS`` pairs at the new mean. Discard the step if the mean changes again."""
     step = s.step[axis]
     if np.abs(mean - step[AFTER]) > 0.5 * np.abs(step[AFTER] - step[BEFORE]):
         step[0] = -1.0
@@ -504,15 +495,14 @@ def _confirm(s: ChangeState, axis: int, mean: float, now: int) -> None:
         alarm = s.alarm[axis]
         alarm[KIND], alarm[START], alarm[FOUND] = STEP, step[PLACE], now
         alarm[EVIDENCE], alarm[DUE] = 0.5 * step[SIGMA] ** 2, now
-        set_due(s)
+        set_next_decision_time(s)
 
 
 @compiled
 def _remember(s: ChangeState, tick: int) -> None:
-    """Store a snapshot of ``cum``.
+    """Store a copy of ``cum``.
 
-    A snapshot at an odd multiple of 2^k ticks is stored in level k, so that the spacing of the snapshots grows with
-    age.
+    Copies at odd multiples of 2^k ticks are stored in level k, so that older copies have larger intervals.
     """
     level = 0
     while tick & 1 == 0:

@@ -1,22 +1,18 @@
-"""Identification of the coefficients Q, N, B and K that changed, from the variances of octaves before and after.
+"""Identification of the noise coefficients Q, N, B and K that changed, from Haar variances before and after.
 
 The change of the Haar variance of octave j, δ_j = after − before, is linear in the changes of Q², N², B² and K². The
-factors are the sampled Allan variances of the terms (IEEE Std 952 annex C). If the variances are means of n_before and
-n_after terms with spread F, the variance of δ_j is 2F(after²/n_after + before²/n_before).
+factors are the sampled Allan variances of the noise terms (IEEE Std 952 annex C). The variance of δ_j is
+2F(after²/n_after + before²/n_before) for means of n_before and n_after terms with the factor F of ``change_kernel``.
 
-All 16 subsets of the coefficients are fitted by weighted least squares. Each coefficient of a subset must decrease χ²
-by ``CHI2_PER_LETTER``, which corresponds to a significance of 3σ. No coefficient may become negative. All coefficients
-of a subset must change in the same direction, because two opposite changes at the same time are less likely than a
-filter or a spectral line.
+All 16 subsets of the coefficients are fitted by weighted least squares. Each coefficient of the selected subset must
+reduce χ² by ``CHI2_PER_LETTER``. All changes of a subset must have the same sign, because two opposite changes are less
+likely than a filter or a spectral line. Coefficients cannot become negative.
 
-If the misfit of the best subset is too large, no coefficient explains the change, and the changed frequency band is
-reported. A Haar difference of clusters of length τ is most sensitive at f = 0.371/τ. The band extends by half an octave
-on both sides. Real sensors do not follow the standard terms exactly, so deviations up to ``SHAPE_TOLERANCE`` of the
-variance are tolerated.
+If no subset explains the change, the changed frequency band is reported. A Haar difference of clusters of length τ is
+most sensitive at the frequency 0.371/τ. The band is extended by half an octave on both sides.
 
-Q also represents a vibration near the Nyquist frequency. A line of amplitude A contributes A² sin⁴(πfτ)/(πfτ)². At a
-third of the sample rate, sin⁴ is 9/16 at every octave, so the contribution is proportional to 1/τ², as for Q. Octaves
-cannot distinguish quantization noise and such a vibration, so the text for a change of Q names both causes.
+A change of Q can also be caused by a vibration near the Nyquist frequency. The Allan variance of a vibration at one
+third of the sample rate is proportional to 1/τ² in all octaves, as for quantization noise.
 """
 
 from dataclasses import dataclass
@@ -26,50 +22,50 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.standard_terms import unit_allan_variances
+from monitor.noise.standard_terms import unit_coefficient_allan_variances
 
 CHANGE_SYMBOLS: Final = "QNBK"
-"""Symbols of the coefficients that can change."""
+"""Symbols of the noise coefficients that are tested for a change."""
 CHI2_PER_LETTER: Final = 9.0
-"""Minimum decrease of χ² for each coefficient."""
+"""Minimum decrease of χ² for each coefficient, which corresponds to 3σ."""
 SHAPE_TOLERANCE: Final = 0.03
-"""Tolerated deviation of an octave from the standard terms, as a share of the variance."""
+"""Maximum deviation from the standard noise terms, as a share of the variance."""
 MAX_MISFIT_SIGMA: Final = 2.5
-"""Largest misfit of a subset, in standard deviations of χ²."""
+"""Maximum misfit of a subset of coefficients, in standard deviations of χ²."""
 MIN_TERMS: Final = 8.0
 """Minimum number of terms of an octave before and after the change."""
 PEAK_F_TAU: Final = 0.371
-"""Value of f τ at which sin⁴(πfτ)/(πfτ)² is largest."""
+"""Value of f τ at which the kernel sin⁴(πfτ)/(πfτ)² is largest."""
 
 
 @dataclass(frozen=True, slots=True)
 class HaarVariancesBeforeAfter:
-    """Haar variances of one axis before and after a change. Element j of each array is for clusters of 2^j samples."""
+    """Haar variances of one axis before and after a change. Element j belongs to clusters of 2^j samples."""
 
     before: Floats  # variance, squared unit of the axis
-    n_before: Floats  # number of terms, divided by their spread F
+    n_before: Floats  # number of terms, divided by the factor F of ``change_kernel``
     after: Floats  # variance, squared unit of the axis
-    n_after: Floats  # number of terms, divided by their spread F
+    n_after: Floats  # number of terms, divided by the factor F of ``change_kernel``
 
     @property
-    def usable_octaves(self) -> np.ndarray:
+    def octaves_with_enough_terms(self) -> np.ndarray:
         """Boolean array, True for octaves with enough terms before and after the change."""
         return (self.n_after >= MIN_TERMS) & (self.n_before >= MIN_TERMS) & (self.before > 0.0)
 
-    def evidence(self) -> float:
-        """Return the logarithm of the likelihood ratio of "all octaves changed" and "no octave changed".
+    def log_likelihood_ratio_of_change(self) -> float:
+        """Return the log-likelihood ratio of "all octaves changed" and "no octave changed".
 
-        The expectation without a change is subtracted.
+        The expected value for unchanged noise is subtracted.
         """
-        ok = self.usable_octaves & (self.after > 0.0)
+        ok = self.octaves_with_enough_terms & (self.after > 0.0)
         n0, n1, v0, v1 = self.n_before[ok], self.n_after[ok], self.before[ok], self.after[ok]
         pooled = (n0 * v0 + n1 * v1) / (n0 + n1)
         gained = 0.5 * ((n0 + n1) * np.log(pooled) - n0 * np.log(v0) - n1 * np.log(v1))
         return float(max(gained.sum() - 0.5 * ok.sum(), 0.0))
 
 
-def identify_noise_change(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> dict[str, tuple[float, float]]:
-    """Return the coefficients that changed, or the frequency band if no coefficient explains the change.
+def identify_changed_coefficients(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> dict[str, tuple[float, float]]:
+    """Return the noise coefficients that changed, or the changed frequency band.
 
     Parameters
     ----------
@@ -81,22 +77,22 @@ def identify_noise_change(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> 
     Returns
     -------
     dict of str to tuple of float
-        Value before and after in SI for each changed coefficient. If no coefficient explains the change, ``band``
-        contains the lowest and the highest frequency in Hz. ``rms`` then contains the Haar deviation before and after
-        at the octave that changed most. The dictionary is empty if no octave has enough terms.
+        Values before and after the change, in SI units, for each changed coefficient. If no coefficient explains the
+        change, ``band`` contains the limits of the frequency band in Hz. The key ``rms`` then contains the Haar
+        deviations before and after the change. The dictionary is empty if no octave has enough terms.
     """
-    ok = octaves.usable_octaves
+    ok = octaves.octaves_with_enough_terms
     if not ok.any():
         return {}
     tau0 = 1.0 / rate_hz
     tau = np.asarray(tau0 * 2.0 ** np.flatnonzero(ok), np.float64)
-    columns = unit_allan_variances(tau, tau0)[:, : len(CHANGE_SYMBOLS)]
+    columns = unit_coefficient_allan_variances(tau, tau0)[:, : len(CHANGE_SYMBOLS)]
     v0, v1, n0, n1 = octaves.before[ok], octaves.after[ok], octaves.n_before[ok], octaves.n_after[ok]
     floor, _, _ = _select_letters(
         columns, v0, 2.0 * v0**2 / n0 + (SHAPE_TOLERANCE * v0) ** 2, np.zeros(len(CHANGE_SYMBOLS))
     )
     change, misfit, var = np.zeros(len(CHANGE_SYMBOLS)), np.inf, 2.0 * (v1**2 / n1 + v0**2 / n0)
-    for _ in range(3):  # weights from the model, because a variance that is small by chance must not get a large weight
+    for _ in range(3):  # A small variance must not get a large weight by chance.
         change, chosen, misfit = _select_letters(columns, v1 - v0, var + (SHAPE_TOLERANCE * v1) ** 2, floor)
         model = np.maximum(v0 + columns @ change, 0.2 * v1)
         var = 2.0 * (model**2 / n1 + v0**2 / n0)
@@ -110,7 +106,7 @@ def identify_noise_change(octaves: HaarVariancesBeforeAfter, rate_hz: float) -> 
 def _select_letters(
     columns: Floats, values: Floats, var: Floats, floor: Floats
 ) -> tuple[Floats, tuple[int, ...], float]:
-    """Return the changes, the indices and the χ² of the subset of coefficients with the smallest penalized χ²."""
+    """Return the changes, the indices and the χ² of the best subset of coefficients."""
     weight = 1.0 / np.sqrt(var)
     best, which = np.zeros(len(CHANGE_SYMBOLS)), tuple[int, ...]()
     least = price = float(((values * weight) ** 2).sum())
@@ -121,7 +117,7 @@ def _select_letters(
             scaled, *_ = np.linalg.lstsq(a / scale, values * weight, rcond=1e-9)
             x = scaled / scale
             if (x < -floor[list(chosen)]).any():
-                # A coefficient that would become negative is set to zero, and χ² is computed with this value.
+                # A coefficient that would become negative is set to zero.
                 x = np.maximum(x, -floor[list(chosen)])
             if (x > 0.0).any() and (x < 0.0).any():
                 continue
@@ -134,9 +130,9 @@ def _select_letters(
 
 
 def _find_band(tau: Floats, v0: Floats, v1: Floats, sigma: Floats, rate_hz: float) -> dict[str, tuple[float, float]]:
-    """Return the band of octaves around the most significant one.
+    """Return the frequency band around the most significant octave.
 
-    The band includes neighbouring octaves that changed significantly and by at least half the relative amount.
+    Neighbouring octaves belong to the band if their relative change is significant and at least half as large.
     """
     relative, strength = v1 / v0 - 1.0, np.abs(v1 - v0) / sigma
     top = int(strength.argmax())

@@ -1,12 +1,9 @@
-"""Detection of quantization steps that are as large as the noise and therefore distort the measured noise.
+"""Detection of quantization steps that are large enough to distort the measured noise.
 
-For each axis, the quantization step and the noise from sample to sample are estimated from at most ``MAX_STRETCHES``
-stretches of ``ROWS`` samples, spread over the recording. The step is the smallest distance between two different
-values. The noise is computed from the mean absolute difference of successive samples. This mean does not depend on the
-step size, and a few outliers or a slow drift hardly affect it.
+The quantization step is the smallest distance between two different values of an axis. The noise is computed from the
+mean absolute difference of successive samples, which outliers and slow drift hardly affect.
 
-``reconcile`` also detects steps that are far smaller than the noise (``value_statistics.detect_quantization``). It
-searches for the common divisor of all differences and compares the divisor with the resolution of the number format.
+``reconcile`` uses another method, which also detects steps far below the noise (``value_statistics``).
 """
 
 from dataclasses import dataclass
@@ -17,17 +14,17 @@ import numpy as np
 from drivers.data_types import AXES, Floats
 
 MIN_STEP_TO_NOISE: Final = 0.5
-"""Minimum step relative to the noise. Smaller steps add at most two percent to the variance of the noise."""
+"""Minimum ratio of step and noise. Smaller steps increase the noise variance by at most two percent."""
 ROWS: Final = 4096
-"""Maximum number of samples in a stretch."""
+"""Maximum number of samples in a stretch of the recording."""
 MAX_STRETCHES: Final = 16
 GRID_TOLERANCE: Final = 0.1
-"""Deviation from a whole number of steps, as a share of the step, within which a value is on the grid.
+"""Maximum deviation from a whole number of steps, as a share of the step.
 
-Values rounded to float32 are on the grid.
+The tolerance allows for values rounded to float32.
 """
 SIGMA_PER_MEAN_DISTANCE: Final = 0.8862269254527580
-"""√π/2, the ratio of σ to the mean distance between two samples of Gaussian noise."""
+"""Ratio √π/2 of σ to the mean absolute difference of two samples of Gaussian noise."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +33,15 @@ class QuantizationStep:
 
     axis: int  # index into AXES
     step: float  # rad/s or m/s²
-    noise: float  # σ from sample to sample, including quantization, rad/s or m/s²
+    noise: float  # standard deviation of successive samples, rad/s or m/s²
 
 
-def find_coarse_axes(values: Floats) -> list[QuantizationStep]:
-    """Return the axes of samples [n, 6] whose quantization step is at least ``MIN_STEP_TO_NOISE`` times the noise.
+def find_coarsely_quantized_axes(values: Floats) -> list[QuantizationStep]:
+    """Return the axes of samples [n, 6] with a quantization step of at least ``MIN_STEP_TO_NOISE`` times the noise.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[:, 4] = noise[:, 4].round()
-    >>> [(one.axis, one.step, round(one.noise, 1)) for one in find_coarse_axes(noise)]
+    >>> [(one.axis, one.step, round(one.noise, 1)) for one in find_coarsely_quantized_axes(noise)]
     [(4, 1.0, 1.0)]
     """
     rows = min(ROWS, len(values))
@@ -64,7 +61,7 @@ def find_coarse_axes(values: Floats) -> list[QuantizationStep]:
 
 
 def _step(levels: Floats, least: float) -> float | None:
-    """Return the step of the regular grid that contains all values, or None if the step would be below ``least``."""
+    """Return the step of the regular grid that contains all values, or None if the step is below ``least``."""
     apart = np.diff(levels)
     if not apart.size or not apart.min() >= least:
         return None

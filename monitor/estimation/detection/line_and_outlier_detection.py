@@ -1,26 +1,20 @@
-"""Detection of spectral lines, resonances and outliers, which the five Gaussian noise terms cannot explain.
+"""Detection of spectral lines, resonances and outliers in a recording.
 
-The input is a recording on a regular grid and the Allan curve of the recording. The results are a ``Line`` for each
-relevant peak, and the share of outliers of each axis. At most ``MAX_STRETCHES`` stretches of ``ROWS`` samples, spread
-over the recording, are searched. The longest recording therefore takes no more than a second. Stretches with more than
-``MAX_MISSING_SHARE`` missing samples are skipped.
+At most ``MAX_STRETCHES`` stretches of ``ROWS`` samples are searched, so even the longest recording takes less than a
+second. Stretches with more than ``MAX_MISSING_SHARE`` missing samples are skipped.
 
-- **Lines.** The periodograms of the stretches with a Hann window are averaged (Welch 1967). A peak exceeds the medians
-  of the bins on both sides by ``MIN_PEAK_SIGMA`` and by the factor ``MIN_PEAK_RATIO``. Lines are searched in single
-  bins, and resonances in bins that are ``WIDE_BINS`` times wider. The power of a peak is the power above the level of
-  both sides. A peak is reported if it contributes a share of at least ``MIN_LINE_SHARE`` of the Allan variance at some
-  τ. A line of amplitude A contributes A² sin⁴(πfτ) / (m sin(πf/rate))². This is the formula of IEEE Std 952, annex C,
-  for a mean of m samples instead of an integral. A resonance is treated as a line of the same power.
-- **Outliers** deviate by more than ``OUTLIER_SIGMA`` σ of their stretch from the median of the ``BLOCK`` samples around
-  them. They also deviate by half as much from the median of the ``NEIGHBOURS`` samples on each side, which excludes
-  slopes and curvature within the block. σ is estimated from the median distance, which changes by an eighth if one
-  sample in ten is an outlier. σ is at least one quantization step.
+- **Spectral lines.** The periodograms of all stretches with a Hann window are averaged (Welch 1967). A peak must exceed
+  the medians of the neighbouring bins on both sides by ``MIN_PEAK_SIGMA`` and by the factor ``MIN_PEAK_RATIO``. Lines
+  are searched in single bins, and resonances in bins that are ``WIDE_BINS`` times wider. A line of amplitude A
+  contributes A² sin⁴(πfτ) / (m sin(πf/rate))² to the Allan variance (IEEE Std 952 annex C, for a mean of m samples).
+  Peaks that contribute less than ``MIN_LINE_SHARE`` at every averaging time are not reported.
+- **Outliers** deviate by more than ``OUTLIER_SIGMA`` σ from the median of a block of ``BLOCK`` samples. To exclude
+slopes, an outlier must also deviate by ``OUTLIER_SIGMA``/2 σ from the median of the neighbouring samples. σ is computed
+  from the median absolute deviation, and is at least one quantization step.
 
 Lines with fewer than ``FIRST_BIN`` cycles per stretch and lines of short duration are not detected.
 
-``reconcile`` tests lines and outliers with other statistics, because it compares hypotheses by log-likelihood. The gain
-in log-likelihood is computed from a series that is whitened by the current model. It cannot be computed from an
-averaged spectrum or from distances from a median.
+``reconcile`` tests lines and outliers by log-likelihood and does not use this module.
 """
 
 from collections.abc import Iterator
@@ -37,68 +31,67 @@ from monitor.estimation.allan.curve import AllanCurve
 Mask = NDArray[np.bool_]
 
 ROWS: Final = 4096
-"""Maximum number of samples in a stretch."""
+"""Maximum number of samples in a stretch of the recording."""
 MIN_ROWS: Final = 256
-"""Minimum number of samples in a stretch."""
+"""Minimum number of samples in a stretch of the recording."""
 MIN_STRETCHES: Final = 8
 """Minimum number of stretches for a spectrum."""
 MAX_STRETCHES: Final = 128
 """Maximum number of stretches for a spectrum."""
 MAX_OUTLIER_STRETCHES: Final = 32
-"""Maximum number of stretches searched for outliers.
+"""Maximum number of stretches in the search for outliers.
 
-With 131 072 samples, a share of 0.001 is known with a relative error of 10 %.
+With 131 072 samples, a share of 0.001 has a relative error of 10 %.
 """
 MAX_MISSING_SHARE: Final = 0.05
 """Maximum share of missing samples in a stretch."""
 MIN_PEAK_SIGMA: Final = 6.5
-"""Minimum height of a peak in σ.
+"""Minimum height of a peak in standard deviations.
 
-With this value, no line was found in a thousand simulated recordings each of white, flicker, quantized, random-walk,
-low-pass filtered, coarse and repeated noise. The recordings had 2048 or 20 000 samples.
+With this limit, no line was found in 1000 simulated recordings of each noise type. The noise was white, flicker,
+quantized, random walk, low-pass filtered, coarse or repeated. Each recording had 2048 or 20 000 samples.
 """
 MIN_PEAK_RATIO: Final = 1.6
-"""Minimum factor by which a peak exceeds both sides.
+"""Minimum ratio of a peak to the neighbouring bins.
 
-A slope or the edge of a filter rises by a smaller factor within the bins of a side.
+A slope or a filter edge has a smaller ratio.
 """
 WIDE_BINS: Final = 16
-"""Width in bins of the wider bins in which resonances are searched."""
+"""Width of the bins for resonances, in bins of the spectrum."""
 FIRST_BIN: Final = 6
-"""First bin in which peaks are searched."""
+"""First bin in the search for peaks."""
 MIN_BINS: Final = 64
-"""Minimum number of bins in a spectrum. With fewer bins, quantization noise could be mistaken for a peak."""
+"""Minimum number of bins of a spectrum. With fewer bins, quantization noise resembles a peak."""
 NEAR_BINS: Final = 3
-"""Number of bins on each side of a line into which the Hann window spreads the power of the line."""
+"""Number of bins on each side of a line that contain leakage of the Hann window."""
 SIDE_BINS: Final = 16
-"""Number of bins on each side of a peak for the median; a quarter of this number for the wider bins."""
+"""Number of neighbouring bins on each side of a peak. Wide bins use a quarter of this number."""
 FOOT_SIGMA: Final = 2.0
-"""Minimum decrease in σ from ``NEAR_BINS`` bins to the next ones within the flank of a peak."""
+"""Minimum decrease in standard deviations over ``NEAR_BINS`` bins at the flank of a peak."""
 MIN_LINE_SHARE: Final = 0.002
 """Minimum share of the Allan variance for a reported line."""
 MAX_LINES: Final = 3
-"""Maximum number of lines per axis, the strongest first."""
+"""Maximum number of reported lines per axis."""
 OUTLIER_SIGMA: Final = 5.0
-"""Minimum deviation of an outlier in σ."""
+"""Minimum deviation of an outlier in standard deviations."""
 BLOCK: Final = 63
 """Number of samples in a block for the median.
 
-The number is odd, so that the median is one of the samples. Distances from the median are then whole quantization
-steps.
+With an odd number, the median is one of the samples, and the deviations are whole quantization steps.
 """
 NEIGHBOURS: Final = 3
-"""Number of neighbours on each side. Up to three outliers in a row are detected."""
+"""Number of neighbouring samples on each side of an outlier. Up to three successive outliers are detected."""
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
-    """Spectral peak of one axis."""
+class SpectralLine:
+    """Spectral line or resonance of one axis."""
 
     axis: int  # index into AXES
     frequency_hz: float  # frequency after sampling, possibly an alias
-    amplitude: float  # amplitude of a sine of the same power, rad/s or m/s²
-    share: float  # largest share of the Allan variance at any τ
-    wide: bool  # True for a resonance, wider than the resolution of the spectrum
+    amplitude: float  # amplitude of a sinusoid with the same power, rad/s or m/s²
+    share: float  # largest share of the Allan variance at any averaging time
+    wide: bool  # True for a resonance
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,30 +99,30 @@ class _Peak:
     """Peak in the spectrum of one axis."""
 
     middle: float  # centre in bins
-    power: float  # mean square above the level of both sides, squared unit of the axis
-    wide: bool  # True for a peak wider than the resolution of the spectrum
+    power: float  # mean square above the neighbouring bins, squared unit of the axis
+    wide: bool  # True for a resonance
 
 
-def detect_lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve) -> list[Line]:
-    """Return the spectral peaks of all axes, the strongest of each axis first.
+def detect_spectral_lines(values: Floats, in_motion: Mask, rate_hz: float, curve: AllanCurve) -> list[SpectralLine]:
+    """Return the spectral lines of all axes. The strongest line of each axis is the first.
 
     Parameters
     ----------
     values : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s²; NaN means missing.
-    moving : ndarray of bool, shape (n,)
-        True for samples to ignore.
+    in_motion : ndarray of bool, shape (n,)
+        True for samples in motion, which are ignored.
     rate_hz : float
         Sample rate in Hz.
     curve : AllanCurve
-        Allan curve of the recording, which determines whether a peak is relevant.
+        Allan curve of the recording.
     """
     rows = min(ROWS, 1 << (len(values) // MIN_STRETCHES).bit_length() >> 1)
     if rows < MIN_ROWS:
         return []
     found = []
     for axis in range(len(AXES)):
-        parts = [_filled(part) for part in _stretches(values[:, axis], moving, rows, MAX_STRETCHES)]
+        parts = [_filled(part) for part in _stretches(values[:, axis], in_motion, rows, MAX_STRETCHES)]
         if len(parts) < MIN_STRETCHES:
             continue
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # constant axes and extreme values
@@ -140,24 +133,24 @@ def detect_lines(values: Floats, moving: Mask, rate_hz: float, curve: AllanCurve
     return found
 
 
-def outlier_share(values: Floats, moving: Mask) -> Floats:
+def outlier_share_of_axes(values: Floats, in_motion: Mask) -> Floats:
     """Return the share of outliers of each axis.
 
     Parameters
     ----------
     values : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s²; NaN means missing.
-    moving : ndarray of bool, shape (n,)
-        True for samples to ignore.
+    in_motion : ndarray of bool, shape (n,)
+        True for samples in motion, which are ignored.
 
     Returns
     -------
     ndarray of float64, shape (6,)
-        Share of outliers; NaN if there are too few samples.
+        Share of outliers of each axis; NaN if there are too few samples.
 
     >>> noise = np.random.default_rng(0).standard_normal((20_000, 6))
     >>> noise[::50, 2] = 30.0
-    >>> outlier_share(noise, np.zeros(20_000, bool)).round(3).tolist()
+    >>> outlier_share_of_axes(noise, np.zeros(20_000, bool)).round(3).tolist()
     [0.0, 0.0, 0.02, 0.0, 0.0, 0.0]
     """
     shares = np.full(len(AXES), np.nan)
@@ -165,19 +158,19 @@ def outlier_share(values: Floats, moving: Mask) -> Floats:
     for axis in range(len(AXES)) if rows else ():
         far = [
             _outlier_share(part[np.isfinite(part)])
-            for part in _stretches(values[:, axis], moving, rows, MAX_OUTLIER_STRETCHES)
+            for part in _stretches(values[:, axis], in_motion, rows, MAX_OUTLIER_STRETCHES)
         ]
         if far:
             shares[axis] = np.mean(far)
     return shares
 
 
-def line_share(line: Line, curve: AllanCurve) -> Floats:
-    """Return the share [m] of the Allan variance that a line contributes at each τ.
+def allan_variance_share_of_line(line: SpectralLine, curve: AllanCurve) -> Floats:
+    """Return the share [m] of the Allan variance that a spectral line contributes at each averaging time.
 
     Parameters
     ----------
-    line : Line
+    line : SpectralLine
         Spectral line.
     curve : AllanCurve
         Allan curve of the recording.
@@ -187,7 +180,7 @@ def line_share(line: Line, curve: AllanCurve) -> Floats:
 
 
 def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[Floats]:
-    """Yield stretches [rows] of an axis with few missing samples; NaN means missing or in motion."""
+    """Yield stretches [rows] with few missing samples; NaN means missing or in motion."""
     begins = np.linspace(0, len(column) - rows, min(most, max(2 * len(column) // rows - 1, 1))).astype(np.int64)
     for begin in begins:
         part = np.where(moving[begin : begin + rows], np.nan, column[begin : begin + rows])
@@ -196,16 +189,13 @@ def _stretches(column: Floats, moving: Mask, rows: int, most: int) -> Iterator[F
 
 
 def _filled(part: Floats) -> Floats:
-    """Return a stretch with the mean subtracted, and with 0 for missing samples."""
+    """Return a stretch without the mean, and with 0 for missing samples."""
     there = np.isfinite(part)
     return np.where(there, part - part[there].mean(), 0.0)
 
 
 def _spectrum(parts: Floats) -> Floats:
-    """Return the mean square per bin [rows / 2] of zero-mean stretches [k, rows].
-
-    The sum over the bins is the variance.
-    """
+    """Return the mean square per bin [rows / 2] of zero-mean stretches [k, rows]."""
     window = np.hanning(parts.shape[1])
     turned = np.fft.rfft(parts * window, axis=1)[
         :, :-1
@@ -215,7 +205,7 @@ def _spectrum(parts: Floats) -> Floats:
 
 
 def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
-    """Return the lines of a spectrum, then the resonances in bins without a line."""
+    """Return the spectral lines, then the resonances."""
     taken = np.zeros(spectrum.size, np.bool_)
     found = []
     for width, side in ((1, SIDE_BINS), (WIDE_BINS, SIDE_BINS // 4)):
@@ -223,7 +213,7 @@ def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
         if power.size < MIN_BINS:
             continue
         runs = _find_runs(_significant_bins(power, parts * width, side))
-        # The highest peak comes first, because the bins of its flanks are not searched again.
+        # The flanks of higher peaks are excluded from the search.
         for first, last in sorted(runs, key=lambda run: -power[slice(*run)].max()):
             if first * width < FIRST_BIN or taken[first * width : last * width].any():
                 continue
@@ -234,7 +224,6 @@ def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
             if above.sum() > 0.0:
                 weights = np.maximum(above, 0.0)
                 middle = float((np.arange(begin, end) * weights).sum() / weights.sum())
-                # The leakage of a strong line is significant in many bins, but low.
                 high = int((above > above.max() / 4.0).sum())
                 wide = width > 1 or high > 2 * NEAR_BINS + 1
                 found.append(_Peak(width * (middle + 0.5) - 0.5, width * float(above.sum()), wide))
@@ -242,24 +231,18 @@ def _peaks(spectrum: Floats, parts: int) -> list[_Peak]:
 
 
 def _significant_bins(power: Floats, averaged: int, side: int) -> Mask:
-    """Return a mask of the bins that exceed the medians of both sides by ``MIN_PEAK_SIGMA`` and ``MIN_PEAK_RATIO``."""
     bins, reach = power.size, NEAR_BINS + side
-    # The spectrum is mirrored at both ends.
     padded = np.pad(power, reach, mode="reflect")
     around = np.lib.stride_tricks.sliding_window_view(padded, side)
     left, right = (np.median(around[at : at + bins], axis=1) for at in (0, reach + NEAR_BINS + 1))
     level = np.maximum(left, right)
     ratio = power / level
-    chi = 2.0 / (9.0 * 2.0 * averaged)  # Wilson & Hilferty (1931) with two degrees of freedom per periodogram
+    chi = 2.0 / (9.0 * 2.0 * averaged)  # Wilson & Hilferty (1931), two degrees of freedom per periodogram
     sigma = (np.cbrt(ratio) - (1.0 - chi)) / np.sqrt(chi)
     return np.asarray((sigma > MIN_PEAK_SIGMA) & (ratio > MIN_PEAK_RATIO) & (level > 0.0))
 
 
 def _find_feet(power: Floats, first: int, last: int, averaged: int) -> tuple[int, int]:
-    """Return the first bin of a peak and the bin after the last.
-
-    A peak extends ``NEAR_BINS`` beyond the significant bins, and further as long as the spectrum decreases.
-    """
     falls, step = 1.0 - FOOT_SIGMA / (NEAR_BINS * averaged) ** 0.5, NEAR_BINS
     first, last = max(first - step, 0), min(last + step, power.size)
     while first >= step and power[first - step : first].sum() < falls * power[first : first + step].sum():
@@ -270,27 +253,24 @@ def _find_feet(power: Floats, first: int, last: int, averaged: int) -> tuple[int
 
 
 def _find_runs(marks: Mask) -> list[tuple[int, int]]:
-    """Return the first index and the index after the end of each run of True."""
+    """Return the first index and the end of each run of True."""
     edges = np.flatnonzero(np.diff(marks.astype(np.int8), prepend=0, append=0)).tolist()
     return list(zip(edges[::2], edges[1::2], strict=True))
 
 
-def _make_line(axis: int, peak: _Peak, bin_hz: float, rate_hz: float, curve: AllanCurve) -> Line:
-    """Convert a peak to a ``Line``, and compute the share of the Allan variance."""
+def _make_line(axis: int, peak: _Peak, bin_hz: float, rate_hz: float, curve: AllanCurve) -> SpectralLine:
     frequency, amplitude = peak.middle * bin_hz, (2.0 * peak.power) ** 0.5
     shares = _allan_share(axis, frequency / rate_hz, amplitude, curve)
-    return Line(axis, frequency, amplitude, float(np.nanmax(shares, initial=0.0)), peak.wide)
+    return SpectralLine(axis, frequency, amplitude, float(np.nanmax(shares, initial=0.0)), peak.wide)
 
 
 def _allan_share(axis: int, turns: float, amplitude: float, curve: AllanCurve) -> Floats:
-    """Return the share [m] of the Allan variance that a line with ``turns`` cycles per sample contributes."""
     half = np.pi * turns
     made = (amplitude * np.sin(curve.factors * half) ** 2 / np.sin(half)) ** 2 / curve.factors
     return np.asarray(made / (curve.factors * curve.avar[:, axis]))
 
 
 def _outlier_share(part: Floats) -> float:
-    """Return the share of outliers in the present samples of a stretch."""
     steps = np.abs(np.diff(part))
     step = float(steps[steps > 0.0].min(initial=np.inf))
     part = part[: part.size // BLOCK * BLOCK]
@@ -306,7 +286,7 @@ def _outlier_share(part: Floats) -> float:
 
 
 def _interpolated_median(away: Floats, step: float) -> float:
-    """Return the median of quantized distances, interpolated within a quantization step."""
+    """Return the median of quantized deviations, interpolated within a quantization step."""
     middle = float(np.median(away))
     below, upto = (away < middle - step / 4.0).mean(), (away < middle + step / 4.0).mean()
     return middle + step * float((0.5 - below) / max(upto - below, 1.0 / away.size) - 0.5)

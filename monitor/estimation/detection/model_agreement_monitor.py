@@ -1,15 +1,10 @@
-"""Decisions whether the axes of a sensor agree with the noise model, and events when a decision changes.
+"""Decisions whether the axes of a sensor agree with the noise model, with an event for each change of a decision.
 
-The window is compared with the model ten times per second, and successive results are strongly correlated. Several
-results above the threshold are therefore not independent evidence. In addition, some of many windows exceed the
-threshold by chance. A model is rejected only if every comparison exceeds the stricter limit ``AxisGap.alarm`` until an
-eighth of the window and at least ``MIN_SAMPLES`` samples have been replaced. If the gap is above twice the threshold,
-chance is excluded, and ``MIN_SAMPLES`` new samples are sufficient. A rejected model is accepted again if the gap stays
-below ``null95`` until the same share of the window has been replaced. Between the two limits, the decision does not
-change. In a simulation of 1600 windows of six axes with 128 comparisons each, a true model was rejected three times.
-
-A rejection and a renewed acceptance are reported as ``model_disagrees`` events. The field ``agrees`` of the event is
-the new decision.
+The window is compared with the noise model ten times per second, so successive comparisons are strongly correlated. An
+axis disagrees with the model if the largest difference exceeds ``AxisModelComparison.alarm`` in all comparisons during
+1/8 of the window. For differences above twice the threshold, ``MIN_SAMPLES`` samples are sufficient. An axis agrees
+again if the largest difference stays below ``null95`` during 1/8 of the window. In a simulation of 1600 windows of six
+axes with 128 comparisons each, a true model was rejected three times.
 """
 
 from collections.abc import Mapping
@@ -17,13 +12,13 @@ from dataclasses import dataclass
 from typing import Final
 
 from drivers.data_types import AXES, Event
-from monitor.estimation.detection.model_comparison import MIN_SAMPLES, AxisGap, ModelGap
+from monitor.estimation.detection.model_comparison import MIN_SAMPLES, AxisModelComparison, ModelComparison
 
 KIND: Final = "model_disagrees"
 RENEWED_SHARE: Final = 0.125
-"""Share of the window that must be replaced while a gap persists."""
+"""Share of the window that must be new before a decision changes."""
 CLEAR_FACTOR: Final = 2.0
-"""Multiple of the threshold above which chance is excluded."""
+"""Ratio of the difference to the threshold above which fewer new samples are sufficient."""
 
 
 @dataclass(slots=True)
@@ -31,29 +26,28 @@ class _Axis:
     """State of the decision for one axis."""
 
     agrees: bool | None = None  # None until the first decision
-    since: tuple[int, int] | None = None  # samples and t_ns of the first comparison that contradicts the decision
+    since: tuple[int, int] | None = None  # number of samples and time of the first comparison against the decision
 
 
-class ModelAgreement:
-    """Decisions whether the axes of one device agree with the noise model."""
+class ModelAgreementMonitor:
+    """Monitor of the agreement between the axes of one device and the noise model."""
 
     def __init__(self) -> None:
         self._axes = {axis: _Axis() for axis in AXES}
 
     @property
-    def decisions(self) -> Mapping[str, bool]:
-        """Current decision for each decided axis, True if the axis agrees with the model."""
+    def agreement_by_axis(self) -> Mapping[str, bool]:
+        """Decision for each axis, True if the axis agrees with the noise model. Undecided axes are omitted."""
         return {axis: one.agrees for axis, one in self._axes.items() if one.agrees is not None}
 
-    def update(self, comparison: ModelGap) -> list[Event]:
+    def update_decisions(self, comparison: ModelComparison) -> list[Event]:
         """Process one comparison, and return an event for each axis whose decision changes."""
         found = (self._update_axis(self._axes[axis], gap, comparison) for axis, gap in comparison.axes.items())
         return [event for event in found if event is not None]
 
-    def _update_axis(self, axis: _Axis, gap: AxisGap, comparison: ModelGap) -> Event | None:
-        """Update the decision for one axis, and return an event if it changed."""
+    def _update_axis(self, axis: _Axis, gap: AxisModelComparison, comparison: ModelComparison) -> Event | None:
         if axis.agrees is None and gap.gap <= gap.alarm:
-            axis.agrees = True  # a first decision for agreement is not reported
+            axis.agrees = True  # an initial agreement is not reported
         contradicted = gap.gap < gap.null95 if axis.agrees is False else gap.gap > gap.alarm
         if not contradicted:
             axis.since = None
@@ -68,15 +62,14 @@ class ModelAgreement:
         return _event(gap, axis.agrees, comparison.t_ns, since_ns)
 
 
-def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
-    """Build the event for a changed decision."""
+def _event(gap: AxisModelComparison, agrees: bool, t_ns: int, since_ns: int) -> Event:
     lo, hi = gap.tau_s
     tau = f"{lo:.3g} s" if lo == hi else f"{lo:.3g} to {hi:.3g} s"
     what = {
         "agrees": agrees,
         "gap": gap.gap,
         "threshold": gap.threshold,
-        "ratio": gap.ratio,
+        "ratio": gap.measured_to_model_ratio,
         "tau_lo": lo,
         "tau_hi": hi,
     }
@@ -85,7 +78,7 @@ def _event(gap: AxisGap, agrees: bool, t_ns: int, since_ns: int) -> Event:
     else:
         text = (
             f"{gap.axis} disagrees with its model at τ {tau}: "
-            f"the deviation is {gap.ratio:.3g} times the deviation of the model, "
+            f"the deviation is {gap.measured_to_model_ratio:.3g} times the deviation of the model, "
             f"a gap of {gap.gap:.3g} σ with a threshold of {gap.threshold:.1f} σ"
         )
     return Event(KIND, t_ns, text, gap.axis, {"model": what}, since_ns, gap.gap)

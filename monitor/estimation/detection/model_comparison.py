@@ -1,26 +1,23 @@
 """Comparison of the Allan variance of the live window with the Allan variance of the noise model.
 
-For each axis, the comparison gives the difference at each τ in standard deviations and the largest difference, called
-the gap. It also gives the limits that the gap of a true model exceeds only by chance.
-``model_agreement.ModelAgreement`` converts successive comparisons into events.
+The comparison gives the difference z(τ) in standard deviations for each axis and averaging time. The largest |z| of an
+axis is called the gap.
 
 If the model is true, ν σ²(τ)/σ²_model(τ) is approximately χ² with ν degrees of freedom. The cube root of χ² is
 approximately normal (Wilson & Hilferty, PNAS 17, 1931), which gives
 
     z(τ) = ((σ²/σ²_model)^(1/3) − 1 + 2/(9ν)) / √(2/(9ν)).
 
-The degrees of freedom ν = 2 σ⁴_model/Var are computed from the model and not from the fit. Var is the variance of the
-measured Allan variance. For the terms Q N B K, Var is computed exactly in ``uncertainty``. Other effects such as a
-resonance, a low-pass or correlated noise have a power spectral density S. For a mean of M terms, Var is then 4/M ∫ (S
-G)² df with the spectral kernel G of the Allan variance. The integral is accurate if the window is long compared with
-the correlation time of the noise. Averaging times with fewer than ``MIN_EDF`` degrees of freedom are not compared,
-because the distribution then differs too much from χ².
+The degrees of freedom are ν = 2 σ⁴_model/Var, where Var is the variance of the measured Allan variance under the model.
+For the noise terms Q, N, B and K, Var is computed exactly in ``uncertainty``. For other effects with the power spectral
+density S, Var is 4/M ∫ (S G)² df, where M is the number of terms and G the spectral kernel of the Allan variance. The
+integral is accurate if the window is much longer than the correlation time of the noise.
 
-The limits account for the number of τ and axes by the inequality of Šidák (J. Am. Stat. Assoc. 62, 1967), P(all |z_i| <
-c) ≥ ∏ P(|z_i| < c). The inequality holds for normal z_i with any correlation. Of 100 independent windows of a true
-model, at most one exceeds ``threshold`` on any axis. Overlapping τ are correlated, so the true share is lower. Of 2500
-simulated windows of six axes and 14 octaves, 0.5 % exceeded ``threshold`` with Q N B K, and 0.9 % with random walk
-alone. The share is higher for telegraph noise and jumps, which are not Gaussian.
+The limits of the gap account for the number of averaging times and axes by the inequality of Šidák (J. Am. Stat. Assoc.
+62, 1967), which holds for normal variables with any correlation. Of 100 independent windows of a true model, at most
+one exceeds ``threshold`` on any axis. Of 2500 simulated windows of six axes and 14 octaves, 0.5 % exceeded
+``threshold``. With random walk only, the share was 0.9 %. Telegraph noise and random steps are not Gaussian and exceed
+``threshold`` more often.
 """
 
 from collections.abc import Mapping
@@ -39,53 +36,53 @@ from monitor.noise.spectrum import MIN_FREQUENCY_CYCLES, Spectrum, frequency_gri
 from monitor.noise.standard_terms import STANDARD_TERMS
 
 MIN_EDF: Final = 2.0
-"""Minimum degrees of freedom of a compared τ."""
+"""Minimum degrees of freedom of a compared averaging time."""
 MIN_SAMPLES: Final = 1000
-"""Minimum number of samples of an axis. With 1000 samples, the error of N is 3 %."""
+"""Minimum number of samples of a compared axis. With 1000 samples, the error of N is 3 %."""
 FALSE_ALARM: Final = 0.01
-"""Share of independent windows of a true model that exceed the threshold on any axis."""
+"""Share of independent windows of a true model in which the gap of any axis exceeds ``threshold``."""
 FALSE_ALARM_WATCHED: Final = 0.001
-"""Share of independent windows of a true model that exceed ``AxisGap.alarm`` on any axis."""
+"""Share of independent windows of a true model in which the gap of any axis exceeds ``alarm``."""
 
 
 @dataclass(frozen=True, slots=True)
-class AxisGap:
-    """Comparison of one axis of the window with its model."""
+class AxisModelComparison:
+    """Comparison of one axis of the window with the noise model."""
 
     axis: str
     measured: Floats  # [m] Allan deviation, unit of the axis; NaN if the window is too short
     model: Floats  # [m] Allan deviation of the model; NaN if unknown
-    z: Floats  # [m] standard deviations above the model; NaN if not compared
+    z: Floats  # [m] difference from the model in standard deviations; NaN if not compared
     gap: float  # largest |z|
-    tau_s: tuple[float, float]  # range of τ around the largest |z| that exceeds the threshold on the same side
-    row: int  # row of the largest |z|
-    null95: float  # limit that 95 of 100 windows of a true model do not exceed on this axis
-    threshold: float  # limit that 99 of 100 windows of a true model do not exceed on any axis
-    alarm: float  # limit that 999 of 1000 windows do not exceed on any axis, for repeated comparisons
-    samples: int  # samples of this axis in the window
+    tau_s: tuple[float, float]  # averaging times around the largest |z| that exceed the threshold
+    row: int  # index of the largest |z|
+    null95: float  # limit of the gap for 95 of 100 windows of a true model, on this axis
+    threshold: float  # limit of the gap for 99 of 100 windows of a true model, on all axes
+    alarm: float  # limit of the gap for 999 of 1000 windows of a true model, on all axes
+    samples: int  # number of samples of this axis in the window
 
     @property
-    def ratio(self) -> float:
-        """Ratio of the measured deviation to the deviation of the model at the largest gap."""
+    def measured_to_model_ratio(self) -> float:
+        """Ratio of the measured Allan deviation to the Allan deviation of the model at the largest |z|."""
         return float(self.measured[self.row] / self.model[self.row])
 
 
 @dataclass(frozen=True, slots=True)
-class ModelGap:
-    """Comparison of all axes at one moment."""
+class ModelComparison:
+    """Comparison of all axes of the window with the noise model."""
 
     t_ns: int  # time of the newest sample
     rate_hz: float
     window_s: float
-    samples: int  # received since the start
-    n: int  # samples in the window
+    samples: int  # number of samples received since the start
+    n: int  # number of samples in the window
     tau_s: Floats  # [m]
-    axes: Mapping[str, AxisGap]  # axes that can be compared, in the order of AXES
+    axes: Mapping[str, AxisModelComparison]  # axes that can be compared, in the order of AXES
     agrees: Mapping[str, bool] = field(default_factory=dict)  # current decisions, see ``model_agreement``
 
 
 class PreparedModel:
-    """Noise model prepared for comparison with the Allan curves of a window.
+    """Noise model with precomputed Allan variances for the comparison with a live window.
 
     Parameters
     ----------
@@ -102,48 +99,47 @@ class PreparedModel:
         self._tables = AxisCovarianceTables(np.empty(0, np.int64), length)
         self._of: tuple[float, tuple[int, ...]] = (0.0, ())  # rate and cluster sizes of the prepared values
 
-    def compare(self, estimate: Estimate) -> ModelGap:
-        """Compare all axes that are part of the model and have at least ``MIN_SAMPLES`` samples in the window."""
+    def compare_with_estimate(self, estimate: Estimate) -> ModelComparison:
+        """Compare the axes of the model that have at least ``MIN_SAMPLES`` samples in the window."""
         curve = estimate.curve
         tables = self._prepare(curve.factors, estimate.rate_hz)
-        found: dict[str, AxisGap] = {}
+        found: dict[str, AxisModelComparison] = {}
         for axis, expected in self._expected.items():
             i = AXES.index(axis)
             terms = curve.terms[:, i]
-            n = samples_of_axis(curve, i)
+            n = count_axis_samples_in_window(curve, i)
             if n < MIN_SAMPLES:
                 continue
-            edf = expected.edf(tables.at(i, n, curve.n), terms)
+            edf = expected.degrees_of_freedom(tables.at(i, n, curve.n), terms)
             one = _axis_gap(axis, curve.tau_s, curve.avar[:, i], expected.avar, edf, n, len(self._expected))
             if one is not None:
                 found[axis] = one
-        return ModelGap(
+        return ModelComparison(
             estimate.t_ns, estimate.rate_hz, estimate.window_s, estimate.samples, curve.n, curve.tau_s, found
         )
 
     def _prepare(self, factors: Ints, rate_hz: float) -> AxisCovarianceTables:
-        """Return the covariance tables.
-
-        If the rate or the cluster sizes have changed, the expected curves are recomputed.
-        """
+        """Return the covariance tables. A new rate or new cluster sizes change the expected Allan variances."""
         of = (rate_hz, tuple(factors.tolist()))
         if self._of[1] != of[1]:
             self._tables = AxisCovarianceTables(factors, self._length)
         if self._of != of:
             named = (axis for axis in AXES if self._model.effects.get(axis))
-            known = {axis: _Expected.of(self._model, axis, factors, rate_hz) for axis in named}
+            known = {axis: _Expected.from_model(self._model, axis, factors, rate_hz) for axis in named}
             self._expected = {axis: one for axis, one in known.items() if (one.avar > 0.0).any()}
             self._of = of
         return self._tables
 
 
-def samples_of_axis(curve: AllanCurve, axis: int) -> int:
-    """Return the number of samples of an axis in the window, which is less than ``curve.n`` for a restarted axis.
+def count_axis_samples_in_window(curve: AllanCurve, axis: int) -> int:
+    """Return the number of samples of one axis in the window.
+
+    A restarted axis has fewer than ``curve.n`` samples.
 
     Parameters
     ----------
     curve : AllanCurve
-        Curve of the window.
+        Allan curve of the window.
     axis : int
         Index into ``AXES``.
     """
@@ -153,26 +149,25 @@ def samples_of_axis(curve: AllanCurve, axis: int) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Expected:
-    """Expected values of the model for one axis at m averaging times."""
+    """Allan variance of the model for one axis, and the variance of the measured Allan variance."""
 
     avar: Floats  # [m] Allan variance, squared unit of the axis
     shape: Floats  # [4] Q² N² B² K² at τ0 = 1
     more: Floats  # [m] variance of one term beyond the variance from Q N B K, unit⁴
 
     @classmethod
-    def of(cls, model: NoiseModel, axis: str, factors: Ints, rate_hz: float) -> "_Expected":
-        """Compute the expected values of one axis of a model at the given cluster sizes."""
+    def from_model(cls, model: NoiseModel, axis: str, cluster_sizes: Ints, rate_hz: float) -> "_Expected":
+        """Compute the expected values of one axis at the given cluster sizes."""
         spectrum = model.spectrum(axis, 1.0 / rate_hz)
-        tau_s = factors / rate_hz
+        tau_s = cluster_sizes / rate_hz
         shape, classic = _standard_terms(model, axis, rate_hz)
-        more = _excess_variance(spectrum, classic, factors, rate_hz)
-        # A ramp has no variance, but the product of ramp and noise has. The effect is at most the effect of a random
-        # walk of the same size.
+        more = _excess_variance(spectrum, classic, cluster_sizes, rate_hz)
+        # The product of a ramp and noise increases the variance by at most as much as a random walk of the same size.
         shape[K] += 1.5 * spectrum.slope**2 * float(tau_s.max()) / rate_hz
         return cls(spectrum.avar(tau_s), shape, more)
 
-    def edf(self, table: CovarianceTable, terms: Ints) -> Floats:
-        """Return the degrees of freedom [m] for these numbers of terms; NaN without terms."""
+    def degrees_of_freedom(self, table: CovarianceTable, terms: Ints) -> Floats:
+        """Return the degrees of freedom [m]; NaN for averaging times without terms."""
         pairs = np.array([self.shape[a] * self.shape[b] * (1.0 if a == b else 2.0) for a, b in PAIRS])
         exact = np.einsum("iik,k->i", table.covariance, pairs)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -181,7 +176,7 @@ class _Expected:
 
 
 def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Floats, NoiseModel]:
-    """Return Q², N², B² and K² of an axis at τ0 = 1, and a model with only these terms."""
+    """Return Q², N², B² and K² of an axis at τ0 = 1, and a model with only the terms Q, N, B and K."""
     letters = ("Q", "N", "B", "K")
     kinds = tuple(STANDARD_TERMS[letter] for letter in letters)
     powers = (2.0, 1.0, 0.0, -1.0)
@@ -194,11 +189,10 @@ def _standard_terms(model: NoiseModel, axis: str, rate_hz: float) -> tuple[Float
 
 
 def _excess_variance(spectrum: Spectrum, classic: NoiseModel, factors: Ints, rate_hz: float) -> Floats:
-    """Return the variance of the Allan variance that the standard terms do not explain, times the number of terms.
+    """Return the variance of the Allan variance beyond the standard terms, times the number of terms, at τ0 = 1.
 
-    A second difference of noise with the spectral density S has the spectral density S G, where G = 2 sin⁴(πνm)/(m sin
-    πν)². By Parseval's theorem, the result is 4 ∫ (S² − S_standard²) G² dν. A spectral line of mean square P adds 4 P S
-    G² at the frequency of the line. All quantities are at τ0 = 1.
+    The result is 4 ∫ (S² − S_standard²) G² dν, where S is the spectral density and G = 2 sin⁴(πνm)/(m sin πν)²
+    (Parseval's theorem). A spectral line of mean square P contributes 4 P S G² at the frequency of the line.
     """
     (axis,) = classic.effects
     f_hz = frequency_grid(MIN_FREQUENCY_CYCLES * rate_hz / float(factors.max()), 1.0 / rate_hz, spectrum.peaks)
@@ -219,21 +213,20 @@ def _excess_variance(spectrum: Spectrum, classic: NoiseModel, factors: Ints, rat
 
 
 def _kernel(nu: Floats, m: int) -> Floats:
-    """Return the spectral kernel G of the Allan variance at cluster size m."""
     return np.asarray(2.0 * np.sin(np.pi * nu * m) ** 4 / (m * np.sin(np.pi * nu)) ** 2)
 
 
 def _axis_gap(
     axis: str, tau_s: Floats, avar: Floats, expected: Floats, edf: Floats, samples: int, axes: int
-) -> AxisGap | None:
-    """Compare one axis of a model that has ``axes`` axes. Return None if no τ can be compared."""
+) -> AxisModelComparison | None:
+    """Compare one axis. Return None if no averaging time can be compared."""
     expected = np.where(expected > 0.0, expected, np.nan)
-    z = normal_score(avar / expected, edf)
+    z = chi2_ratio_to_normal_score(avar / expected, edf)
     judged = np.isfinite(z)
     if not judged.any():
         return None
     count = int(judged.sum())
-    threshold, alarm = (max_z_limit(share, axes * count) for share in (FALSE_ALARM, FALSE_ALARM_WATCHED))
+    threshold, alarm = (max_abs_z_limit(share, axes * count) for share in (FALSE_ALARM, FALSE_ALARM_WATCHED))
     size = np.where(judged, np.abs(z), -1.0)
     at = int(size.argmax())
     alike = (size > threshold) & (np.sign(z) == np.sign(z[at]))
@@ -243,17 +236,17 @@ def _axis_gap(
     while last + 1 < alike.size and alike[last + 1]:
         last += 1
     where = float(tau_s[first]), float(tau_s[last])
-    null95 = max_z_limit(0.05, count)
-    return AxisGap(
+    null95 = max_abs_z_limit(0.05, count)
+    return AxisModelComparison(
         axis, np.sqrt(avar), np.sqrt(expected), z, float(size[at]), where, at, null95, threshold, alarm, samples
     )
 
 
-def normal_score(ratio: Floats, edf: Floats) -> Floats:
-    """Return the deviation of χ²/ν from 1 in standard deviations, computed from the cube root of the ratio.
+def chi2_ratio_to_normal_score(ratio: Floats, edf: Floats) -> Floats:
+    """Convert χ²/ν to standard deviations from 1, by means of the cube root.
 
-    The result is NaN for fewer than ``MIN_EDF`` degrees of freedom. In the example, 129.561 is the 97.5 % quantile of
-    χ² with 100 degrees of freedom.
+    The result is NaN for fewer than ``MIN_EDF`` degrees of freedom. The example is the 97.5 % quantile of χ² with 100
+    degrees of freedom.
 
     Parameters
     ----------
@@ -262,26 +255,26 @@ def normal_score(ratio: Floats, edf: Floats) -> Floats:
     edf : ndarray of float64
         Degrees of freedom ν.
 
-    >>> round(float(normal_score(np.array([1.29561]), np.array([100.0]))[0]), 2)
+    >>> round(float(chi2_ratio_to_normal_score(np.array([1.29561]), np.array([100.0]))[0]), 2)
     1.96
     """
     spread = 2.0 / (9.0 * np.where(edf >= MIN_EDF, edf, np.nan))
     return np.asarray((np.cbrt(ratio) - 1.0 + spread) / np.sqrt(spread))
 
 
-def max_z_limit(share: float, numbers: int) -> float:
+def max_abs_z_limit(exceedance_probability: float, count: int) -> float:
     """Return the limit that the largest of several |z| exceeds with a given probability.
 
-    The probability is exact for independent z, and an upper bound otherwise.
+    The probability is exact for independent z. For correlated z, the true probability is smaller.
 
     Parameters
     ----------
-    share : float
+    exceedance_probability : float
         Probability that the limit is exceeded.
-    numbers : int
-        Number of z.
+    count : int
+        Number of z values.
 
-    >>> f"{max_z_limit(0.05, 1):.3f} {max_z_limit(0.01, 6 * 14):.3f}"
+    >>> f"{max_abs_z_limit(0.05, 1):.3f} {max_abs_z_limit(0.01, 6 * 14):.3f}"
     '1.960 3.847'
     """
-    return -normal_quantile(float(-0.5 * np.expm1(np.log1p(-share) / numbers)))
+    return -normal_quantile(float(-0.5 * np.expm1(np.log1p(-exceedance_probability) / count)))

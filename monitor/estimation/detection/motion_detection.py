@@ -1,16 +1,12 @@
-"""Detection of motion, knocks and handling of the sensor, and removal of these samples from the stream.
+"""Detection of motion, knocks and handling of the sensor.
 
-The detector replaces samples in motion by NaN, so that all later statistics treat them as missing. It also returns a
-``Motion`` for each episode. The noise at rest is learned from the samples of each axis and updated continuously, so no
-noise level has to be configured. ``motion_kernel`` describes the method. One block before the first moving block of an
-episode and two blocks after the last moving block are removed as well.
+The detector replaces samples in motion by NaN and reports each episode of motion. The noise at rest is learned
+continuously from the samples (``motion_kernel``). For each episode, one block before the motion and two blocks after
+the motion are replaced as well.
 
-Samples are delayed by two blocks, because the decision for a block needs the following block. Two blocks take 0.5 s, or
-16 samples at sample rates below 32 Hz. After 60 s, a constant disturbance counts as rest and is left to the change
-detector. The first reference is learned in eight blocks. During these blocks, only signals that are too strong for any
-MEMS sensor at rest count as motion.
-
-Rotation at a constant rate below 2 °/s is not detected. Motion below the noise is not detected either.
+The detector delays samples by two blocks, which is 0.5 s, or 16 samples at sample rates below 32 Hz. A disturbance that
+stays constant for 60 s counts as rest. During the first eight blocks, only signals that are too strong for a sensor at
+rest count as motion. Rotation at a constant rate below 2 °/s and motion below the noise are not detected.
 """
 
 from collections import deque
@@ -30,35 +26,35 @@ from monitor.estimation.detection.motion_kernel import (
     LAST,
     PEAK,
     REMOVED_AFTER,
-    advance,
-    make_state,
+    advance_motion_detection,
+    make_motion_state,
 )
 
 BLOCK_S: Final = 0.25
 """Length of a block in seconds."""
 MIN_BLOCK_SAMPLES: Final = 8
-"""Minimum number of samples in a block. With fewer samples, the variance is too uncertain."""
+"""Minimum number of samples in a block."""
 MAX_KNOCK_BLOCKS: Final = 2
-"""Largest number of moving blocks of a knock, if the orientation of the sensor did not change."""
+"""Maximum number of moving blocks of a knock that does not change the orientation."""
 
 Kind = Literal["knock", "motion", "handling/orientation"]
 
 
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """One episode of motion."""
+    """Episode of motion."""
 
     kind: Kind
-    since: int  # index of the first removed sample, including missing samples
-    until: int  # index after the last removed sample
-    seconds: float  # duration of the motion, without the additional blocks before and after
-    axis: str  # axis with the largest excursion relative to the noise
-    peak: float  # excursion from the mean at rest, rad/s or m/s²
+    since: int  # index of the first replaced sample, counting missing samples
+    until: int  # index after the last replaced sample
+    seconds: float  # duration of the motion in seconds
+    axis: str  # axis with the largest deviation relative to the noise
+    peak: float  # largest deviation from the mean at rest, rad/s or m/s²
     text: str  # description for users
 
 
 class MotionDetector:
-    """Motion detector that removes the samples in motion from a stream.
+    """Detector that replaces samples in motion by NaN.
 
     Parameters
     ----------
@@ -68,52 +64,53 @@ class MotionDetector:
     >>> rest = MotionDetector(100.0)
     >>> still = np.random.default_rng(0).normal(0.0, 1e-3, (2000, 6))
     >>> still[1000:1200, 0] += np.sin(np.arange(200) / 20)
-    >>> out = rest.advance_and_take_decided(make_block(np.arange(2000), still)) + rest.flush()
-    >>> [motion.text for motion in rest.take()]
+    >>> out = rest.advance_and_take_decided(make_block(np.arange(2000), still)) + rest.flush_delayed_samples()
+    >>> [motion.text for motion in rest.take_motions()]
     ['moved for 2.0 s: gx up to 57 °/s']
-    >>> rest.moved_samples, sum(int(np.isnan(one.values[:, 0]).sum()) for one in out)
+    >>> rest.samples_in_motion, sum(int(np.isnan(one.values[:, 0]).sum()) for one in out)
     (275, 275)
     """
 
     def __init__(self, rate_hz: float) -> None:
-        self.moved_samples = 0
+        self.samples_in_motion = 0
         self.episodes = 0
         self._rate_hz = rate_hz
-        self._size = block_size(rate_hz)
-        self._state = make_state()
-        self._held: deque[tuple[int, SampleBlock]] = deque()  # blocks with the index of their first row
+        self._size = samples_per_block(rate_hz)
+        self._state = make_motion_state()
+        self._held: deque[tuple[int, SampleBlock]] = deque()  # delayed blocks, with the index of the first sample
         self._index = 0  # index of the next sample
         self._motions: list[Motion] = []
 
     @property
-    def moving(self) -> bool:
-        """True if the newest decided block belongs to an episode of motion."""
+    def is_moving(self) -> bool:
+        """True if the newest decided block is in motion."""
         return bool(self._state.place[BEGAN] >= 0)
 
     def advance_and_take_decided(self, samples: SampleBlock) -> list[SampleBlock]:
-        """Process a block, and return the samples for which motion has been decided, oldest first."""
+        """Process a block of samples, and return the samples with a final decision, oldest first."""
         first = self._index + samples.lost
         self._held.append((first, samples))
         self._index = first + len(samples)
         blocks, moving, episodes = _allocate_output(len(samples), self._size)
-        filled = advance(samples.values, first, self._size, False, self._state, blocks, moving, episodes)
+        filled = advance_motion_detection(
+            samples.values, first, self._size, False, self._state, blocks, moving, episodes
+        )
         return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
-    def flush(self) -> list[SampleBlock]:
-        """Return the delayed samples and end the current episode, because the stream has ended."""
+    def flush_delayed_samples(self) -> list[SampleBlock]:
+        """Return the delayed samples at the end of the stream, and end the current episode."""
         blocks, moving, episodes = _allocate_output(0, self._size)
-        filled = advance(
+        filled = advance_motion_detection(
             _read_only(np.empty((0, len(AXES)))), 0, self._size, True, self._state, blocks, moving, episodes
         )
         return self._release(blocks[: filled[0]], moving[: filled[0]], episodes[: filled[1]])
 
-    def take(self) -> list[Motion]:
-        """Return the episodes that ended since the last call."""
+    def take_motions(self) -> list[Motion]:
+        """Return the episodes of motion that ended since the last call."""
         motions, self._motions = self._motions, []
         return motions
 
     def _release(self, blocks: Ints, moving: Ints, episodes: Floats) -> list[SampleBlock]:
-        """Store the finished episodes, and return the samples of the blocks for which motion has been decided."""
         motions = [_make_motion(episode, self._size, self._rate_hz) for episode in episodes]
         self._motions += motions
         self.episodes += len(motions)
@@ -126,13 +123,13 @@ class MotionDetector:
                 samples = samples[: end - first]
             rows = (first + np.arange(len(samples))) // self._size
             struck = moving[np.searchsorted(blocks, rows)].astype(bool)
-            self.moved_samples += int(struck.sum())
+            self.samples_in_motion += int(struck.sum())
             out.append(_remove_moving(samples, struck))
         return out
 
 
 def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], list[Motion]]:
-    """Find motion in a whole recording on a regular grid.
+    """Detect motion in a whole recording on a regular time grid.
 
     Parameters
     ----------
@@ -148,23 +145,25 @@ def detect_motion(values: Floats, rate_hz: float) -> tuple[NDArray[np.bool_], li
     motions : list of Motion
         Episodes of motion.
     """
-    size = block_size(rate_hz)
-    kernel_state = make_state()
+    size = samples_per_block(rate_hz)
+    kernel_state = make_motion_state()
     blocks, moving, episodes = _allocate_output(len(values), size)
-    verdicts, stretches = advance(_read_only(values), 0, size, True, kernel_state, blocks, moving, episodes)
+    verdicts, stretches = advance_motion_detection(
+        _read_only(values), 0, size, True, kernel_state, blocks, moving, episodes
+    )
     mask = np.repeat(moving[:verdicts].astype(bool), size)[: len(values)]
     return mask, [_make_motion(episode, size, rate_hz) for episode in episodes[:stretches]]
 
 
-def block_size(rate_hz: float) -> int:
+def samples_per_block(rate_hz: float) -> int:
     """Return the number of samples in a block."""
     return max(round(BLOCK_S * rate_hz), MIN_BLOCK_SAMPLES)
 
 
 def _read_only(values: Floats) -> Floats:
-    """Return the samples as a contiguous read-only array, like those of a ``SampleBlock``.
+    """Return the samples as a contiguous read-only array.
 
-    Numba compiles a kernel again for each memory layout and access flag.
+    Numba compiles a kernel again for each memory layout and for writable arrays.
     """
     view = np.ascontiguousarray(values, np.float64).view()
     view.flags.writeable = False
@@ -172,13 +171,11 @@ def _read_only(values: Floats) -> Floats:
 
 
 def _allocate_output(rows: int, size: int) -> tuple[Ints, Ints, Floats]:
-    """Allocate the output arrays of the kernel."""
     n = rows // size + 4
     return np.zeros(n, np.int64), np.zeros(n, np.int64), np.zeros((n, 5))
 
 
 def _remove_moving(samples: SampleBlock, struck: NDArray[np.bool_]) -> SampleBlock:
-    """Replace the samples in motion by NaN."""
     if not struck.any():
         return samples
     values = np.where(struck[:, None], np.nan, samples.values)
@@ -186,7 +183,6 @@ def _remove_moving(samples: SampleBlock, struck: NDArray[np.bool_]) -> SampleBlo
 
 
 def _make_motion(episode: Floats, size: int, rate_hz: float) -> Motion:
-    """Convert a row of the kernel's output to a ``Motion``."""
     first, last = int(episode[FIRST]), int(episode[LAST])
     axis, peak = AXES[int(episode[AXIS])], float(episode[PEAK])
     moving = last - first + 1

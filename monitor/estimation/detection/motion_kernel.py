@@ -1,18 +1,14 @@
-"""Compiled kernel of the motion detector, which learns a reference at rest and decides for each block of samples.
+"""Compiled kernel of the motion detector, which learns the noise at rest and decides for each block of samples.
 
-Each axis of a block is described by the logarithm of the variance and by the mean. The sample furthest from the mean is
-excluded, because an outlier is a single sample and a knock lasts longer. The reference consists of the medians and
-quartiles of the log variance and the mean over the last ``REFERENCE_BLOCKS`` blocks at rest. The quartiles are exact,
-because the blocks are inserted into a sorted array. Up to a quarter of unusual blocks does not affect the reference. A
-drift of the sensor widens the accepted range.
+A block is described by the log variance and the mean of each axis. The sample with the largest deviation is excluded,
+so a single outlier does not count as motion. The reference consists of the medians and the quartiles over the last
+``REFERENCE_BLOCKS`` blocks at rest. Up to a quarter of unusual blocks does not affect the reference.
 
-A block is moving if the variance of any axis is too large or the mean of any axis is too far from the reference. If all
-axes are still at a new mean, the sensor has a new orientation, and the reference is shifted. A constant disturbance
-becomes the new reference after some time. Blocks with a far smaller variance than the reference become the new
-reference as well, because the old reference was learned in motion.
+A block is moving if the variance of an axis is too large or the mean of an axis is too far from the reference. A
+constant new mean is a new orientation, which shifts the reference. A constant disturbance becomes the new reference. A
+far smaller variance also starts a new reference, because the old reference was learned in motion.
 
-Samples must be passed in order. The index of a sample determines the block, so the decisions do not depend on the
-division of the stream into calls.
+The sample index determines the block, so decisions do not depend on the division of the input into calls.
 """
 
 from math import exp, inf, log, nan, sqrt
@@ -29,83 +25,82 @@ GYROS: Final = 3
 REFERENCE_BLOCKS: Final = 240
 """Number of blocks in the reference.
 
-240 blocks of 0.25 s take 60 s. A constant disturbance counts as rest after this number of blocks.
+240 blocks of 0.25 s take 60 s. A disturbance that lasts longer counts as rest.
 """
 MIN_REFERENCE_BLOCKS: Final = 8
-"""Minimum number of blocks at rest for a first reference. The accepted ranges are then twice as wide as later."""
+"""Minimum number of blocks at rest in a reference. The limits of a new reference are twice as wide."""
 BAND: Final = 8.0
-"""Largest deviation of the mean or the log variance of a block at rest, in standard deviations (from quartiles)."""
+"""Maximum deviation of a block at rest from the reference, in standard deviations."""
 LOUDER: Final = log(4.0)
-"""Minimum rise of the log variance for motion. Smaller changes are left to the change detector."""
+"""Minimum increase of the log variance for motion. The change detector reports smaller increases."""
 LOUDEST: Final = log(100.0)
-"""Rise of the log variance that always counts as motion, even if the reference contains motion."""
+"""Increase of the log variance that is always motion."""
 TOGETHER: Final = log(2.5)
-"""Minimum mean rise of the log variance over all axes, for motion that is too weak on each single axis."""
+"""Minimum mean increase of the log variance over all axes for weak motion."""
 TOGGLE: Final = 0.25
-"""Variance of toggling between two neighbouring levels, in squared steps."""
+"""Variance of an output that alternates between two adjacent levels, in squared quantization steps."""
 DRIFT: Final = 100.0
 """Maximum deviation of a mean at rest, relative to the deviation expected from the noise within blocks."""
 QUIETER: Final = log(9.0)
-"""Distance of the log variance below the lower quartile that replaces the reference.
+"""Minimum decrease of the log variance below the lower quartile that starts a new reference.
 
-If most axes are this quiet for ``MIN_REFERENCE_BLOCKS`` blocks, the reference was learned in motion.
+Most axes must be this quiet for ``MIN_REFERENCE_BLOCKS`` blocks.
 """
 NEVER_AT_REST: Final = (0.1,) * 3 + (1.0,) * 3
 """Limits in rad/s and m/s² that no MEMS sensor exceeds at rest.
 
-The limits apply to the rms within a block and to the change between blocks while there is no reference.
+Without a reference, the limits apply to the rms within a block and to the change between blocks.
 """
 SETTLED: Final = 4
-"""Number of blocks without change after which another mean is a new orientation."""
+"""Number of constant blocks after which a new mean is a new orientation."""
 NEW_BIAS: Final = 0.035
-"""Deviation of the mean of a gyroscope that is accepted after handling: 0.035 rad/s, 2 °/s.
+"""Maximum bias change of a gyroscope after handling, in rad/s (2 °/s).
 
-The limit is larger than g-sensitivity and bias steps. A larger deviation counts as rotation until ``SPUN`` blocks have
-passed.
+A larger change counts as rotation until ``SPUN`` blocks have passed.
 """
 SPUN: Final = 40
-"""Number of blocks (10 s) after which a larger mean without other signs of motion is accepted.
+"""Number of blocks (10 s) after which a larger bias change without other motion is accepted.
 
-In this case, the reference was learned during rotation.
+The reference was then learned during rotation.
 """
 REMOVED_AFTER: Final = 2
-"""Number of blocks that are removed after a moving block. The block before a moving block is removed as well."""
+"""Number of blocks that are replaced after a moving block."""
 EPISODE_GAP_BLOCKS: Final = 4
-"""Number of blocks at rest that end an episode."""
+"""Number of blocks at rest that end an episode of motion."""
 LOOK_EVERY: Final = 20
 """Number of blocks between two tests for a constant disturbance."""
 WANDER: Final = 4.0
-"""Largest ratio of the scatter of means at rest to the scatter expected from the noise within blocks."""
+"""Maximum ratio of the scatter of the means to the scatter expected from the noise within blocks."""
 MIN_VARIANCE: Final = 1e-30
-"""Variance assigned to a constant."""
+"""Variance of a constant signal."""
 MIN_BLOCK_SAMPLES: Final = 4
-"""Minimum number of samples in a block for a decision. At least half of the samples must be present as well."""
+"""Minimum number of samples in a block for a decision."""
 
 OPEN, HELD, HELD_MOVES, QUIET_RUN, BEGAN, LATEST, STILL, QUIET, RECENT, TURNED = range(10)
 """Elements of ``MotionState.place``:
 
-- ``OPEN``: block being filled.
-- ``HELD``, ``HELD_MOVES``: block whose decision is pending (-1 means none), and this decision.
+- ``OPEN``: number of the current block.
+- ``HELD``, ``HELD_MOVES``: number of the block with a pending decision (-1 means none), and the decision.
 - ``QUIET_RUN``: number of blocks at rest since the last moving block.
-- ``BEGAN``, ``LATEST``: first (-1 means none) and latest moving block of the open episode.
-- ``STILL``: number of successive still blocks.
+- ``BEGAN``, ``LATEST``: first (-1 means none) and latest moving block of the current episode.
+- ``STILL``: number of successive blocks with a constant mean.
 - ``QUIET``: number of successive blocks with a far smaller variance than the reference.
 - ``RECENT``: total number of blocks.
-- ``TURNED``: whether the orientation changed in the episode.
+- ``TURNED``: 1 if the orientation changed in the current episode.
 """
 FIRST, LAST, CHANGED, AXIS, PEAK = range(5)
-"""Columns of an episode: first and last moving block, whether the orientation changed, axis and size of the peak."""
+"""Columns of an episode: first and last moving block, change of the orientation, axis and size of the peak."""
 LOG_VARIANCE, MEAN = 0, 1
-"""Kinds of block statistics, the first index of the rings."""
+"""Block statistics, which are the first index of the ring buffers."""
 COUNT, SHIFT, SUM, SQUARES, LOW, HIGH, BEFORE, STEP = range(8)
 """Columns of ``MotionState.open``:
 
 - ``COUNT``: number of samples.
 - ``SHIFT``: first sample.
-- ``SUM``, ``SQUARES``: sums of the deviations from the first sample and of their squares.
-- ``LOW``, ``HIGH``: extremes.
+- ``SUM``, ``SQUARES``: sums of the deviations from the first sample, and of the squared deviations.
+- ``LOW``, ``HIGH``: minimum and maximum.
 - ``BEFORE``: previous sample.
-- ``STEP``: smallest step so far.
+- ``STEP``: smallest difference of successive samples since the start.
 """
 
 
@@ -113,17 +108,17 @@ class MotionState(NamedTuple):
     """State of the motion detector."""
 
     place: Ints  # [10] counters and flags, see OPEN
-    open: Floats  # [6, 8] block being filled, see COUNT
-    seen: Ints  # [6] total number of blocks at rest that were learned
-    shifted: Floats  # [6] sum of the shifts of the means by new orientations, while earlier blocks are in the ring
-    ring: Floats  # [2, 6, REFERENCE_BLOCKS] log variance and mean of blocks at rest, in order of time
-    ordered: Floats  # [2, 6, REFERENCE_BLOCKS] the same values, sorted
+    open: Floats  # [6, 8] current block, see COUNT
+    seen: Ints  # [6] total number of learned blocks
+    shifted: Floats  # [6] sum of the shifts of the mean by new orientations
+    ring: Floats  # [2, 6, REFERENCE_BLOCKS] log variance and mean of blocks at rest, ring buffer
+    ordered: Floats  # [2, 6, REFERENCE_BLOCKS] sorted values of ``ring``
     recent: Floats  # [2, 6, REFERENCE_BLOCKS] log variance and mean of all recent blocks
-    peaks: Floats  # [2, 6] largest excursion of the open episode, in SI and relative to the noise
+    peaks: Floats  # [2, 6] largest deviation in the current episode, in SI units and relative to the noise
 
 
-def make_state() -> MotionState:
-    """Return the initial state."""
+def make_motion_state() -> MotionState:
+    """Return the initial state of the motion detector."""
     place = np.zeros(10, np.int64)
     place[[HELD, BEGAN]] = -1
     place[QUIET_RUN] = EPISODE_GAP_BLOCKS
@@ -136,39 +131,45 @@ def make_state() -> MotionState:
 
 
 @compiled
-def advance(
-    values: Floats, first: int, size: int, ends: bool, s: MotionState, blocks: Ints, moving: Ints, episodes: Floats
+def advance_motion_detection(
+    values: Floats,
+    first_index: int,
+    block_samples: int,
+    stream_ends: bool,
+    s: MotionState,
+    blocks: Ints,
+    moving: Ints,
+    episodes: Floats,
 ) -> Ints:
-    """Process consecutive rows, and write the new decisions and the finished episodes to the output arrays.
+    """Process consecutive samples, and write new decisions and finished episodes to the output arrays.
 
     Parameters
     ----------
     values : ndarray of float64, shape (n, 6)
         Samples in rad/s and m/s²; NaN means missing.
-    first : int
-        Index of the first row, including missing samples.
-    size : int
+    first_index : int
+        Index of the first sample, counting missing samples.
+    block_samples : int
         Number of samples in a block.
-    ends : bool
-        True if the stream ends after these rows. The decision for the last, incomplete block is then made at once, and
-        the current episode ends.
+    stream_ends : bool
+        True at the end of the stream, to decide for the last block and to end the current episode.
     s : MotionState
-        State, updated in place.
+        State of the motion detector, updated in place.
     blocks, moving : ndarray of int64, shape (at least n/size + 2,)
-        Result: number of each block, and 1 if it moves.
+        Output: number of each decided block, and 1 for a moving block.
     episodes : ndarray of float64, shape (at least n/size + 2, 5)
-        Result: first and last moving block, whether the orientation changed, axis and size of the peak.
+        Output: finished episodes, with the columns ``FIRST``, ``LAST``, ``CHANGED``, ``AXIS`` and ``PEAK``.
 
     Returns
     -------
     ndarray of int64, shape (2,)
-        Number of decisions and number of episodes.
+        Numbers of new decisions and of finished episodes.
     """
     filled = np.zeros(2, np.int64)
     for i in range(values.shape[0]):
-        number = (first + i) // size
+        number = (first_index + i) // block_samples
         if number != s.place[OPEN]:
-            _close(size, s, blocks, moving, episodes, filled)
+            _close(block_samples, s, blocks, moving, episodes, filled)
             s.place[OPEN] = number
         for a in range(AXES):
             value = values[i, a]
@@ -187,8 +188,8 @@ def advance(
             s.open[a, SQUARES] += off * off
             s.open[a, LOW] = min(s.open[a, LOW], value)
             s.open[a, HIGH] = max(s.open[a, HIGH], value)
-    if ends:
-        _close(size, s, blocks, moving, episodes, filled)
+    if stream_ends:
+        _close(block_samples, s, blocks, moving, episodes, filled)
         _emit(s, blocks, moving, filled)
         s.place[HELD] = -1
         if s.place[BEGAN] >= 0:
@@ -198,7 +199,6 @@ def advance(
 
 @compiled
 def _close(size: int, s: MotionState, blocks: Ints, moving: Ints, episodes: Floats, filled: Ints) -> None:
-    """Complete the current block, decide whether it moves, update the reference, and output the previous block."""
     number = s.place[OPEN]
     follows = s.place[HELD] == number - 1
     now = np.empty((2, AXES))
@@ -222,7 +222,7 @@ def _close(size: int, s: MotionState, blocks: Ints, moving: Ints, episodes: Floa
 
 @compiled
 def _measure(a: int, s: MotionState, now: Floats) -> None:
-    """Compute the log variance and the mean of one axis of the block without the sample furthest from the mean."""
+    """Compute the log variance and the mean of one axis, without the sample of the largest deviation."""
     n = s.open[a, COUNT]
     mean = s.open[a, SUM] / n
     square = s.open[a, SQUARES] - n * mean * mean
@@ -231,7 +231,7 @@ def _measure(a: int, s: MotionState, now: Floats) -> None:
     furthest = high if high > -low else low
     square = max(square - furthest * furthest * n / (n - 1.0), 0.0)
     mean -= furthest / (n - 1.0)
-    floor = s.open[a, STEP] ** 2 / 12.0  # variance that rounding may hide
+    floor = s.open[a, STEP] ** 2 / 12.0  # maximum variance of a constant output
     now[LOG_VARIANCE, a] = log(square / (n - 2.0) + floor + MIN_VARIANCE)
     now[MEAN, a] = mean
     floor = log(floor + MIN_VARIANCE)
@@ -247,7 +247,7 @@ def _measure(a: int, s: MotionState, now: Floats) -> None:
 
 @compiled
 def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
-    """Return True if the block moves. A new orientation shifts the reference."""
+    """Return True if the block is moving. A new orientation shifts the reference."""
     loud, off, rotates = False, False, False
     still = follows
     before = (s.place[RECENT] - 1) % REFERENCE_BLOCKS
@@ -263,7 +263,7 @@ def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
         young = 1.0 + MIN_REFERENCE_BLOCKS / n
         step = s.open[a, STEP]
         middle = _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)
-        # approximately the standard deviation of the logarithm of χ² over its degrees of freedom
+        # √(2/ν) approximates the standard deviation of ln(χ²/ν).
         sigma = min(max(_scatter(s.ordered[LOG_VARIANCE, a], n), sqrt(2.0 / (size - 2.0))), LOUDEST / BAND)
         loud |= exp(now[LOG_VARIANCE, a]) > exp(middle + young * max(LOUDER, BAND * sigma)) + step * step
         rise = log(max(exp(now[LOG_VARIANCE, a]) - TOGGLE * step * step, MIN_VARIANCE)) - middle
@@ -287,14 +287,14 @@ def _judge(now: Floats, follows: bool, size: int, s: MotionState) -> bool:
 
 @compiled
 def _band(a: int, n: int, size: int, s: MotionState) -> float:
-    """Return the largest distance of a mean at rest from the median of the reference."""
+    """Return the maximum deviation of a mean at rest from the median of the reference."""
     explained = exp(0.5 * _quantile(s.ordered[LOG_VARIANCE, a], n, 0.5)) / sqrt(size)
     return BAND * min(max(_scatter(s.ordered[MEAN, a], n), explained), DRIFT / BAND * explained)
 
 
 @compiled
 def _take_over(now: Floats, s: MotionState) -> None:
-    """Shift the means of the reference to the current means of all axes, without a change of the scatter."""
+    """Shift the means of the reference to the current means. The scatter does not change."""
     for a in range(AXES):
         n = min(s.seen[a], REFERENCE_BLOCKS)
         if now[MEAN, a] == now[MEAN, a] and n > 0:
@@ -311,7 +311,6 @@ def _take_over(now: Floats, s: MotionState) -> None:
 
 @compiled
 def _learn(now: Floats, moves: bool, number: int, size: int, s: MotionState) -> None:
-    """Add a block at rest to the reference, or replace the reference by recent blocks."""
     newest = s.place[RECENT] % REFERENCE_BLOCKS
     s.place[RECENT] += 1
     quieter = measured = 0
@@ -341,7 +340,6 @@ def _learn(now: Floats, moves: bool, number: int, size: int, s: MotionState) -> 
 
 @compiled
 def _insert(a: int, log_variance: float, mean: float, s: MotionState) -> None:
-    """Add the values of one block to the reference of an axis, and remove the oldest block."""
     at, n = s.seen[a] % REFERENCE_BLOCKS, min(s.seen[a], REFERENCE_BLOCKS)
     for kind in range(2):
         value, ordered = log_variance if kind == LOG_VARIANCE else mean, s.ordered[kind, a]
@@ -363,7 +361,6 @@ def _insert(a: int, log_variance: float, mean: float, s: MotionState) -> None:
 
 @compiled
 def _rank(ordered: Floats, n: int, value: float) -> int:
-    """Return the position of a value in a sorted array."""
     low, high = 0, n - 1
     while low < high:
         middle = (low + high) // 2
@@ -391,9 +388,9 @@ def _begin_anew(blocks: int, s: MotionState) -> None:
 
 @compiled
 def _steady(size: int, s: MotionState) -> bool:
-    """Return True if the last ``REFERENCE_BLOCKS`` blocks show a constant disturbance.
+    """Return True if the last ``REFERENCE_BLOCKS`` blocks contain a constant disturbance.
 
-    The first and the second half of these blocks must agree. Bursts and a wandering mean are not allowed.
+    The first and the second half must agree, without bursts and without drift of the mean.
     """
     half, ordered = REFERENCE_BLOCKS // 2, np.empty(REFERENCE_BLOCKS)
     for a in range(AXES):
@@ -423,10 +420,7 @@ def _steady(size: int, s: MotionState) -> bool:
 
 @compiled
 def _sort_recent(s: MotionState, kind: int, a: int, begin: int, end: int, ordered: Floats) -> int:
-    """Write the sorted values of the recent blocks begin ≤ k < end, counted from the oldest, without NaN.
-
-    Return how many.
-    """
+    """Write recent values without NaN to ``ordered`` in ascending order, and return the number of values."""
     n = 0
     for k in range(begin, end):
         value = s.recent[kind, a, (s.place[RECENT] + k) % REFERENCE_BLOCKS]
@@ -442,13 +436,11 @@ def _sort_recent(s: MotionState, kind: int, a: int, begin: int, end: int, ordere
 
 @compiled
 def _median(ordered: Floats, n: int) -> float:
-    """Return the median of the first n values of a sorted array; NaN if n is 0."""
     return 0.5 * (ordered[(n - 1) // 2] + ordered[n // 2]) if n > 0 else nan
 
 
 @compiled
 def _interpolate(ordered: Floats, n: int, p: float) -> float:
-    """Return the quantile p of the first n ≥ 1 values of a sorted array, interpolated linearly between ranks."""
     rank = (n - 1) * p
     lower = int(rank)
     share = rank - lower
@@ -457,13 +449,13 @@ def _interpolate(ordered: Floats, n: int, p: float) -> float:
 
 @compiled
 def _quantile(ordered: Floats, n: int, p: float) -> float:
-    """Return the quantile p of the first n values of a sorted array, without interpolation."""
+    """Return a quantile of the first n values of a sorted array, without interpolation."""
     return float(ordered[int(p * (n - 1) + 0.5)])
 
 
 @compiled
 def _scatter(ordered: Floats, n: int) -> float:
-    """Return the standard deviation, estimated from the larger distance of the two quartiles from the median."""
+    """Return the standard deviation, computed from the larger distance of a quartile from the median."""
     low, middle, high = _quantile(ordered, n, 0.25), _quantile(ordered, n, 0.5), _quantile(ordered, n, 0.75)
     return max(high - middle, middle - low) / NORMAL_QUARTILE
 
@@ -473,7 +465,6 @@ def _scatter(ordered: Floats, n: int) -> float:
 
 @compiled
 def _remember(now: Floats, number: int, s: MotionState) -> None:
-    """Add a moving block to the current episode or to a new one, and update the peaks of the episode."""
     if s.place[BEGAN] < 0:
         s.place[BEGAN], s.place[TURNED] = number, 0
         for a in range(AXES):
@@ -494,7 +485,6 @@ def _remember(now: Floats, number: int, s: MotionState) -> None:
 
 @compiled
 def _emit(s: MotionState, blocks: Ints, moving: Ints, filled: Ints) -> None:
-    """Write the pending decision to the output."""
     if s.place[HELD] >= 0:
         blocks[filled[0]], moving[filled[0]] = s.place[HELD], s.place[HELD_MOVES]
         filled[0] += 1
@@ -502,7 +492,6 @@ def _emit(s: MotionState, blocks: Ints, moving: Ints, filled: Ints) -> None:
 
 @compiled
 def _end(s: MotionState, episodes: Floats, filled: Ints) -> None:
-    """Write the current episode to the output and end it."""
     axis = 0
     for a in range(1, AXES):
         if s.peaks[1, a] > s.peaks[1, axis]:

@@ -1,12 +1,9 @@
 """Share of rows in a recording that repeat the previous row because the sensor had no new measurement.
 
-With a coarse resolution, values also repeat by chance, but then the axes repeat independently of each other. A repeated
-measurement repeats all axes at the same time. The noise may change during a recording. The result is therefore the
-median of the shares in up to ``MAX_STRETCHES`` stretches of ``ROWS`` rows, spread over the recording. With fewer than
-two measured axes, the share is 0.
+Values can also repeat by chance if the resolution is coarse, but only on single axes. A repeated measurement repeats
+all axes. The noise may change during a recording, so the share is the median over stretches of ``ROWS`` rows.
 
-``reconcile`` tests each axis separately (``value_statistics.detect_repeats``), because it needs the positions of the
-repeats and the gain in log-likelihood for a single axis.
+``reconcile`` tests each axis separately, because it needs the positions of the repeated samples.
 """
 
 from typing import Final
@@ -18,21 +15,20 @@ from drivers.data_types import Floats, Ints
 from monitor.common.compiled import compiled
 
 ROWS: Final = 1000
-"""Number of rows in a stretch. The noise is assumed to be constant within a stretch."""
+"""Number of rows in a stretch with constant noise."""
 MAX_STRETCHES: Final = 500
 BISECTIONS: Final = 40
 
 
-def estimate_repeated_share(values: Floats) -> float:
+def estimate_repeated_row_share(values: Floats) -> float:
     """Return the share of rows [n, 6] that repeat the previous row because the sensor had no new measurement.
 
-    Let s be the share of repeated rows, and q_a the share of the other rows in which the value of axis a repeats by
-    chance. The share of rows in which axis a repeats is then s + (1 - s) q_a. The noise of different axes is
-    independent, so the share of rows in which all axes repeat is s + (1 - s) Π q_a. The function solves these equations
-    for s. NaN means missing.
+    Let s be the share of repeated measurements, and q_a the probability that the value of axis a repeats by chance.
+    Axis a then repeats in a share s + (1 - s) q_a of all rows. All axes repeat in a share s + (1 - s) Π q_a. The
+    function solves these equations for s. NaN means missing. The share is 0 for fewer than two measured axes.
 
     >>> noise = np.random.default_rng(0).normal(size=(5000, 6)).round()
-    >>> estimate_repeated_share(noise), round(estimate_repeated_share(noise.repeat(2, axis=0)), 1)
+    >>> estimate_repeated_row_share(noise), round(estimate_repeated_row_share(noise.repeat(2, axis=0)), 1)
     (0.0, 0.5)
     """
     there = np.array([not np.isnan(column[:1]).all() or not np.isnan(column).all() for column in values.T])
@@ -50,7 +46,6 @@ def estimate_repeated_share(values: Floats) -> float:
 
 @compiled
 def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, pairs: Ints, repeats: Ints, whole: Ints) -> None:
-    """Count the complete pairs of rows in each stretch, the repeats of each axis, and the repeats of all axes."""
     for stretch in range(begins.size):
         begin = begins[stretch]
         for i in range(begin + 1, min(begin + ROWS, len(values))):
@@ -74,11 +69,10 @@ def _count(values: Floats, there: NDArray[np.bool_], begins: Ints, pairs: Ints, 
 def _solve_share(each: Floats, all_of_them: Floats) -> Floats:
     """Return the shares s [k] that solve all_of_them = s + (1 - s) Π (each - s)/(1 - s), by bisection.
 
-    ``each`` [k, axes] contains the shares of rows in which each axis repeats, and ``all_of_them`` [k] the shares in
-    which all axes repeat.
+    ``each`` [k, axes] is the share of repeats of each axis. ``all_of_them`` [k] is the share of rows in which all axes
+    repeat.
     """
     explained = each.prod(axis=1)
-    # The repeats are explained by chance. A constant axis, each = 1, does not affect this test.
     none = all_of_them <= explained + 3.0 * np.sqrt(explained / ROWS)
     each, all_of_them = each[~none], all_of_them[~none]
     low, high = np.zeros(len(each)), np.minimum(each.min(axis=1), all_of_them)

@@ -46,7 +46,7 @@ from monitor.estimation.fit.fit_kernel_types import (
     empty_solution_maps,
 )
 from monitor.estimation.fit.least_squares import N, R
-from monitor.noise.standard_terms import unit_allan_variances
+from monitor.noise.standard_terms import unit_coefficient_allan_variances
 
 TO_SI: Final = np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
 """Powers of the sample rate that convert Q N B K R from τ0 = 1 to SI."""
@@ -94,7 +94,7 @@ def make_design(factors: Ints, rate_hz: float) -> Design:
         Sample rate in Hz.
     """
     m = np.asarray(factors, np.float64)
-    columns = np.ascontiguousarray(unit_allan_variances(m, 1.0))
+    columns = np.ascontiguousarray(unit_coefficient_allan_variances(m, 1.0))
     return Design(factors, rate_hz, columns)
 
 

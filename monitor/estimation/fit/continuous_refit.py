@@ -17,8 +17,8 @@ order, so outdated weights increase the error by at most 2 %.
 When an axis needs a new map, the kernel returns, and Python calls ``fit_axes``. Such calls are rare. If the kernel
 itself called ``fit_axes``, the compiler would have to compile this function a second time.
 
-The result contains Q N B K R for every sample, with NaN where a coefficient is not estimated. Only ``Estimator.get``
-computes confidence intervals.
+The result contains Q N B K R for every sample, with NaN where a coefficient is not estimated. Only
+``Estimator.get_estimate`` computes confidence intervals.
 """
 
 from typing import Final, NamedTuple

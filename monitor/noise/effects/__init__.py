@@ -1,5 +1,4 @@
-"""Effects of a noise model, one per file, in a folder per family. The name of the file is the name of the effect in
-model files."""
+"""Effects of a noise model. Each effect has its own module, and the module name is the name in model files."""
 
 from typing import Final
 
@@ -38,8 +37,10 @@ TRANSFORM_ORDER: Final[tuple[type[Transform], ...]] = (
     Resolution,
     RandomSampleHold,
 )
-"""Order in which transforms act, independent of their order in the model. Two transforms of the same kind act in the
-order of the model."""
+"""Order in which transforms are applied.
+
+Transforms of the same kind are applied in the order of the model.
+"""
 
 _ALL: Final[tuple[type[Effect], ...]] = (
     Bias,
@@ -64,4 +65,4 @@ _ALL: Final[tuple[type[Effect], ...]] = (
     *TRANSFORM_ORDER,
 )
 EFFECTS: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in _ALL}
-"""Name of an effect in model files -> its class."""
+"""Class of each effect, by its name in model files."""

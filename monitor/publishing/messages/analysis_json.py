@@ -13,7 +13,7 @@ from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.analysis import Analysis
+from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.detection.change_detection import Change
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing.messages.message import attributes_with_field_names, encode_json
@@ -107,7 +107,7 @@ class ChangeValues(msgspec.Struct, frozen=True):
     def from_change(cls, change: Change, rate_hz: float) -> Self:
         """Build the JSON values of a detected change."""
         t = change.since / rate_hz
-        return cls(change.kind, AXES[change.axis], t, change.sigma, change.sides(), change.text)
+        return cls(change.kind, AXES[change.axis], t, change.sigma, change.values_before_and_after(), change.text)
 
 
 class CoefficientSeries(msgspec.Struct, frozen=True, eq=False):
@@ -166,7 +166,7 @@ class AnalysisMessage(msgspec.Struct, frozen=True, kw_only=True, eq=False, tag_f
     @classmethod
     def from_analysis(
         cls,
-        result: Analysis,
+        result: RecordingAnalysis,
         total: TotalCurve | None = None,
         hadamard: HadamardCurve | None = None,
         dynamic: DynamicAllan | None = None,
@@ -242,7 +242,7 @@ class FailedAnalysisMessage(msgspec.Struct, frozen=True, tag_field="schema", tag
 
 
 def _temperature_values(
-    result: Analysis, temperature: TemperatureRemoval | None, axis: str
+    result: RecordingAnalysis, temperature: TemperatureRemoval | None, axis: str
 ) -> TemperatureDependenceValues | UnsetType:
     if temperature is None or axis not in result.axes_of_temperature:
         return UNSET

@@ -17,10 +17,10 @@ from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Coefficients, Status
-from monitor.noise.standard_terms import unit_allan_variances
+from monitor.noise.standard_terms import unit_coefficient_allan_variances
 from monitor.publishing.messages.message import (
     Count,
     Message,
@@ -208,7 +208,7 @@ class ModelGapMessage(WindowResultMessage, frozen=True, kw_only=True, tag=topics
     axes: dict[str, AxisModelGapValues]
 
     @classmethod
-    def _convert(cls, _t: float | None, result: ModelGap) -> dict[str, Any]:
+    def _convert(cls, _t: float | None, result: ModelComparison) -> dict[str, Any]:
         axes = {
             axis: AxisModelGapValues(
                 agrees=result.agrees.get(axis),
@@ -483,7 +483,7 @@ def fitted_allan_variance(tau_s: Floats, rate_hz: float, coefficients: Coefficie
     coefficients
         Coefficients of all axes.
     """
-    total: Floats = unit_allan_variances(tau_s, 1.0 / rate_hz) @ np.nan_to_num(coefficients.value) ** 2
+    total: Floats = unit_coefficient_allan_variances(tau_s, 1.0 / rate_hz) @ np.nan_to_num(coefficients.value) ** 2
     total[:, np.isnan(coefficients.value).all(axis=0)] = np.nan
     return total
 

@@ -14,7 +14,7 @@ import numpy as np
 from drivers.data_types import AXES
 from monitor.common.units import COEFFICIENT_NAMES, COEFFICIENT_UNITS, KINDS, Kind, axes_of, format_duration
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
-from monitor.estimation.analysis import Analysis
+from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing.coefficient_cells import (
@@ -42,7 +42,7 @@ TABLE_LEGEND: Final = (
 class AnalysisPlotData:
     """Content of the analysis plot and of the HTML report of one recording."""
 
-    analysis: Analysis
+    analysis: RecordingAnalysis
     others: Sequence[AdditionalDeviation] = ()  # such as total and Hadamard deviation
     dynamic: DynamicAllan | None = None
     marks: Sequence[ChangeMark] = ()  # changes to mark in the dynamic Allan deviation
@@ -114,7 +114,7 @@ def is_k_r_ambiguous(estimate: Estimate, letter: str, axis: str) -> bool:
     return letter in ("K", "R") and bool(estimate.k_or_r[i] and bounded)
 
 
-def _draw_table(panel: "Axes", analysis: Analysis, kind: Kind) -> None:
+def _draw_table(panel: "Axes", analysis: RecordingAnalysis, kind: Kind) -> None:
     estimate = analysis.estimate
     panel.axis("off")
     rows = np.linspace(0.97, 0.19, len(SYMBOLS) + 1)

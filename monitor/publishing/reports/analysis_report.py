@@ -9,7 +9,7 @@ from typing import Any, Final
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from monitor.common.units import COEFFICIENT_NAMES, KIND_NAMES, Kind, axes_of, format_duration, format_number
-from monitor.estimation.analysis import Analysis
+from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.publishing.coefficient_cells import (
@@ -70,7 +70,7 @@ def render_page(plot_data: AnalysisPlotData, title: str = "") -> str:
     )
 
 
-def recording_facts(analysis: Analysis) -> tuple[tuple[str, str], ...]:
+def recording_facts(analysis: RecordingAnalysis) -> tuple[tuple[str, str], ...]:
     """Return names and values of the properties of a recording."""
     estimate = analysis.estimate
     missing = max(estimate.curve.n - estimate.samples, 0)

@@ -13,7 +13,7 @@ import rerun as rr
 
 from drivers.data_types import AXES, Floats
 from monitor.common.units import DEVIATION_UNITS, KINDS, Kind, axes_of, sensor_kind
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.publishing.plots import axis_colours as colours
 from monitor.publishing.plots.axis_colours import Colour
@@ -50,7 +50,7 @@ class AllanPlot:
         self._path = path
         self._scales: dict[Kind, ChartScale] = {}  # scale of the newest grid
 
-    def draw(self, estimate: Estimate, gap: ModelGap | None) -> None:
+    def draw(self, estimate: Estimate, gap: ModelComparison | None) -> None:
         """Draw the Allan deviations of an estimate.
 
         Parameters
@@ -132,7 +132,7 @@ class _Curve:
         return self.deviation, self.fitted, self.model
 
     @classmethod
-    def from_estimate(cls, estimate: Estimate, axis: str, gap: ModelGap | None) -> "_Curve | None":
+    def from_estimate(cls, estimate: Estimate, axis: str, gap: ModelComparison | None) -> "_Curve | None":
         """Return None if the axis has fewer than two deviations."""
         curve, i = estimate.curve, AXES.index(axis)
         rows = np.isfinite(curve.avar[:, i]) & (curve.avar[:, i] > 0)

@@ -25,7 +25,7 @@ from monitor.common.units import (
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
 from monitor.drift.thermal.online_thermal_model import PredictedAxisInterval
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.history.history_table import HistoryTable
@@ -256,7 +256,7 @@ class ThermalPanel(Panel):
 class GapPanel(Panel):
     """Time series of the difference between measurement and noise model."""
 
-    newest: ModelGap | None = None
+    newest: ModelComparison | None = None
 
     def log_styles(self) -> None:
         """Log the names, colours and widths of the lines."""
@@ -264,7 +264,7 @@ class GapPanel(Panel):
             self._style_lines(f"gap/{axis}", [(f"{axis}, σ from its model", colours.AXIS_COLOURS[axis], 1.5)])
         self._style_lines("gap/threshold", [("threshold", colours.blend_colours(colours.TEXT, 0.6), 1.0)])
 
-    def draw(self, unix_s: Floats, results: Sequence[ModelGap]) -> None:
+    def draw(self, unix_s: Floats, results: Sequence[ModelComparison]) -> None:
         """Draw comparisons with the noise model."""
         self.newest = results[-1]
         highest = [max((axis.threshold for axis in one.axes.values()), default=np.nan) for one in results]

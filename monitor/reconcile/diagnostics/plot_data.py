@@ -13,7 +13,7 @@ from scipy.special import chdtri, erfc
 from drivers.data_types import Floats, Ints
 from monitor.common.distributions import Z95
 from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
-from monitor.noise.spectrum import allan_of_density
+from monitor.noise.spectrum import allan_variance_of_density
 from monitor.reconcile.diagnostics.diagnostics import MAX_LAG_SAMPLES, autocorrelation
 from monitor.reconcile.likelihood.whitening import WhitenedAxis, noise_deviation_over_time
 from monitor.reconcile.preparation.cosine_bins import inverse_cosine_transform
@@ -73,7 +73,7 @@ def _plot_allan_deviation(whitened: WhitenedAxis, fitted: Floats) -> PlotData:
     measured, _ = overlapping_avar_axis(axis.repaired, m)
     deterministic, _ = overlapping_avar_axis(fitted, m)
     tau_s = np.asarray(m * tau0_s, np.float64)
-    noise = allan_of_density(_density_function(whitened), tau_s, tau0_s, ())
+    noise = allan_variance_of_density(_density_function(whitened), tau_s, tau0_s, ())
     lo, hi = _chi2_band(_allan_degrees_of_freedom(whitened, m))
     curves = (measured, noise + deterministic, lo * noise + deterministic, hi * noise + deterministic)
     names = ("allan", "averaging time", "s", "Allan deviation", _level_unit(whitened))

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import Effect, Leak, Source, Transform
+from monitor.noise.effect import AxisLeak, Effect, Source, Transform
 from monitor.noise.effects import (
     TRANSFORM_ORDER,
     AngleRandomWalk,
@@ -155,7 +155,7 @@ class Axis:
 
     def regressor_transforms(self, effect: Effect) -> list[Floats]:
         """Return the cosine transform of each regressor of a deterministic effect, each of shape (n − 1,)."""
-        if isinstance(effect, Leak):
+        if isinstance(effect, AxisLeak):
             return [self.leak_sources[effect.source]]
         return self.regressors.regressor_transforms(effect)
 
@@ -263,7 +263,7 @@ class Axis:
                     factor *= 1.0 + later * (other.ratio**2 - 1.0)  # mean variance over the recording
         tau0_s, unit = 1.0 / self.rate_hz, with_size(effect, 1.0)
         assert isinstance(unit, Source)
-        source = Spectrum(lambda f: factor * unit.psd(f, tau0_s), None, tau0_s)
+        source = Spectrum(lambda f: factor * unit.two_sided_psd(f, tau0_s), None, tau0_s)
         density = _density_after(transforms, source, self.bins) - _density_after(transforms, None, self.bins)
         return np.asarray(density / tau0_s)
 
@@ -386,4 +386,4 @@ def _regressor_key(regressor: Regressor | None) -> tuple[object, int] | None:
     if regressor is None or regressor is CURVATURE:
         return regressor
     effect, at = regressor
-    return (with_size(effect, 1.0) if isinstance(effect, Leak) else with_regressor_factors(effect, np.ones(2)), at)
+    return (with_size(effect, 1.0) if isinstance(effect, AxisLeak) else with_regressor_factors(effect, np.ones(2)), at)

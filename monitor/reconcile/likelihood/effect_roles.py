@@ -4,8 +4,8 @@ The **size** of an effect is the parameter that scales the effect. All other par
 noise effect adds variance to each frequency bin. The variance is the **variance basis**, which is the variance for size
 one, multiplied by the square of the size. A deterministic effect adds a series. The series is the **regressor**, which
 is the series for size one, multiplied by the size. The simulation uses the same series, so fit and simulation agree.
-The regressor of a ``Leak`` is another axis. A transform, such as a low-pass filter, changes the variance bases of all
-noise effects that act before the transform.
+The regressor of an ``AxisLeak`` is another axis. A transform, such as a low-pass filter, changes the variance bases of
+all noise effects that act before the transform.
 """
 
 from dataclasses import replace
@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import Effect, Leak, SampleBlockContext, Source
+from monitor.noise.effect import AxisLeak, Effect, SampleBlockContext, Source
 from monitor.noise.effects import (
     AngleRandomWalk,
     BiasInstability,
@@ -131,7 +131,7 @@ def unit_regressors(effect: Effect, n: int, rate_hz: float, temperature_c: Float
     TypeError
         If the effect is a leak, because the regressor of a leak is another axis.
     """
-    if isinstance(effect, Leak):
+    if isinstance(effect, AxisLeak):
         raise TypeError("the series of a leak is another axis")
     variants: list[Any]
     if isinstance(effect, Sinusoidal):
@@ -168,5 +168,7 @@ def _series_of(effect: Source, n: int, rate_hz: float, temperature_c: Floats | N
     values = np.zeros(n)
     known_c = np.full(n, np.nan) if temperature_c is None else temperature_c
     # a deterministic effect draws no random numbers, but the interface requires a generator
-    effect.start(rate_hz, np.random.default_rng(0)).add(values, SampleBlockContext(0, known_c, np.empty(n)))
+    effect.start_series(rate_hz, np.random.default_rng(0)).add_next_samples(
+        values, SampleBlockContext(0, known_c, np.empty(n))
+    )
     return values

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import Floats, Ints
-from monitor.noise.effect import Effect, first_sample_index
+from monitor.noise.effect import Effect, first_sample_at_or_after
 from monitor.noise.effects import NoiseStep
 from monitor.reconcile.likelihood.axis_fit import Axis, AxisFit, Effects
 from monitor.reconcile.likelihood.outlier_fit import OutlierFit, fit_outliers
@@ -117,5 +117,5 @@ def noise_deviation_over_time(fit: AxisFit) -> Floats:
     deviation = np.ones(fit.axis.n)
     for effect in fit.effects:
         if isinstance(effect, NoiseStep):
-            deviation[min(first_sample_index(effect.time, fit.axis.rate_hz), fit.axis.n) :] *= effect.ratio
+            deviation[min(first_sample_at_or_after(effect.time, fit.axis.rate_hz), fit.axis.n) :] *= effect.ratio
     return np.asarray(deviation / np.sqrt(np.mean(deviation**2)))

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from monitor.noise.effect import Effect, Leak
+from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import BiasStep, Outliers, RandomSampleHold, Saturation
 from monitor.reconcile.diagnostics.diagnostics import DIAGNOSTICS
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings, run_diagnostics
@@ -235,7 +235,7 @@ def _gains_by_type(rounds: list[SearchRound]) -> dict[type[Effect], float]:
     for one in rounds:
         if one.hypothesis.added:
             kind = type(one.hypothesis.added[-1])
-            most_direct_only = issubclass(kind, (Leak, BiasStep, *SMOOTH_SPECTRA))
+            most_direct_only = issubclass(kind, (AxisLeak, BiasStep, *SMOOTH_SPECTRA))
             lenses = (MOST_DIRECT_DIAGNOSTIC[kind.name],) if most_direct_only else tuple(one.before.findings)
             found[kind] = max(found.get(kind, 0.0), *(one.before.findings[lens].gain for lens in lenses))
     return found

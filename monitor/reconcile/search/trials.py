@@ -21,7 +21,7 @@ from typing import Final
 import numpy as np
 from scipy.special import chdtrc
 
-from monitor.noise.effect import Effect, Leak
+from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import (
     AngleRandomWalk,
     ExponentiallyCorrelated,
@@ -254,7 +254,7 @@ def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> lis
         effect
         for effect in proposed
         if hypothesis.axis.fit((*hypothesis.effects, effect)).log_likelihood - free > 0.3 * PENALTY_NATS[effect.name]
-        and (not isinstance(effect, Leak) or _has_flat_coefficient(whitened, effect))
+        and (not isinstance(effect, AxisLeak) or _has_flat_coefficient(whitened, effect))
     ]
     if not kept:
         return []
@@ -275,7 +275,7 @@ def _deterministic_trials(hypothesis: Hypothesis, whitened: WhitenedAxis) -> lis
     return trials
 
 
-def _has_flat_coefficient(whitened: WhitenedAxis, leak: Leak) -> bool:
+def _has_flat_coefficient(whitened: WhitenedAxis, leak: AxisLeak) -> bool:
     """Return True if one coefficient describes a leak at all frequencies.
 
     If vibration acts on both axes, the coefficient of the leak depends on the frequency. The coefficient is fitted in

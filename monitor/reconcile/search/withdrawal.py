@@ -22,7 +22,7 @@ from typing import Final
 
 import numpy as np
 
-from monitor.noise.effect import Effect, Leak
+from monitor.noise.effect import AxisLeak, Effect
 from monitor.noise.effects import BandwidthLimit, BiasStep, ExponentiallyCorrelated, Narrowband, Sinusoidal
 from monitor.reconcile.diagnostics.null_distribution import AxisNull, Findings
 from monitor.reconcile.likelihood.axis_fit import Effects
@@ -83,7 +83,7 @@ def keep_supported_effects(
         if place is not None:
             candidates = contradicted(Effect, remaining(lens), MAX_REMAINING_SHARE)
             withdrawn |= {at for at in candidates if _overlaps(added[at], place)}
-    withdrawn |= contradicted(Leak, remaining("other_axes"), MAX_REMAINING_LEAK_SHARE)
+    withdrawn |= contradicted(AxisLeak, remaining("other_axes"), MAX_REMAINING_LEAK_SHARE)
     withdrawn |= contradicted(BiasStep, remaining("level"), MAX_REMAINING_SHARE)
     withdrawn |= contradicted(SMOOTH_SPECTRA, max(map(remaining, NON_SPECTRAL_DIAGNOSTICS)), MAX_FOREIGN_RATIO)
     return tuple(effect for at, effect in enumerate(added) if at not in withdrawn)

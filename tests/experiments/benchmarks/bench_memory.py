@@ -47,9 +47,9 @@ for start in range(0, n + rows, rows):
     values = 1e-4 * rng.standard_normal((rows, 6)) + [0.0, 0.0, 0.0, 0.0, 0.0, 9.81]
     if every:
         values[start // rows % every :: every] = np.nan
-    estimator.update(make_block(start + np.arange(rows), values))
+    estimator.add_samples(make_block(start + np.arange(rows), values))
 said("a full window")
-estimator.get()
+estimator.get_estimate()
 said("curve, fit and intervals")
 """
 

@@ -98,9 +98,9 @@ class Fitted:
             values[:, 0] = first[start : start + ROWS]
             samples = make_block(start + np.arange(len(values)), values)
             begun = time.thread_time()
-            estimator.update(samples)
+            estimator.add_samples(samples)
             took += time.thread_time() - begun
-        self.avar = estimator.get().curve.avar[:, 0]
+        self.avar = estimator.get_estimate().curve.avar[:, 0]
         return took
 
 
@@ -215,16 +215,16 @@ def each_sample(length: int, taus: int, rounds: int) -> tuple[str, ...]:
     for _ in range(-(-length // n) + 1):
         samples = make_block(np.arange(n), noise(n))
         window.update(samples.values)
-        plain.update(samples)
-        fitting.update(samples)
+        plain.add_samples(samples)
+        fitting.add_samples(samples)
     parts = [make_block(np.arange(100), noise(100)) for _ in range(n // 100)]
     model, table_ = make_design(sizes, 1.0), covariances(length, sizes)
     avar, terms, slope = window.avar(), window.terms(), window.slopes_of_axes_and_taus()[0]
     took = alternate(
         {
             "kernel": for_each(window.update, [one.values for one in parts]),
-            "plain": for_each(plain.update, parts),
-            "fitting": for_each(fitting.update, parts),
+            "plain": for_each(plain.add_samples, parts),
+            "fitting": for_each(fitting.add_samples, parts),
             "solved": for_each(
                 lambda curve: fit(model, table_, curve, full=False), [MeasuredCurve(avar, terms, slope)] * 100
             ),
@@ -248,7 +248,7 @@ def fits(windows: Sequence[int], rounds: int) -> None:
     load = Load()
     shown = table(
         f"six axes, a hundred samples a call, full windows; median of {rounds} rounds, a sample", "window", "τ",
-        "kernel, and a τ·axis", "Estimator.update", "fitted at each", "more, an axis", "fit from nothing, an axis",
+        "kernel, and a τ·axis", "Estimator.add_samples", "fitted at each", "more, an axis", "fit from nothing, an axis",
     )  # fmt: skip
     for length in windows:
         for taus in (20, 40):

@@ -60,12 +60,12 @@ NORMALS: Final = {"five": 4, "eight": 5}
 
 def streamed(effects: tuple[Effect, ...], n: int) -> Callable[[], None]:
     """A stream of six axes, in blocks."""
-    stream = NoiseModel(dict.fromkeys(AXES, effects)).stream(RATE_HZ, 1)
-    stream.draw(BLOCK)  # compiles
+    stream = NoiseModel(dict.fromkeys(AXES, effects)).start_stream(RATE_HZ, 1)
+    stream.draw_samples(BLOCK)  # compiles
 
     def work() -> None:
         for _ in range(n // BLOCK):
-            stream.draw(BLOCK)
+            stream.draw_samples(BLOCK)
 
     return work
 
@@ -156,13 +156,13 @@ def speed(rounds: int) -> None:
 
 def memory(samples: int) -> None:
     """Resident memory while so many samples are drawn."""
-    stream = NoiseModel(dict.fromkeys(AXES, FIVE + THREE_MORE)).stream(RATE_HZ, 1)
+    stream = NoiseModel(dict.fromkeys(AXES, FIVE + THREE_MORE)).start_stream(RATE_HZ, 1)
     process = psutil.Process()
     shown = table(f"resident memory, five terms and three more, blocks of {BLOCK}", "samples drawn", "MB")
     drawn = 0
     for mark in np.unique(np.geomspace(BLOCK, samples, 6).astype(np.int64) // BLOCK * BLOCK):
         while drawn < mark:
-            stream.draw(BLOCK)
+            stream.draw_samples(BLOCK)
             drawn += BLOCK
         shown.add_row(f"{drawn:,}", f"{process.memory_info().rss / 1e6:.1f}")
     console.print(shown)

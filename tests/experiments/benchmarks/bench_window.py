@@ -42,8 +42,8 @@ from monitor.estimation.estimator import Estimator
 imported = time.perf_counter()
 estimator = Estimator(100.0, 60.0)
 values = np.random.default_rng(0).standard_normal((1000, 6))
-estimator.update(make_block(np.arange(1000), values, np.full(1000, np.nan), np.arange(1000)))
-estimator.get()
+estimator.add_samples(make_block(np.arange(1000), values, np.full(1000, np.nan), np.arange(1000)))
+estimator.get_estimate()
 print(imported - start, time.perf_counter() - imported)
 """
 
@@ -136,14 +136,14 @@ def window_costs(rounds: int) -> None:
 
 
 def refit_cost(rounds: int) -> None:
-    """``Estimator.get`` on a full and on a growing window."""
+    """``Estimator.get_estimate`` on a full and on a growing window."""
     load = Load()
     shown = table("a refit: curve, fit and intervals of six axes", "window", "τ", "median (best)")
     for seconds, rate_hz in ((10.0, 100.0), (3600.0, 100.0), (3600.0, 1000.0)):
         estimator = full_estimator(seconds, rate_hz)
-        estimator.get()  # the table of covariances of a full window is made once
-        median, best = alternate({"get": estimator.get}, 20 * rounds)["get"]  # type: ignore[dict-item]
-        taus = estimator.get().curve.factors.size
+        estimator.get_estimate()  # the table of covariances of a full window is made once
+        median, best = alternate({"get": estimator.get_estimate}, 20 * rounds)["get"]  # type: ignore[dict-item]
+        taus = estimator.get_estimate().curve.factors.size
         shown.add_row(f"full, {seconds:g} s at {rate_hz:g} Hz", f"{taus}", f"{median * 1e6:.0f} ({best * 1e6:.0f}) µs")
     took = sorted(growing_refits())
     text = f"{took[len(took) // 2] * 1e6:.0f} µs, 99 of 100 within {took[int(0.99 * len(took))] * 1e6:.0f} µs, "
@@ -157,7 +157,7 @@ def full_estimator(seconds: float, rate_hz: float) -> Estimator:
     estimator = Estimator(rate_hz, seconds)
     for start in range(0, round(seconds * rate_hz), 100_000):
         n = min(100_000, round(seconds * rate_hz) - start)
-        estimator.update(make_block(np.arange(n), made(n), np.full(n, np.nan), np.arange(n)))
+        estimator.add_samples(make_block(np.arange(n), made(n), np.full(n, np.nan), np.arange(n)))
     return estimator
 
 
@@ -167,9 +167,9 @@ def growing_refits() -> list[float]:
     values = made(60_000)
     for start in range(0, len(values), CHUNK):
         part = values[start : start + CHUNK]
-        estimator.update(make_block(np.arange(CHUNK), part, np.full(CHUNK, np.nan), np.arange(CHUNK)))
+        estimator.add_samples(make_block(np.arange(CHUNK), part, np.full(CHUNK, np.nan), np.arange(CHUNK)))
         begun = time.perf_counter()
-        estimator.get()
+        estimator.get_estimate()
         took.append(time.perf_counter() - begun)
     return took[1:]
 

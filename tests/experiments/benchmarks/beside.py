@@ -31,8 +31,8 @@ from monitor.common.units import (
     axes_of,
     sensor_kind,
 )
-from monitor.estimation.analysis import Analysis
-from monitor.estimation.detection.line_and_outlier_detection import detect_lines
+from monitor.estimation.analysis import RecordingAnalysis
+from monitor.estimation.detection.line_and_outlier_detection import detect_spectral_lines
 from monitor.noise.model_loading import load_model
 from monitor.publishing.coefficient_cells import format_coefficient
 from monitor.publishing.plots.allan_figure import FIT_DASHES, MARKER_SIZES, MARKERS
@@ -72,7 +72,7 @@ class Side:
     """One of the two."""
 
     name: str
-    result: Analysis
+    result: RecordingAnalysis
 
     @property
     def rate_hz(self) -> float:
@@ -144,7 +144,9 @@ def curve(side: Side, axis: str) -> tuple[Floats, Floats, Floats, Floats]:
 def name_lines(axes: "Axes", side: Side, kind: Kind) -> None:
     """A mark where each line of the recording stands out most, one for those of several axes."""
     result = side.result
-    found = detect_lines(result.values, np.zeros(len(result.values), bool), side.rate_hz, result.estimate.curve)
+    found = detect_spectral_lines(
+        result.values, np.zeros(len(result.values), bool), side.rate_hz, result.estimate.curve
+    )
     named: list[float] = []
     for line in sorted((one for one in found if AXES[one.axis] in axes_of(kind)), key=lambda one: -one.share):
         if all(abs(line.frequency_hz / other - 1.0) > 0.1 for other in named):

@@ -50,7 +50,7 @@ def white(rate_hz: float, seed: int) -> Callable[[int], Floats]:
 
 def coarse(rate_hz: float, seed: int) -> Callable[[int], Floats]:
     """The mix through an output of 0.05 °/s a bit; at 100 Hz a bit is 0.58 σ, at 10 Hz 1.8 σ."""
-    draw = mix().stream(rate_hz, seed).draw
+    draw = mix().start_stream(rate_hz, seed).draw_samples
     return lambda n: np.asarray(np.round(draw(n) / STEP_OF_OUTPUT) * STEP_OF_OUTPUT)
 
 
@@ -75,9 +75,9 @@ def constant(seed: int) -> None:
         draw, n = white(1.0, seed), 0
         kinds: Counter[str] = Counter()
         while n < 10_000_000:
-            detector.update(draw(PIECE))
+            detector.process_samples(draw(PIECE))
             n += PIECE
-            kinds.update(change.kind for change in detector.take())
+            kinds.update(change.kind for change in detector.take_changes())
         count, scale = kinds["noise_changed"], np.exp(h) / (6 * n)
         low, high = poisson(count)
         shown.add_row(
@@ -94,9 +94,9 @@ def false_alarms(years: float, seed: int) -> None:
     day = 86_400.0
     cases: list[tuple[str, float, float, Callable[[int], Floats]]] = [
         ("white, 10 Hz", 10.0, years * 365.25, white(10.0, seed)),
-        ("MEMS mix, 10 Hz", 10.0, years * 365.25 / 3, mix().stream(10.0, seed).draw),
+        ("MEMS mix, 10 Hz", 10.0, years * 365.25 / 3, mix().start_stream(10.0, seed).draw_samples),
         ("mix at 0.05 °/s, 10 Hz", 10.0, years * 365.25 / 3, coarse(10.0, seed)),
-        ("MEMS mix, 100 Hz", 100.0, years * 365.25 / 30, mix().stream(100.0, seed).draw),
+        ("MEMS mix, 100 Hz", 100.0, years * 365.25 / 30, mix().start_stream(100.0, seed).draw_samples),
     ]
     for title, rate_hz, days, draw in cases:
         detectors = [ChangeDetector(rate_hz, stated) for stated in (1 / 30, 1.0, 10.0)]
@@ -104,8 +104,8 @@ def false_alarms(years: float, seed: int) -> None:
         for _ in range(int(days * day * rate_hz / PIECE)):
             values = draw(PIECE)
             for detector, seen in zip(detectors, kinds, strict=True):
-                detector.update(values)
-                seen.update(change.kind for change in detector.take())
+                detector.process_samples(values)
+                seen.update(change.kind for change in detector.take_changes())
         for stated, seen in zip((1 / 30, 1.0, 10.0), kinds, strict=True):
             low, high = poisson(seen.total())
             rate = f"{seen.total() / days:.3f} ({low / days:.3f}–{high / days:.3f})"
@@ -147,10 +147,10 @@ def onsets() -> dict[str, tuple[float, float, Callable[[Floats, np.random.Genera
 def looked(first: Floats, second: Floats) -> Iterator[list[Change]]:
     """What a detector finds on each axis that changes from one series to the other, first change only."""
     detector = ChangeDetector(RATE_HZ)
-    detector.update(first)
-    early = {change.axis for change in detector.take()}
-    detector.update(second)
-    found = detector.take()
+    detector.process_samples(first)
+    early = {change.axis for change in detector.take_changes()}
+    detector.process_samples(second)
+    found = detector.take_changes()
     for axis in range(6):
         if axis not in early:
             yield [change for change in found if change.axis == axis][:1]
@@ -192,10 +192,10 @@ def delays(repeats: int, seed: int) -> None:
     for k in range(-(-repeats // 24)):  # K × 3 wants days: the mix at 10 Hz, where K is the same
         slow = ChangeDetector(10.0)
         cut, n = 2 * 864_000, 864_000
-        slow.update(mix().simulate(cut, 10.0, seed + k))
-        early = {change.axis for change in slow.take()}
-        slow.update(mix(4.5e-6).simulate(n, 10.0, seed + 1000 + k))
-        found = [c for c in slow.take() if c.kind != "bias_stepped"]
+        slow.process_samples(mix().simulate(cut, 10.0, seed + k))
+        early = {change.axis for change in slow.take_changes()}
+        slow.process_samples(mix(4.5e-6).simulate(n, 10.0, seed + 1000 + k))
+        found = [c for c in slow.take_changes() if c.kind != "bias_stepped"]
         results += [[c for c in found if c.axis == axis][:1] for axis in range(6) if axis not in early]
     text = row("K × 3 after 2 days, 10 Hz", results, cut, 10.0)
     shown.add_row(*text)
@@ -231,9 +231,9 @@ def cost() -> None:
 
         return work
 
-    run(detector.update)(), run(window.update)()
+    run(detector.process_samples)(), run(window.update)()
     load = Load()
-    took = alternate({"change": run(detector.update), "window": run(window.update)}, 7)
+    took = alternate({"change": run(detector.process_samples), "window": run(window.update)}, 7)
     shown = table("cost, six axes, blocks of 100", "what", "ns a sample and axis: median (best)")
     for name, (median, best) in took.items():
         shown.add_row(name, f"{median / 6e5 * 1e9:.1f} ({best / 6e5 * 1e9:.1f})")

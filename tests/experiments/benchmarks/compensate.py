@@ -51,7 +51,7 @@ RECORDINGS = (
 def noise(sensor: str, seed: int, seconds: float) -> Floats:
     """[n, 6] at rest."""
     model = load_model(sensor, Path.cwd())
-    return model.stream(RATE_HZ, seed, None).draw_with_temperature(round(seconds * RATE_HZ)).values.copy()
+    return model.start_stream(RATE_HZ, seed, None).draw_samples_with_temperature(round(seconds * RATE_HZ)).values.copy()
 
 
 def profiles(t: Floats) -> Iterator[tuple[str, Floats]]:

@@ -56,7 +56,7 @@ class Sensors:
         self._masters = [self._plug(port) for port in self.ports]
         n = round(rate_hz * seconds)
         model = read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml")
-        values = model.stream(float(rate_hz), 1).draw_with_temperature(n).values
+        values = model.start_stream(float(rate_hz), 1).draw_samples_with_temperature(n).values
         ticks = np.arange(n, dtype=np.int64) * (1_000_000_000 // rate_hz)
         encoder = vectornav_binary.build(vectornav_binary.Settings())
         self._frames = [one.data for one in encoder.encode(make_block(ticks, values, np.full(n, 25.0), ticks))]

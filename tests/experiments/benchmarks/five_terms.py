@@ -11,11 +11,15 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import AXES, Floats, make_block
-from monitor.estimation.analysis import DETECTOR_CHUNK_ROWS, Analysis, analyze
+from monitor.estimation.analysis import DETECTOR_CHUNK_ROWS, RecordingAnalysis, analyze
 from monitor.estimation.analysis_notes import LINE_FREQUENCY_TOLERANCE, MIN_OUTLIER_SHARE
 from monitor.estimation.detection.change_detection import Change, ChangeDetector
-from monitor.estimation.detection.coarse_quantization import find_coarse_axes
-from monitor.estimation.detection.line_and_outlier_detection import Line, detect_lines, outlier_share
+from monitor.estimation.detection.coarse_quantization import find_coarsely_quantized_axes
+from monitor.estimation.detection.line_and_outlier_detection import (
+    SpectralLine,
+    detect_spectral_lines,
+    outlier_share_of_axes,
+)
 from monitor.estimation.detection.motion_detection import detect_motion
 from monitor.estimation.fit.coefficient_values import SYMBOLS, Status
 from monitor.noise.effects import Narrowband, Sinusoidal
@@ -59,7 +63,7 @@ def names(columns: Mapping[str, Floats], rate_hz: float, model: NoiseModel) -> s
     return {(axis, name) for axis, name in said if axis in columns}
 
 
-def _of_fit(result: Analysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
+def _of_fit(result: RecordingAnalysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
     has = {axis: {effect.name for effect in model.effects.get(axis, ())} for axis in AXES}
     status = result.estimate.coefficients.status
     for i, axis in enumerate(AXES):
@@ -68,24 +72,24 @@ def _of_fit(result: Analysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
                 yield axis, effect
         if np.isfinite(result.bandwidth_hz[i]) and "bandwidth_limit" not in has[axis]:
             yield axis, "bandwidth_limit"
-    for one in find_coarse_axes(result.values):
+    for one in find_coarsely_quantized_axes(result.values):
         yield AXES[one.axis], "resolution"
 
 
-def _of_events(result: Analysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
+def _of_events(result: RecordingAnalysis, model: NoiseModel) -> Iterator[tuple[str, str]]:
     """Of what ``detect_events`` looks for, where it stands as numbers: each thing is sought once, as there."""
     values, rate_hz = result.values, result.estimate.rate_hz
     moving, _ = detect_motion(values, rate_hz)
-    for line in detect_lines(values, moving, rate_hz, result.estimate.curve):
+    for line in detect_spectral_lines(values, moving, rate_hz, result.estimate.curve):
         if not _expected(line, model):
             yield AXES[line.axis], "narrowband" if line.wide else "sinusoidal"
-    for i in np.flatnonzero(outlier_share(values, moving) > MIN_OUTLIER_SHARE).tolist():
+    for i in np.flatnonzero(outlier_share_of_axes(values, moving) > MIN_OUTLIER_SHARE).tolist():
         yield AXES[i], "outliers"
     detector = ChangeDetector(rate_hz)
     for begin in range(0, len(values), DETECTOR_CHUNK_ROWS):
         rows = slice(begin, begin + DETECTOR_CHUNK_ROWS)
-        detector.update(np.where(moving[rows, None], np.nan, values[rows]))
-    for change in detector.take():
+        detector.process_samples(np.where(moving[rows, None], np.nan, values[rows]))
+    for change in detector.take_changes():
         name = _of_change(change)
         if name:
             yield AXES[change.axis], name
@@ -98,7 +102,7 @@ def _of_change(change: Change) -> str | None:
     return {"bias_stepped": "bias_step", "outlier_burst": "outliers"}[change.kind]
 
 
-def _expected(line: Line, model: NoiseModel) -> bool:
+def _expected(line: SpectralLine, model: NoiseModel) -> bool:
     """Whether the model has a line or a resonance there."""
     for effect in model.effects.get(AXES[line.axis], ()):
         if (

@@ -123,7 +123,7 @@ def law_of(axis: str, n: int, rate_hz: float, model: NoiseModel) -> gmwm.Known:
     """The baseline of an axis as GMWM sees it: Allan variance at τ/2 is twice the wavelet variance at τ."""
     variance = 0.5 * model.avar(axis, 0.5 * gmwm.dyadic(n) / rate_hz, 1.0 / rate_hz)
     f_hz = (rate_hz / n) * np.arange(1, n // 2 + 1, dtype=np.float64)
-    return gmwm.Known(variance, rate_hz * model.psd(axis, f_hz, 1.0 / rate_hz))
+    return gmwm.Known(variance, rate_hz * model.two_sided_psd(axis, f_hz, 1.0 / rate_hz))
 
 
 def _added(axis: str, best: gmwm.Ranked, model: NoiseModel, expected: int) -> Iterable[Named]:

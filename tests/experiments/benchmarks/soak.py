@@ -77,7 +77,9 @@ class Wire:
         self._rate_hz = rate_hz
         self._samples = samples
         self._encoder = vectornav_binary.build(vectornav_binary.Settings())
-        self._stream = read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml").stream(rate_hz, 1)
+        self._stream = read_model(shipped_file_paths.CONFIG_FOLDER / "models" / "consumer-mems.toml").start_stream(
+            rate_hz, 1
+        )
         self._rng = np.random.default_rng(1)
         self._closed = threading.Event()
 
@@ -95,7 +97,7 @@ class Wire:
         if n == 0:
             raise LinkEnded("the end of the month")
         index = np.arange(truth.sent, truth.sent + n)
-        drawn = self._stream.draw_with_temperature(n)
+        drawn = self._stream.draw_samples_with_temperature(n)
         t_ns = START_NS + np.rint(index * (1e9 / self._rate_hz)).astype(np.int64)
         ticks = np.rint(index * (1e9 / self._rate_hz)).astype(np.int64)
         samples = make_block(

@@ -45,7 +45,7 @@ def records(coefficients: tuple[float, ...], n: int, count: int, rng: np.random.
     values = np.zeros((n, count))
     for kind, letter, size in zip(kinds, "QNBK", coefficients, strict=True):
         for column in range(count if size else 0):
-            values[:, column] += kind(**{letter: size}).start(1.0, rng).draw(n)
+            values[:, column] += kind(**{letter: size}).start_series(1.0, rng).draw_samples(n)
     return values
 
 

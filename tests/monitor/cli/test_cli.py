@@ -80,7 +80,7 @@ def call(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str], tmp
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Three minutes of the shipped model."""
     path = tmp_path_factory.mktemp("recording") / "static.csv"
-    values = read_model(CONFIG_FOLDER / "models" / "consumer-mems.toml").stream(RATE_HZ, 7).draw(18_000)
+    values = read_model(CONFIG_FOLDER / "models" / "consumer-mems.toml").start_stream(RATE_HZ, 7).draw_samples(18_000)
     save_samples(path, np.arange(len(values)) / RATE_HZ, values)
     return path
 

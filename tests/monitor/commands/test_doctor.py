@@ -262,7 +262,7 @@ def test_room_is_judged_by_days(tmp_path: Path) -> None:
 def test_what_a_sample_is_said_to_take_is_what_it_takes(tmp_path: Path) -> None:
     """Ten minutes of noise that fills a 32-bit float, packed as the daemon does it."""
     pytest.importorskip("pyarrow", reason="pyarrow is not installed")
-    values = read_model(CONFIG_FOLDER / "models" / "consumer-mems.toml").stream(100.0, 1).draw(60_000)
+    values = read_model(CONFIG_FOLDER / "models" / "consumer-mems.toml").start_stream(100.0, 1).draw_samples(60_000)
     values = values.astype(np.float32).astype(np.float64)
     rng = np.random.default_rng(1)
     t_ns = 1_760_000_000_000_000_000 + np.arange(60_000) * 10_000_000 + rng.integers(-1000, 1000, 60_000)

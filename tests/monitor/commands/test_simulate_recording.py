@@ -69,7 +69,7 @@ def test_it_is_the_models_own_series_to_the_last_bit(path: Path) -> None:
     n = CHUNK_ROWS + 1000  # more than one block
     run_simulation(Request(WARM, path, n / 50.0, seed=4))
     recording = load_samples(path)
-    drawn = WARM.stream(50.0, 4).draw_with_temperature(n)
+    drawn = WARM.start_stream(50.0, 4).draw_samples_with_temperature(n)
     assert recording.axes == ("gy", "ax", "az")  # what the model does not name is absent, not zero
     for axis in recording.axes:
         assert np.array_equal(recording.values[:, AXES.index(axis)], drawn.values[:, AXES.index(axis)])

@@ -83,13 +83,13 @@ def results(seed: int) -> list[Any]:
         piece = values[at : at + size]
         samples = make_block(np.arange(at, at + len(piece)) * 10_000_000, piece, lost=lost)
         at += size
-        for part in watch.update(samples):
-            estimator.update(part)
-        for restart in watch.take_restarts():
-            estimator.restart(restart.axis, restart.samples)
+        for part in watch.process_samples(samples):
+            estimator.add_samples(part)
+        for restart in watch.take_restart_requests():
+            estimator.restart_axis(restart.axis, restart.samples)
         found += [compensation.update(samples).values, compensation.take_updates()]
         if rng.random() < 0.2 and estimator.samples_in_window >= MIN_SAMPLES:
-            found.append(estimator.get())
+            found.append(estimator.get_estimate())
     found += [estimator.step_slow_statistics() for _ in range(3)]
     found += [
         watch.take_events(),

@@ -16,7 +16,7 @@ from monitor.daemon.device.device_worker import DeviceWorker
 from monitor.daemon.kernels.kernel_readiness import KernelReadiness
 from monitor.drift.compensation.live_compensation import DriftUpdate
 from monitor.drift.thermal.live_thermal import ThermalIntervalResult
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.publishing.messages.results import TotalAndHadamardCurves
@@ -45,7 +45,7 @@ class Caught:
     def publish_result(self, device, unix_s, received, result):
         kept = {
             Estimate: self.estimates,
-            ModelGap: self.gaps,
+            ModelComparison: self.gaps,
             ThermalIntervalResult: self.thermals,
             DriftUpdate: self.drifts,
         }
@@ -668,7 +668,7 @@ def test_the_samples_of_the_window_and_their_temperature():
         rig.bring(50, lost=3 if i == 12 else 0)
         rig.work(1000.0 + 0.1 * i)
     held, temperature_c = rig.station.copy_window_and_temperature()
-    values = held.values()
+    values = held.restore_samples()
     sent = np.concatenate([samples.values for samples in rig.caught.blocks] + [np.empty((0, 6))])
     assert (len(held), temperature_c.shape) == (500, (500,))
     assert np.isnan(values[397:400]).all()

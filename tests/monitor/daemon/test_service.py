@@ -19,7 +19,7 @@ from monitor.daemon.kernels import kernel_compilation, kernel_parts
 from monitor.daemon.output import Output
 from monitor.daemon.result_outputs import TableOutput
 from monitor.daemon.service import Service
-from monitor.estimation.detection.model_comparison import ModelGap
+from monitor.estimation.detection.model_comparison import ModelComparison
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.history import history_table as past
@@ -193,13 +193,13 @@ class Estimates(Output):
     def __init__(self) -> None:
         self.all: list[Estimate] = []
         self.kinds: set[str] = set()
-        self.gaps: list[ModelGap] = []
+        self.gaps: list[ModelComparison] = []
         self.health_text = ""
 
     def publish_result(self, device: str, unix_s: float, received: int, result: Any) -> None:
         if isinstance(result, Estimate):
             self.all.append(result)
-        elif isinstance(result, ModelGap):
+        elif isinstance(result, ModelComparison):
             self.gaps.append(result)
 
     def publish_event(self, device: str, unix_s: float, received: int, event: Event) -> None:

@@ -95,7 +95,7 @@ def test_a_list_of_tau():
 def test_an_absent_axis_is_unestimated_and_warns_nobody():
     values = white(6000)
     values[:, 3:] = np.nan
-    found = analyze(recorded_blocks(np.arange(6000) / 100, values), None, notes=["of the file"])
+    found = analyze(recorded_blocks(np.arange(6000) / 100, values), None, reading_notes=["of the file"])
     assert found.notes == ("of the file",)
     assert (found.estimate.coefficients.status[:, 3:] == Status.UNESTIMATED).all()
     assert (found.estimate.coefficients.status[1, :3] == Status.ESTIMATED).all()
@@ -119,7 +119,7 @@ def test_recordings_of_real_sensors(name, rate):
 
     loaded = load_samples(recordings() / name)
     blocks = list(iter_blocks(loaded))
-    found = analyze(blocks, None, notes=loaded.notes)
+    found = analyze(blocks, None, reading_notes=loaded.notes)
     assert found.estimate.rate_hz == pytest.approx(rate, rel=0.01)
     received = sum(len(one) for one in blocks)
     assert received <= found.estimate.curve.n <= 1.02 * received
@@ -176,7 +176,9 @@ def test_motion_is_no_change_of_noise():
 def test_changes_are_told_with_time_and_size():
     values = white(60_000)
     values[40_000:, 2] += 1.5e-3 * np.random.default_rng(9).standard_normal(20_000)
-    found = detect_events(analyze(recorded_blocks(np.arange(60_000) / 100, values), 100.0, notes=["of the file"]))
+    found = detect_events(
+        analyze(recorded_blocks(np.arange(60_000) / 100, values), 100.0, reading_notes=["of the file"])
+    )
     [change] = found.changes
     assert (change.kind, change.axis) == ("noise_changed", 2)
     assert change.since == pytest.approx(40_000, abs=50)
@@ -199,5 +201,5 @@ def test_a_sensor_that_never_rests_is_an_answer():
 def test_axes_side_by_side_give_the_same():
     blocks = recorded_blocks(np.arange(6000) / 100)
     with ThreadPoolExecutor(2) as pool:
-        side_by_side = analyze(blocks, 100.0, each=pool.map)
+        side_by_side = analyze(blocks, 100.0, map_axes=pool.map)
     assert np.array_equal(side_by_side.estimate.curve.avar, analyze(blocks, 100.0).estimate.curve.avar)

@@ -10,7 +10,7 @@ from drivers.data_types import AXES, make_block
 from monitor.estimation import analysis_notes
 from monitor.estimation.analysis import analyze
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.line_and_outlier_detection import Line, detect_lines
+from monitor.estimation.detection.line_and_outlier_detection import SpectralLine, detect_spectral_lines
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.fit.coefficient_values import Status
 from monitor.estimation.fit.low_pass_search import LowPass
@@ -30,7 +30,7 @@ def white(n, seed=1):
 def test_the_sensor_s_own_bandwidth_is_told_once_for_axes_alike():
     axes = [None if i == 2 else LowPass("digital", 1, 0.249 + 0.001 * i) for i in range(6)]
     curve, fit = departing()
-    [note] = analysis_notes.of_unexplained_curve(curve, fit, axes, RATE_HZ)
+    [note] = analysis_notes.describe_unexplained_curve(curve, fit, axes, RATE_HZ)
     assert note == (
         "gx, gy, ax, ay, az: white noise ends below half the sample rate, as after a first-order low-pass at about "
         "25 Hz; N is the level below this frequency"
@@ -49,14 +49,14 @@ def test_a_line_is_told_with_the_averaging_times_that_it_spoils():
     assert where == "0.64"  # a line's deviation peaks at 0.37 of its period, 2 s: sin⁴(πfτ)/(πfτ)²
     assert found.fit.misfit[0] == 1.0
     curve = found.estimate.curve
-    told = detect_lines(values, np.zeros(len(values), bool), RATE_HZ, curve)
+    told = detect_spectral_lines(values, np.zeros(len(values), bool), RATE_HZ, curve)
     known = analysis_notes.replace_guessed_causes(["first", *found.notes], curve, found.fit, told)
     assert known[0] == "first"
     [known] = [one for one in known if "departs" in one]
     assert known == note.replace(
         "vibration, motion or temperature may be the cause", "the likely cause is the line at 0.4999 Hz"
     )
-    assert analysis_notes.of_lines_and_outliers(told, np.zeros(6)) == ["a line at 0.4999 Hz: gy 0.11 °/s"]
+    assert analysis_notes.describe_lines_and_outliers(told, np.zeros(6)) == ["a line at 0.4999 Hz: gy 0.11 °/s"]
 
 
 def departing(misfit=(1.0,) * 6, at=(2,) * 6, left_out=(0,) * 6, q=()):
@@ -77,13 +77,13 @@ def departing(misfit=(1.0,) * 6, at=(2,) * 6, left_out=(0,) * 6, q=()):
 
 
 def line(axis, hz, amplitude=1.0, wide=False):
-    return Line(axis, hz, amplitude, 0.5, wide)
+    return SpectralLine(axis, hz, amplitude, 0.5, wide)
 
 
 def test_axes_that_depart_alike_share_a_note():
     curve, fit = departing((9.0, 36.0, 1.0, 16.0, 4.0, 1.0), at=(2, 2, 2, 2, 6, 2))
     text = "vibration, motion or temperature may be the cause; intervals are widened accordingly"
-    assert analysis_notes.of_misfit(curve, fit) == [
+    assert analysis_notes.describe_misfit(curve, fit) == [
         f"gx, gy, ax: the five terms do not explain the curve (scatter 3 to 6 times wider), most at τ = 0.04 s: {text}",
         f"ay: the five terms do not explain the curve (scatter 2 times wider), most at τ = 0.64 s: {text}",
     ]
@@ -92,20 +92,20 @@ def test_axes_that_depart_alike_share_a_note():
 def test_motion_left_in_is_one_note_that_points_to_rest():
     curve, fit = departing((4.0, 4.0, 4.0, 9.0, 9.0, 9.0), at=(0, 1, 3, 5, 6, 7))
     notes = analysis_notes.replace_guessed_causes(
-        analysis_notes.of_misfit(curve, fit), curve, fit, [line(0, 9.0)], moved=True
+        analysis_notes.describe_misfit(curve, fit), curve, fit, [line(0, 9.0)], includes_motion=True
     )
     assert notes == [
         "gx, gy, gz, ax, ay, az: the five terms do not explain the curve (scatter 2 to 3 times wider): "
         "motion of the sensor may be the cause; --rest removes the samples in motion; intervals are widened accordingly"
     ]
-    assert analysis_notes.replace_guessed_causes(["other"], *departing(), [], moved=True) == ["other"]
+    assert analysis_notes.replace_guessed_causes(["other"], *departing(), [], includes_motion=True) == ["other"]
 
 
 def test_a_line_is_blamed_only_where_it_shows():
     """At τ = 0.04 s a line of 9 Hz is strongest; one of 0.05 Hz does not reach there, nor one of another axis."""
     curve, fit = departing((4.0,) * 3 + (1.0,) * 3)
     found = [line(0, 9.0), line(1, 9.03), line(2, 0.05, 0.1), line(3, 9.0)]
-    notes = analysis_notes.of_misfit(curve, fit, found)
+    notes = analysis_notes.describe_misfit(curve, fit, found)
     assert [note.split(":")[0] for note in notes] == ["gx, gy", "gz"]
     assert "the likely cause is the line at 9 Hz" in notes[0]
     assert "may be the cause" in notes[1]
@@ -113,7 +113,7 @@ def test_a_line_is_blamed_only_where_it_shows():
 
 def test_what_is_left_out_is_one_note_with_the_line_that_is_told():
     curve, fit = departing(left_out=(4, 3, 0, 0, 0, 1))
-    assert analysis_notes.of_misfit(curve, fit, [line(0, 9.0, wide=True), line(1, 9.0)]) == [
+    assert analysis_notes.describe_misfit(curve, fit, [line(0, 9.0, wide=True), line(1, 9.0)]) == [
         "gx, gy: the fit leaves out τ up to 0.08, 0.04 s, which the five terms do not explain: the likely cause is "
         "the resonance about 9 Hz",
         "az: the fit leaves out τ up to 0.01 s, which the five terms do not explain: the likely cause is the "
@@ -160,24 +160,28 @@ def change(kind="noise_changed"):
 
 
 def test_many_events_are_counted_rather_than_listed():
-    notes = analysis_notes.of_motions([motion(100 * i) for i in range(14)], RATE_HZ, removed=True)
+    notes = analysis_notes.describe_motions([motion(100 * i) for i in range(14)], RATE_HZ, removed=True)
     assert notes[0] == "the sensor moved 14 times, 7 s in all: removed"
     assert notes[1] == "at 0.0 s: moved for 0.5 s: gx up to 5.7 °/s"
     assert notes[-1] == "and 4 more motions"
     assert len(notes) == 1 + analysis_notes.MAX_NOTES + 1
-    notes = analysis_notes.of_changes([change()] * 11, RATE_HZ)
+    notes = analysis_notes.describe_changes([change()] * 11, RATE_HZ)
     assert notes[0] == "at 1.0 s: gx noise changed (8.0 σ)"
     assert notes[-2] == "and 1 more changes"
 
 
 def test_outliers_alone_mix_no_before_and_after():
-    assert analysis_notes.of_changes([change("outlier_burst")], RATE_HZ) == ["at 1.0 s: gx noise changed (8.0 σ)"]
+    assert analysis_notes.describe_changes([change("outlier_burst")], RATE_HZ) == ["at 1.0 s: gx noise changed (8.0 σ)"]
 
 
 def test_nothing_found_is_nothing_said():
     quiet = analyzed(white(30_000))
     assert quiet.notes == ()
-    assert analysis_notes.of_motions([], RATE_HZ, removed=False) == analysis_notes.of_changes([], RATE_HZ) == []
+    assert (
+        analysis_notes.describe_motions([], RATE_HZ, removed=False)
+        == analysis_notes.describe_changes([], RATE_HZ)
+        == []
+    )
 
 
 def test_a_departure_ends_where_the_curve_comes_back():

@@ -23,8 +23,8 @@ def test_the_last_estimate_covers_all_samples():
     estimator = Estimator(RATE, 20.0)
     blocks = [made(at, 100) for at in range(0, 3000, 100)]
     for one in blocks:
-        estimator.update(one)
-    found = estimator.get()
+        estimator.add_samples(one)
+    found = estimator.get_estimate()
     assert (found.samples, found.t_ns, found.window_s, found.rate_hz) == (3000, 29_990_000_000, 20.0, RATE)
     values = np.concatenate([one.values for one in blocks])[-2000:]
     assert found.curve.n == 2000
@@ -39,10 +39,10 @@ def test_the_last_estimate_covers_all_samples():
 
 def test_missing_samples_keep_their_place():
     estimator = Estimator(RATE, 20.0)
-    estimator.update(made(0, 500))
-    estimator.update(made(537, 400, lost=37))
+    estimator.add_samples(made(0, 500))
+    estimator.add_samples(made(537, 400, lost=37))
     values = np.concatenate([made(0, 500).values, np.full((37, 6), np.nan), made(537, 400).values])
-    found = estimator.get().curve
+    found = estimator.get_estimate().curve
     expected, terms = overlapping_avar(values, found.factors)
     assert np.array_equal(found.terms, terms)
     assert found.avar[terms > 0] == pytest.approx(expected[terms > 0], rel=1e-8)
@@ -52,9 +52,9 @@ def test_missing_samples_keep_their_place():
 @pytest.mark.parametrize("lost", [1999, 2000, 2001, 10**11])
 def test_more_missing_than_the_window_holds(lost):
     estimator = Estimator(RATE, 20.0)
-    estimator.update(made(0, 3000))
-    estimator.update(made(5000, 300, lost=lost))
-    found = estimator.get()
+    estimator.add_samples(made(0, 3000))
+    estimator.add_samples(made(5000, 300, lost=lost))
+    found = estimator.get_estimate()
     expected, terms = overlapping_avar(made(5000, 300).values, found.curve.factors)
     assert np.array_equal(found.curve.terms, terms)
     assert found.curve.avar[terms > 0] == pytest.approx(expected[terms > 0], rel=1e-8)
@@ -64,10 +64,10 @@ def test_more_missing_than_the_window_holds(lost):
 def test_one_by_one_is_as_blocks():
     whole, single = Estimator(RATE, 5.0), Estimator(RATE, 5.0)
     samples = made(0, 1200)
-    whole.update(samples)
+    whole.add_samples(samples)
     for i in range(1200):
-        single.update(samples[i : i + 1])
-    a, b = whole.get(), single.get()
+        single.add_samples(samples[i : i + 1])
+    a, b = whole.get_estimate(), single.get_estimate()
     assert np.array_equal(a.coefficients.status, b.coefficients.status)
     np.testing.assert_allclose(a.coefficients.value, b.coefficients.value, rtol=1e-9)
     np.testing.assert_allclose(a.coefficients.hi, b.coefficients.hi, rtol=1e-9)
@@ -76,34 +76,34 @@ def test_one_by_one_is_as_blocks():
 def test_too_few_samples_are_no_answer():
     estimator = Estimator(RATE, 20.0)
     with pytest.raises(NotReady, match="0 of at least 8"):
-        estimator.get()
-    estimator.update(made(0, MIN_SAMPLES - 1))
+        estimator.get_estimate()
+    estimator.add_samples(made(0, MIN_SAMPLES - 1))
     with pytest.raises(NotReady):
-        estimator.get()
-    estimator.update(made(MIN_SAMPLES - 1, 1))
-    found = estimator.get()
+        estimator.get_estimate()
+    estimator.add_samples(made(MIN_SAMPLES - 1, 1))
+    found = estimator.get_estimate()
     assert (found.coefficients.status != Status.ESTIMATED).all() or np.isfinite(found.coefficients.value).any()
 
 
 def test_reset_empties_the_window_and_goes_on_counting():
     estimator, fresh = Estimator(RATE, 20.0), Estimator(RATE, 20.0)
-    estimator.update(made(0, 3000))
-    estimator.get()
-    estimator.reset()
+    estimator.add_samples(made(0, 3000))
+    estimator.get_estimate()
+    estimator.empty_window()
     with pytest.raises(NotReady):
-        estimator.get()
+        estimator.get_estimate()
     for one in (estimator, fresh):
-        one.update(made(3000, 400))
-    assert np.array_equal(estimator.get().curve.avar, fresh.get().curve.avar, equal_nan=True)
-    assert (estimator.samples, fresh.samples) == (3400, 400)
+        one.add_samples(made(3000, 400))
+    assert np.array_equal(estimator.get_estimate().curve.avar, fresh.get_estimate().curve.avar, equal_nan=True)
+    assert (estimator.samples_received, fresh.samples_received) == (3400, 400)
 
 
 def test_another_rate_is_another_label():
     one, other = Estimator(RATE, 20.0), Estimator(2 * RATE, 10.0)
     for estimator in (one, other):
-        estimator.update(made(0, 2500))
+        estimator.add_samples(made(0, 2500))
     one.refine_rate(2 * RATE)
-    a, b = one.get(), other.get()
+    a, b = one.get_estimate(), other.get_estimate()
     assert (a.rate_hz, a.window_s) == (b.rate_hz, b.window_s) == (200.0, 10.0)
     assert np.array_equal(a.curve.tau_s, b.curve.tau_s)
     np.testing.assert_allclose(a.coefficients.value, b.coefficients.value, rtol=1e-12)
@@ -114,8 +114,8 @@ def test_an_axis_that_is_not_measured_is_unestimated():
     samples = made(0, 3000)
     values = samples.values.copy()
     values[:, 2] = np.nan
-    estimator.update(make_block(samples.t_ns.copy(), values))
-    found = estimator.get()
+    estimator.add_samples(make_block(samples.t_ns.copy(), values))
+    found = estimator.get_estimate()
     assert (found.coefficients.status[:, 2] == Status.UNESTIMATED).all()
     assert np.isnan(found.coefficients.value[:, 2]).all()
     assert found.coefficients.status[1, 1] == Status.ESTIMATED
@@ -123,8 +123,8 @@ def test_an_axis_that_is_not_measured_is_unestimated():
 
 def test_a_constant_axis_is_unestimated():
     estimator = Estimator(RATE, 20.0)
-    estimator.update(make_block(np.arange(2500) * 10**7, np.full((2500, 6), 9.81)))
-    assert (estimator.get().coefficients.status == Status.UNESTIMATED).all()
+    estimator.add_samples(make_block(np.arange(2500) * 10**7, np.full((2500, 6), 9.81)))
+    assert (estimator.get_estimate().coefficients.status == Status.UNESTIMATED).all()
 
 
 def test_a_tau_that_cannot_be_is_refused():
@@ -134,21 +134,21 @@ def test_a_tau_that_cannot_be_is_refused():
 
 def test_deviations_alone_before_the_fit_is_compiled():
     estimator = Estimator(RATE, 20.0)
-    estimator.update(made(0, 2500))
-    bare = estimator.get(fitted=False)
-    assert np.array_equal(bare.curve.avar, estimator.get().curve.avar)
+    estimator.add_samples(made(0, 2500))
+    bare = estimator.get_estimate(fit_coefficients=False)
+    assert np.array_equal(bare.curve.avar, estimator.get_estimate().curve.avar)
     assert (bare.coefficients.status == Status.UNESTIMATED).all()
 
 
 def test_an_axis_restarts_alone():
     estimator, fresh = Estimator(RATE, 100.0), Estimator(RATE, 100.0)
     for at in range(0, 20_000, 500):
-        estimator.update(made(at, 500))
-    before = estimator.get()
-    estimator.restart(2, 4_000)
+        estimator.add_samples(made(at, 500))
+    before = estimator.get_estimate()
+    estimator.restart_axis(2, 4_000)
     for at in range(16_000, 20_000, 500):
-        fresh.update(made(at, 500))
-    after, own = estimator.get(), fresh.get()
+        fresh.add_samples(made(at, 500))
+    after, own = estimator.get_estimate(), fresh.get_estimate()
     others = [0, 1, 3, 4, 5]
     for field in ("value", "lo", "hi", "status"):
         whole, now = (getattr(one.coefficients, field) for one in (before, after))
@@ -163,10 +163,10 @@ def test_a_restarted_axis_is_at_its_new_noise_at_once(every_sample):
     for at in range(0, 40_000, 500):
         one = made(at, 500)
         loud = np.where(np.arange(6) == 1, 3.0, 1.0) if at >= 30_000 else 1.0
-        estimator.update(make_block(one.t_ns, (one.values - 9.81) * loud + 9.81))
+        estimator.add_samples(make_block(one.t_ns, (one.values - 9.81) * loud + 9.81))
         if at + 500 == 32_000:
-            estimator.restart(1, 2_000)
-    n = estimator.get().coefficients.value[1]
+            estimator.restart_axis(1, 2_000)
+    n = estimator.get_estimate().coefficients.value[1]
     assert n[1] == pytest.approx(3e-4, rel=0.05)
     assert n[[0, 2]] == pytest.approx(1e-4, rel=0.05)
 
@@ -175,14 +175,14 @@ def test_a_restarted_axis_is_at_its_new_noise_at_once(every_sample):
 @pytest.mark.parametrize("kept", [0, 1, 2, 3, 7])
 def test_an_axis_restarts_with_next_to_nothing(kept, every_sample):
     estimator = Estimator(RATE, 20.0, every_sample=every_sample)
-    estimator.update(made(0, 3000))
-    estimator.restart(2, kept)
-    estimator.restart(2, kept)
-    found = estimator.get()
+    estimator.add_samples(made(0, 3000))
+    estimator.restart_axis(2, kept)
+    estimator.restart_axis(2, kept)
+    found = estimator.get_estimate()
     assert (found.coefficients.status[:, 2] == Status.UNESTIMATED).all()
     assert found.coefficients.status[1, 3] == Status.ESTIMATED
-    estimator.update(made(3000, 1000))
-    assert estimator.get().coefficients.value[1, 2] == pytest.approx(1e-4, rel=0.2)
+    estimator.add_samples(made(3000, 1000))
+    assert estimator.get_estimate().coefficients.value[1, 2] == pytest.approx(1e-4, rel=0.2)
 
 
 @pytest.mark.long
@@ -196,16 +196,18 @@ def test_the_course_of_a_restarted_axis_is_that_of_a_young_window():
         def feed(estimators, first, last, values=values):
             for at in range(first, last, 2000):
                 for estimator in estimators:
-                    estimator.update(make_block(np.arange(at, at + 2000) * 10_000_000, values[at : at + 2000].copy()))
+                    estimator.add_samples(
+                        make_block(np.arange(at, at + 2000) * 10_000_000, values[at : at + 2000].copy())
+                    )
 
         feed([old], 0, 32_000)
-        old.get()
+        old.get_estimate()
         for axis in range(6):
-            old.restart(axis, 2000)
+            old.restart_axis(axis, 2000)
         feed([young], 30_000, 32_000)
-        young.get()
+        young.get_estimate()
         feed([old, young], 32_000, 60_000)
-        one, other = old.get().history, young.get().history
+        one, other = old.get_estimate().history, young.get_estimate().history
         assert np.isfinite(one.value[:, 1]).all()  # from the first sample on
         differences.append((one.value[:, 1] / other.value[:, 1] - 1.0).ravel())
         ramps += np.isfinite(one.value[:, 4]).sum()
@@ -215,17 +217,17 @@ def test_the_course_of_a_restarted_axis_is_that_of_a_young_window():
 
 def test_an_outage_longer_than_the_window_forgets_what_was_seen_before():
     estimator = Estimator(RATE, 20.0, every_sample=True)
-    estimator.update(made(0, 3000))
-    assert np.isfinite(estimator.get().history.value[-1, 1]).all()
-    estimator.update(made(10_000, 5, lost=7000))
+    estimator.add_samples(made(0, 3000))
+    assert np.isfinite(estimator.get_estimate().history.value[-1, 1]).all()
+    estimator.add_samples(made(10_000, 5, lost=7000))
     assert not estimator._refit.entered.any()
 
 
 def test_the_course_is_bounded_until_someone_looks():
     estimator = Estimator(RATE, 5.0, every_sample=True)
     for at in range(0, 70_000, 700):
-        estimator.update(made(at, 700))
-    t_ns = estimator.get().history.t_ns
+        estimator.add_samples(made(at, 700))
+    t_ns = estimator.get_estimate().history.t_ns
     assert MAX_HISTORY_SAMPLES <= t_ns.size < MAX_HISTORY_SAMPLES + 700
     assert t_ns[-1] == 69_999 * 10_000_000
     assert (np.diff(t_ns) == 10_000_000).all()
@@ -233,21 +235,21 @@ def test_the_course_is_bounded_until_someone_looks():
 
 def test_the_course_has_a_row_a_sample():
     estimator = Estimator(RATE, 100.0, every_sample=True)
-    estimator.update(made(0, 700))
-    estimator.update(made(707, 300, lost=7))
-    found = estimator.get()
+    estimator.add_samples(made(0, 700))
+    estimator.add_samples(made(707, 300, lost=7))
+    found = estimator.get_estimate()
     assert found.history is not None
     assert found.history.t_ns.tolist() == [*made(0, 700).t_ns.tolist(), *made(707, 300).t_ns.tolist()]
     assert found.history.value[-1, 1] == pytest.approx(found.coefficients.value[1], rel=0.06)
-    assert estimator.get().history is None
+    assert estimator.get_estimate().history is None
 
 
 def test_recent_deviations_follow_a_change_at_once():
     estimator = Estimator(RATE, 600.0)
     for at in range(0, 60_000, 500):
         one = made(at, 500)
-        estimator.update(make_block(one.t_ns, (one.values - 9.81) * (2.0 if at >= 58_000 else 1.0)))
-    found = estimator.get()
+        estimator.add_samples(make_block(one.t_ns, (one.values - 9.81) * (2.0 if at >= 58_000 else 1.0)))
+    found = estimator.get_estimate()
     assert found.display_curve is not None
     assert np.sqrt(found.display_curve.avar[0]) == pytest.approx(2e-3, rel=0.1)
     assert np.sqrt(found.curve.avar[0]) == pytest.approx(np.sqrt(1 + 3 * 2000 / 60_000) * 1e-3, rel=0.05)

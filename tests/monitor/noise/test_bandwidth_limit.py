@@ -14,10 +14,10 @@ def test_samples_are_filtered_as_by_scipy(order: int, cutoff_hz: float) -> None:
     sections = butter(order, cutoff_hz, fs=100.0, output="sos")
     values = 9.81 + np.random.default_rng(order).standard_normal(3000)
     expected, _ = sosfilt(sections, values, zi=sosfilt_zi(sections) * values[0])
-    low_pass = BandwidthLimit(cutoff=cutoff_hz, order=order).start(100.0, np.random.default_rng())
+    low_pass = BandwidthLimit(cutoff=cutoff_hz, order=order).start_transform(100.0, np.random.default_rng())
     for piece in np.split(values, [1, 8, 1000, 1000]):  # views of values
         if piece.size:
-            low_pass.apply(piece)
+            low_pass.transform_in_place(piece)
     # the nearer the poles are to one, the more both lose to rounding
     assert values == pytest.approx(expected, rel=1e-11 if cutoff_hz < 1.0 else 1e-12, abs=1e-12)
 
@@ -33,5 +33,5 @@ def test_the_gain_is_that_of_butterworth(order: int) -> None:
 
 def test_columns_of_a_table_are_filtered_in_place() -> None:
     table = np.full((10, 6), 9.81)
-    BandwidthLimit(cutoff=10.0, order=2).start(100.0, np.random.default_rng()).apply(table[:, 2])
+    BandwidthLimit(cutoff=10.0, order=2).start_transform(100.0, np.random.default_rng()).transform_in_place(table[:, 2])
     assert table == pytest.approx(np.full((10, 6), 9.81), rel=1e-14)

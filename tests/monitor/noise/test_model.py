@@ -117,7 +117,7 @@ def test_what_is_wrong_is_said_in_one_line(text, says):
 def test_temperature_is_needed_by_the_stream_and_not_by_the_file():
     model = NoiseModel.from_toml("sample_rate = 100\n[gz.temperature_bias]\ncoefficient = 1\nreference = 20")
     with pytest.raises(ConfigError, match=r"^gz.temperature_bias: no temperature: .* no table \[temperature\]"):
-        model.stream(100.0, 0)
+        model.start_stream(100.0, 0)
     assert model.simulate(2, 100.0, 0, np.array([21.0, 22.0]))[:, 2].tolist() == [1.0, 2.0]
 
 
@@ -165,8 +165,8 @@ def test_axes_and_equal_effects_are_independent():
 
 def test_series_depends_on_seed_not_on_blocks():
     model = NoiseModel.from_toml(MODELS[0].read_text(encoding="utf-8"))
-    stream = model.stream(100.0, 7)
-    pieces = np.concatenate([stream.draw(n) for n in (1, 0, 9, 490)])
+    stream = model.start_stream(100.0, 7)
+    pieces = np.concatenate([stream.draw_samples(n) for n in (1, 0, 9, 490)])
     np.testing.assert_array_equal(pieces, model.simulate(500, 100.0, 7))
     assert not np.array_equal(pieces, model.simulate(500, 100.0, 8))
 
@@ -176,7 +176,7 @@ def test_avar_and_psd_are_sums_over_an_axis():
     tau = np.array([0.1, 1.0])
     np.testing.assert_allclose(model.avar("gx", tau, 0.1), 1.0 / tau + 3.0 / tau**2)
     assert model.avar("gy", tau, 0.1).tolist() == [0.0, 0.0]
-    assert model.psd("gx", np.array([5.0]), 0.1)[0] == pytest.approx(1.0 + 40.0)
+    assert model.two_sided_psd("gx", np.array([5.0]), 0.1)[0] == pytest.approx(1.0 + 40.0)
 
 
 def test_all_mistakes_of_a_model_file_are_told_at_once() -> None:

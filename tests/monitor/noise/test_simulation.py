@@ -94,22 +94,22 @@ def test_held_samples_are_the_same_ones_with_and_without_a_leak():
 )
 def test_an_effect_added_before_the_first_sample_is_as_one_of_the_model(effect):
     model = NoiseModel({axis: (AngleRandomWalk(N=0.5), Saturation(limit=4.0)) for axis in AXES})
-    running = model.stream(RATE_HZ, 1)
-    running.add("gz", effect)
+    running = model.start_stream(RATE_HZ, 1)
+    running.add_effect("gz", effect)
     whole = (model + NoiseModel({"gz": (effect,)})).simulate(5000, RATE_HZ, 1)
-    np.testing.assert_array_equal(running.draw(5000), whole)
+    np.testing.assert_array_equal(running.draw_samples(5000), whole)
 
 
 def test_what_is_added_acts_from_the_next_sample_on():
     model = NoiseModel({"gz": (AngleRandomWalk(N=0.5), BandwidthLimit(cutoff=20.0, order=2)), "gx": (Bias(value=1.0),)})
     plain = model.simulate(6000, RATE_HZ, 1)
-    running = model.stream(RATE_HZ, 1)
-    np.testing.assert_array_equal(running.draw(3000), plain[:3000])
-    running.add("gx", Bias(value=2.0))
-    running.add("gx", BiasStep(time=40.0, height=8.0))
-    running.add("gx", RateRamp(R=1.0))
-    running.add("gz", CrossAxis(source="gx", coefficient=1e-12))
-    later = running.draw(3000)
+    running = model.start_stream(RATE_HZ, 1)
+    np.testing.assert_array_equal(running.draw_samples(3000), plain[:3000])
+    running.add_effect("gx", Bias(value=2.0))
+    running.add_effect("gx", BiasStep(time=40.0, height=8.0))
+    running.add_effect("gx", RateRamp(R=1.0))
+    running.add_effect("gz", CrossAxis(source="gx", coefficient=1e-12))
+    later = running.draw_samples(3000)
     np.testing.assert_allclose(later[:, 2], plain[3000:, 2], atol=1e-9)  # the filter was not begun anew
     k = np.arange(3000)
     np.testing.assert_allclose(later[:, 0], 3.0 + 8.0 * (k >= 1000) + k / RATE_HZ)
@@ -117,7 +117,7 @@ def test_what_is_added_acts_from_the_next_sample_on():
 
 def test_what_cannot_be_added_is_said_and_changes_nothing():
     model = NoiseModel({"gz": (Bias(value=1.0),)})
-    running = model.stream(RATE_HZ, 1)
+    running = model.start_stream(RATE_HZ, 1)
     for axis, effect, says in (
         ("gq", Bias(value=1.0), 'unknown axis "gq"'),
         ("gz", Sinusoidal(amplitude=1.0, frequency=60.0), "gz.sinusoidal: frequency must be below 50 Hz"),
@@ -131,8 +131,8 @@ def test_what_cannot_be_added_is_said_and_changes_nothing():
         ("gz", TemperatureBias(coefficient=1.0, reference=2.0), "gz.temperature_bias: no temperature"),
     ):
         with pytest.raises(ConfigError, match=f"^{says}"):
-            running.add(axis, effect)
-    np.testing.assert_array_equal(running.draw(10), model.simulate(10, RATE_HZ, 1))
+            running.add_effect(axis, effect)
+    np.testing.assert_array_equal(running.draw_samples(10), model.simulate(10, RATE_HZ, 1))
 
 
 def test_truth_tells_what_the_seed_decided():
@@ -150,10 +150,10 @@ def test_truth_tells_what_the_seed_decided():
             "az": (BiasInstability(B=1.0),),
         }
     )
-    stream = model.stream(RATE_HZ, 8)
-    assert stream.drawn_values()["gx"]["poisson_steps"][0]["count"] == 0
-    values = stream.draw(10_000)
-    truth = json.loads(json.dumps(stream.drawn_values()))
+    stream = model.start_stream(RATE_HZ, 8)
+    assert stream.drawn_random_values()["gx"]["poisson_steps"][0]["count"] == 0
+    values = stream.draw_samples(10_000)
+    truth = json.loads(json.dumps(stream.drawn_random_values()))
     assert set(truth) == {"gx", "gy", "gz", "ax", "ay"}
 
     one, other = (line["phase"] for line in truth["gz"]["sinusoidal"])  # a stated phase is in the model
@@ -178,18 +178,18 @@ def test_truth_tells_what_the_seed_decided():
 
 
 def test_truth_lists_no_more_than_a_stated_number():
-    stream = NoiseModel({"gx": (Outliers(fraction=0.5, scale=1.0),)}).stream(RATE_HZ, 0)
-    stream.draw(5000)
-    told = stream.drawn_values()["gx"]["outliers"][0]
+    stream = NoiseModel({"gx": (Outliers(fraction=0.5, scale=1.0),)}).start_stream(RATE_HZ, 0)
+    stream.draw_samples(5000)
+    told = stream.drawn_random_values()["gx"]["outliers"][0]
     assert told["count"] > 2000
     assert len(told["times"]) == len(told["errors"]) == 1000
 
 
 def test_dwells_are_exponential_and_either_level_comes_first():
     model = NoiseModel({"gx": (RandomTelegraph(amplitude=2.0, dwell_time=0.5),)})
-    stream = model.stream(1000.0, 3)
-    stream.draw(400_000)
-    dwells = np.diff(stream.drawn_values()["gx"]["random_telegraph"][0]["times"])
+    stream = model.start_stream(1000.0, 3)
+    stream.draw_samples(400_000)
+    dwells = np.diff(stream.drawn_random_values()["gx"]["random_telegraph"][0]["times"])
     assert kstest(dwells, "expon", args=(0.0, 0.5)).pvalue > 0.001
     firsts = [model.simulate(1, 1000.0, seed)[0, 0] for seed in range(200)]
     assert 70 < np.count_nonzero(np.array(firsts) > 0.0) < 130  # 4.2 deviations of a fair coin
@@ -212,24 +212,26 @@ def test_starts_stationary(source):
 
 def test_generated_temperature_is_what_the_table_says():
     warm = Temperature(mean=25.0, swing=3.0, period=40.0)
-    drawn = NoiseModel({}, RATE_HZ, warm).stream(RATE_HZ, 1).draw_with_temperature(5000)
+    drawn = NoiseModel({}, RATE_HZ, warm).start_stream(RATE_HZ, 1).draw_samples_with_temperature(5000)
     np.testing.assert_allclose(
         drawn.temperature_c, 25.0 + 3.0 * np.sin(2.0 * np.pi * np.arange(5000) / RATE_HZ / 40.0), atol=1e-9
     )
     wander = Temperature(mean=0.0, wander=2.0, wander_time=0.05)
-    c = NoiseModel({}, RATE_HZ, wander).stream(RATE_HZ, 1).draw_with_temperature(200_000).temperature_c
+    c = NoiseModel({}, RATE_HZ, wander).start_stream(RATE_HZ, 1).draw_samples_with_temperature(200_000).temperature_c
     assert c.var() == pytest.approx(4.0, rel=0.05)
     assert np.mean(c[5:] * c[:-5]) == pytest.approx(4.0 * np.exp(-1.0), rel=0.08)
-    assert np.isnan(NoiseModel().stream(RATE_HZ, 1).draw_with_temperature(3).temperature_c).all()
+    assert np.isnan(NoiseModel().start_stream(RATE_HZ, 1).draw_samples_with_temperature(3).temperature_c).all()
 
 
 def test_recorded_temperature_stands_instead_and_is_held():
     model = NoiseModel({"gx": (TemperatureBias(coefficient=1.0, reference=0.0),)}, None, Temperature(mean=99.0))
-    drawn = model.stream(RATE_HZ, 1, np.array([np.nan, 20.0, np.nan, 22.0, np.nan])).draw_with_temperature(7)
+    drawn = model.start_stream(
+        RATE_HZ, 1, np.array([np.nan, 20.0, np.nan, 22.0, np.nan])
+    ).draw_samples_with_temperature(7)
     assert drawn.temperature_c.tolist() == [20.0, 20.0, 20.0, 22.0, 22.0, 22.0, 22.0]
     assert drawn.values[:, 0].tolist() == drawn.temperature_c.tolist()
     with pytest.raises(ConfigError, match="no temperature"):
-        model.stream(RATE_HZ, 1, np.array([np.nan]))
+        model.start_stream(RATE_HZ, 1, np.array([np.nan]))
 
 
 def test_true_time_runs_at_the_true_rate():
@@ -242,7 +244,9 @@ def test_true_time_runs_at_the_true_rate():
     stated = NoiseModel({"gx": axis, "gy": (SampleRateError(ratio=0.8),)}).simulate(5000, 100.0, 1)
     np.testing.assert_array_equal(stated, true)
     with pytest.raises(ConfigError, match="below 40 Hz"):
-        NoiseModel({"gx": (Sinusoidal(amplitude=1.0, frequency=45.0), SampleRateError(ratio=0.8))}).stream(100.0, 1)
+        NoiseModel({"gx": (Sinusoidal(amplitude=1.0, frequency=45.0), SampleRateError(ratio=0.8))}).start_stream(
+            100.0, 1
+        )
 
 
 @pytest.mark.long
@@ -257,11 +261,11 @@ def test_memory_does_not_grow_with_the_length():
         RandomSampleHold(fraction=0.01),
     )
     model = NoiseModel(dict.fromkeys(AXES, axis), None, Temperature(mean=20.0, wander=1.0, wander_time=9.0))
-    stream = model.stream(RATE_HZ, 1)
-    stream.draw(300_000)  # the lists of events are full
+    stream = model.start_stream(RATE_HZ, 1)
+    stream.draw_samples(300_000)  # the lists of events are full
     tracemalloc.start()
     for _ in range(30):
-        stream.draw(10_000)
+        stream.draw_samples(10_000)
     held, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert held < 100_000

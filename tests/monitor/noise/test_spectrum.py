@@ -27,7 +27,7 @@ from monitor.noise.effects import (
     Sinusoidal,
 )
 from monitor.noise.model import NoiseModel
-from monitor.noise.spectrum import allan_of_density
+from monitor.noise.spectrum import allan_variance_of_density
 
 TAU0_S = 0.01
 FACTORS = np.array([1, 2, 3, 5, 8, 17, 64, 129, 1000, 31_623, 1_000_000])
@@ -49,7 +49,7 @@ SOURCES = (
 def test_integral_over_the_spectrum_is_the_closed_form(source):
     spectrum = source.spectrum(TAU0_S)
     tau = FACTORS * TAU0_S
-    found = allan_of_density(spectrum.density, tau, TAU0_S, spectrum.peaks)
+    found = allan_variance_of_density(spectrum.density, tau, TAU0_S, spectrum.peaks)
     np.testing.assert_allclose(found, source.avar(tau, TAU0_S), rtol=1e-3)
 
 
@@ -75,7 +75,7 @@ def test_white_noise_through_the_low_pass(order, cutoff):
     model = NoiseModel({"gx": (BandwidthLimit(cutoff=cutoff, order=order), AngleRandomWalk(N=3.0))})
     found = model.avar("gx", factors * TAU0_S, TAU0_S)
     np.testing.assert_allclose(found, avar_of(r, factors), rtol=1e-3)
-    assert model.psd("gx", np.array([cutoff]), TAU0_S)[0] == pytest.approx(4.5)
+    assert model.two_sided_psd("gx", np.array([cutoff]), TAU0_S)[0] == pytest.approx(4.5)
 
 
 def test_line_and_slope_through_the_low_pass():
@@ -113,7 +113,7 @@ def test_a_clock_that_is_off_relabels_time_and_frequency():
     tau = np.array([0.01, 0.3, 20.0])
     np.testing.assert_allclose(stated.avar("gx", tau, 0.01), true.avar("gx", tau / 1.25, 0.008))
     f = np.array([0.1, 8.0, 40.0])
-    np.testing.assert_allclose(stated.psd("gx", f, 0.01), 1.25 * true.psd("gx", 1.25 * f, 0.008))
+    np.testing.assert_allclose(stated.two_sided_psd("gx", f, 0.01), 1.25 * true.two_sided_psd("gx", 1.25 * f, 0.008))
     assert stated.spectrum("gx", 0.01).lines == ((8.0, 0.5),)
 
 
@@ -145,7 +145,7 @@ def test_leaks_bring_what_the_source_measures_by_itself():
 def test_what_has_no_variance_of_its_own_says_so(axis):
     model = NoiseModel({"gx": axis, "gy": (AngleRandomWalk(N=1.0),)})
     assert np.isnan(model.avar("gx", np.array([1.0]), 0.01)).all()
-    assert np.isnan(model.psd("gx", np.array([1.0]), 0.01)).all()
+    assert np.isnan(model.two_sided_psd("gx", np.array([1.0]), 0.01)).all()
     assert model.avar("gy", np.array([1.0]), 0.01).tolist() == [1.0]
 
 

@@ -12,8 +12,8 @@ from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval
 from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
 from monitor.estimation.allan.total import TotalCurve, total_curve
-from monitor.estimation.analysis import Analysis
-from monitor.estimation.detection.model_comparison import ModelGap, PreparedModel
+from monitor.estimation.analysis import RecordingAnalysis
+from monitor.estimation.detection.model_comparison import ModelComparison, PreparedModel
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
 from monitor.estimation.fit.coefficient_values import Coefficients, Status
@@ -87,7 +87,7 @@ def fitted(truth: np.ndarray, seconds: float, rng: np.random.Generator) -> Coeff
     return Coefficients(value=value, lo=lo, hi=hi, status=status)
 
 
-def look(found: Estimate | None = None, scale: float = 1.0, **agrees: bool) -> ModelGap:
+def look(found: Estimate | None = None, scale: float = 1.0, **agrees: bool) -> ModelComparison:
     """That estimate beside the model of ``true_coefficients(scale)``, with these verdicts."""
     found = found or estimate()
     letters = true_coefficients(scale)
@@ -97,7 +97,7 @@ def look(found: Estimate | None = None, scale: float = 1.0, **agrees: bool) -> M
         for i, axis in enumerate(AXES)
     )
     in_force = PreparedModel(NoiseModel.from_toml(text), 360_000)
-    return replace(in_force.compare(found), agrees=agrees)
+    return replace(in_force.compare_with_estimate(found), agrees=agrees)
 
 
 def thermal_look(t_ns: int = 0, bias: float = 3e-4) -> ThermalIntervalResult:
@@ -123,10 +123,10 @@ def slow_curves() -> tuple[TotalCurve, HadamardCurve]:
     return total_curve(values, 100.0, theta), hadamard_curve(values, 100.0, theta)
 
 
-def analysis(found: Estimate | None = None, seconds: float = 3600.0, notes: tuple[str, ...] = ()) -> Analysis:
+def analysis(found: Estimate | None = None, seconds: float = 3600.0, notes: tuple[str, ...] = ()) -> RecordingAnalysis:
     """An analysis of that estimate: of its samples only the first is kept."""
     found = found or estimate(seconds=seconds)
-    return Analysis(found, seconds, notes, np.zeros((1, 6)), empty_fit(found.curve.avar), np.full(6, np.nan))
+    return RecordingAnalysis(found, seconds, notes, np.zeros((1, 6)), empty_fit(found.curve.avar), np.full(6, np.nan))
 
 
 def health(**changed: object) -> Health:

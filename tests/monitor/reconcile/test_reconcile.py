@@ -134,7 +134,7 @@ def test_a_wrong_clock_is_one_step_for_all_axes():
     assert found.verdict == "explained"
     (step,) = (step for one in found.axes.values() for step in one.steps if step.effect == "sample_rate_error")
     assert step.parameters["ratio"].value == pytest.approx(1.004, abs=1e-4)
-    assert found.model.true_to_stated_rate == pytest.approx(1.004, abs=1e-4)
+    assert found.model.true_to_stated_rate_ratio == pytest.approx(1.004, abs=1e-4)
     # what was found in stated time stands in the model in true time
     assert found.axes["gz"].steps[0].parameters["frequency"].value == pytest.approx(31.0 / 1.004, abs=1e-3)
     added = next(effect for effect in found.model.effects["gz"] if isinstance(effect, Sinusoidal))

@@ -119,7 +119,7 @@ def test_plugging_twice_and_pulling_twice_is_harmless_and_leaves_nothing_open():
 def test_same_seed_same_noise():
     a, b = Rig().imu, Rig().imu
     try:
-        assert np.array_equal(a._sensor._stream.draw(50), b._sensor._stream.draw(50))
+        assert np.array_equal(a._sensor._stream.draw_samples(50), b._sensor._stream.draw_samples(50))
     finally:
         a.stop()
         b.stop()

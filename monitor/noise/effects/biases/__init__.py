@@ -1,1 +1,1 @@
-"""Effects that add a bias or change it with time or temperature."""
+"""Effects that add a constant or variable bias."""

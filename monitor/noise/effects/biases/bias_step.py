@@ -6,32 +6,32 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import SampleBlockContext, Source, StatelessSeries, first_sample_index, parameter
-from monitor.noise.spectrum import Spectrum, undefined_spectrum
+from monitor.noise.effect import SampleBlockContext, Source, StatelessSeries, first_sample_at_or_after, parameter_field
+from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class BiasStep(Source):
-    """Step of the bias by ``height``, from the first sample at or after ``time``.
+    """Step of the bias by ``height`` at the first sample at or after ``time``.
 
     >>> bool(np.isnan(BiasStep(time=60.0, height=1e-3).avar(np.array([1.0]), 0.01)[0]))
     True
     """
 
-    time: float = parameter("s")
-    height: float = parameter("rad/s", "m/s²", signed=True)
+    time: float = parameter_field("s")
+    height: float = parameter_field("rad/s", "m/s²", signed=True)
 
     description: ClassVar[str] = "The bias jumps once and keeps the new value, for example after a knock."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return NaN, because the effect of a single step depends on the length of the recording."""
-        return undefined_spectrum(tau0_s)
+        """Return NaN, because the effect of a step depends on the length of the recording."""
+        return nan_spectrum(tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
-        """Return a series in which ``time`` counts from the first sample of the stream."""
-        first = first_sample_index(self.time, rate_hz)
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
+        """Start a series with a step. ``time`` is relative to the first sample of the stream."""
+        first = first_sample_at_or_after(self.time, rate_hz)
 
-        def add(values: Floats, block: SampleBlockContext) -> None:
+        def add_bias_step(values: Floats, block: SampleBlockContext) -> None:
             values[max(0, first - block.first) :] += self.height
 
-        return StatelessSeries(add)
+        return StatelessSeries(add_bias_step)

@@ -6,34 +6,34 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import SampleBlockContext, Source, StatelessSeries, parameter
-from monitor.noise.spectrum import Spectrum, undefined_spectrum
+from monitor.noise.effect import SampleBlockContext, Source, StatelessSeries, parameter_field
+from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class TemperatureBias(Source):
-    """Bias that is a polynomial of second order in temperature: b = c (T − T_r) + q (T − T_r)² (IEEE Std 952).
+    """Bias that is a second-order polynomial of the temperature: b = c (T − T_r) + q (T − T_r)² (IEEE Std 952).
 
-    >>> bool(np.isnan(TemperatureBias(coefficient=1e-4, reference=25.0).psd(np.array([1.0]), 0.01)[0]))
+    >>> bool(np.isnan(TemperatureBias(coefficient=1e-4, reference=25.0).two_sided_psd(np.array([1.0]), 0.01)[0]))
     True
     """
 
-    coefficient: float = parameter("rad/s/°C", "m/s²/°C", signed=True)
-    reference: float = parameter("°C", signed=True)
-    quadratic: float | None = parameter("rad/s/°C²", "m/s²/°C²", signed=True, optional=True)
+    coefficient: float = parameter_field("rad/s/°C", "m/s²/°C", signed=True)
+    reference: float = parameter_field("°C", signed=True)
+    quadratic: float | None = parameter_field("rad/s/°C²", "m/s²/°C²", signed=True, optional=True)
 
     description: ClassVar[str] = "The bias depends on the temperature of the sensor, without delay."
     uses_temperature: ClassVar[bool] = True
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return NaN, because the spectrum depends on the temperature."""
-        return undefined_spectrum(tau0_s)
+        return nan_spectrum(tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
-        """Return a series that is a function of the temperature of each sample."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> StatelessSeries:
+        """Start a series that depends on the temperature of each sample."""
 
-        def add(values: Floats, block: SampleBlockContext) -> None:
+        def add_temperature_bias(values: Floats, block: SampleBlockContext) -> None:
             warmer = block.temperature_c - self.reference
             values += (self.coefficient + (self.quadratic or 0.0) * warmer) * warmer
 
-        return StatelessSeries(add)
+        return StatelessSeries(add_temperature_bias)

@@ -1,4 +1,4 @@
-"""Bias that depends on temperature with a delay."""
+"""Bias that follows the temperature with a delay."""
 
 from dataclasses import dataclass
 from math import expm1
@@ -8,36 +8,35 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
-from monitor.noise.spectrum import Spectrum, undefined_spectrum
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class TemperatureLag(Source):
-    """Bias that follows temperature with a first-order lag (Newton's law of cooling): b = c (T_l − T_r), dT_l/dt = (T −
-    T_l)/τ.
+    """Bias that follows the temperature with a first-order lag (Newton's law of cooling).
 
-    The lagged temperature T_l starts at the first temperature of the series. The temperature is assumed to be constant
-    between samples.
+    The bias is b = c (T_l − T_r), where dT_l/dt = (T − T_l)/τ. The lagged temperature T_l starts at the first
+    temperature. The temperature is constant between samples.
 
     >>> lag = TemperatureLag(coefficient=1e-4, reference=25.0, time_constant=60.0)
     >>> bool(np.isnan(lag.avar(np.array([1.0]), 0.01)[0]))
     True
     """
 
-    coefficient: float = parameter("rad/s/°C", "m/s²/°C", signed=True)
-    reference: float = parameter("°C", signed=True)
-    time_constant: float = parameter("s", positive=True)
+    coefficient: float = parameter_field("rad/s/°C", "m/s²/°C", signed=True)
+    reference: float = parameter_field("°C", signed=True)
+    time_constant: float = parameter_field("s", positive=True)
 
     description: ClassVar[str] = "The bias follows the temperature of the sensor with a delay."
     uses_temperature: ClassVar[bool] = True
 
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return NaN, because the spectrum depends on the temperature."""
-        return undefined_spectrum(tau0_s)
+        return nan_spectrum(tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_LaggedBias":
-        """Return a series whose lagged temperature starts at the first temperature."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_LaggedBias":
+        """Start a series whose lagged temperature starts at the first temperature."""
         return _LaggedBias(self.coefficient, self.reference, -expm1(-1.0 / (self.time_constant * rate_hz)))
 
 
@@ -46,7 +45,7 @@ class _LaggedBias(NoiseSeries):
         self._coefficient, self._reference_c, self._share = coefficient, reference_c, share
         self._lagged_c: float | None = None
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         inside = float(block.temperature_c[0]) if self._lagged_c is None else self._lagged_c
         self._lagged_c = _add_lagged_bias(
             values, block.temperature_c, inside, self._coefficient, self._reference_c, self._share
@@ -57,7 +56,6 @@ class _LaggedBias(NoiseSeries):
 def _add_lagged_bias(
     values: Floats, temperature_c: Floats, inside: float, coefficient: float, reference: float, share: float
 ) -> float:
-    """Add the bias of the lagged temperature to the values [n], and return the lagged temperature in °C."""
     for k in range(values.size):
         values[k] += coefficient * (inside - reference)
         inside += share * (temperature_c[k] - inside)

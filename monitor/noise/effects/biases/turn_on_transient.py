@@ -1,4 +1,4 @@
-"""Transient after switching on."""
+"""Transient of the bias after switching on."""
 
 from dataclasses import dataclass
 from math import exp
@@ -8,29 +8,29 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
-from monitor.noise.spectrum import Spectrum, undefined_spectrum
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class TurnOnTransient(Source):
-    """Exponential transient A exp(−t/τ), which begins at the first sample (warm-up term of IEEE Std 952).
+    """Exponential transient A exp(−t/τ) that starts at the first sample (warm-up term of IEEE Std 952).
 
     >>> bool(np.isnan(TurnOnTransient(amplitude=1e-3, time_constant=60.0).avar(np.array([1.0]), 0.01)[0]))
     True
     """
 
-    amplitude: float = parameter("rad/s", "m/s²", signed=True)
-    time_constant: float = parameter("s", positive=True)
+    amplitude: float = parameter_field("rad/s", "m/s²", signed=True)
+    time_constant: float = parameter_field("s", positive=True)
 
     description: ClassVar[str] = "After the sensor is switched on, the bias decays exponentially to its final value."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return NaN, because the effect of a single transient depends on the length of the recording."""
-        return undefined_spectrum(tau0_s)
+        """Return NaN, because the effect of a transient depends on the length of the recording."""
+        return nan_spectrum(tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Decay":
-        """Return a transient that begins at the first sample after the call, also in a running stream."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Decay":
+        """Start a transient at the next sample."""
         return _Decay(self.amplitude, 1.0 / (self.time_constant * rate_hz))
 
 
@@ -39,13 +39,12 @@ class _Decay(NoiseSeries):
         self._amplitude, self._step = amplitude, step
         self._count = 0
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         _add_decay(values, self._count, self._amplitude, self._step)
         self._count += values.size
 
 
 @compiled
 def _add_decay(values: Floats, first: int, amplitude: float, step: float) -> None:
-    """Add amplitude · exp(−step · k) for k = first, … to the values [n]."""
     for k in range(values.size):
         values[k] += amplitude * exp(-step * (first + k))

@@ -1,1 +1,1 @@
-"""Effects that couple one axis to another axis or to the acceleration."""
+"""Effects that couple one axis to another axis."""

@@ -1,16 +1,15 @@
-"""Cross-axis sensitivity: leak from another axis of the same kind."""
+"""Cross-axis sensitivity: leak from another gyroscope or accelerometer axis."""
 
 from dataclasses import dataclass
 from typing import ClassVar
 
 from drivers.errors import ConfigError
-from monitor.noise.effect import GYROS, Leak, parameter, source_axis_field
+from monitor.noise.effect import GYROS, AxisLeak, parameter_field, source_axis_field
 
 
 @dataclass(frozen=True, slots=True)
-class CrossAxis(Leak):
-    """Cross-axis sensitivity (IEEE Std 1293): the measurement changes by c·x. x is the measurement of the axis
-    ``source`` without leaks.
+class CrossAxis(AxisLeak):
+    """Cross-axis sensitivity (IEEE Std 1293), which adds ``coefficient`` times the measurement of the axis ``source``.
 
     >>> CrossAxis(source="gx", coefficient=0.02).check_axis("gx")
     Traceback (most recent call last):
@@ -18,12 +17,12 @@ class CrossAxis(Leak):
     """
 
     source: str = source_axis_field()
-    coefficient: float = parameter("1", signed=True)
+    coefficient: float = parameter_field("1", signed=True)
 
     description: ClassVar[str] = "A misalignment adds a share of the signal of another axis."
 
     def check_axis(self, axis: str) -> None:
-        """Raise ConfigError if the source is the same axis or an axis of the other kind."""
+        """Raise ConfigError if the source is the axis itself or has another unit."""
         if self.source == axis:
             raise ConfigError(f"{self.name}: source must be another axis than {axis} itself")
         if (self.source in GYROS) != (axis in GYROS):

@@ -8,51 +8,47 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.gauss_markov import gauss_markov_spectrum
 from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class Narrowband(Source):
-    """White noise through a second-order resonance of frequency f and bandwidth Δ. The autocovariance is σ² exp(−πΔ|t|)
-    cos 2πft.
+    """White noise after a second-order resonance of frequency f and bandwidth Δ.
 
-    The series is the real part of complex first-order noise, z ← φz + w with φ = exp((−πΔ + 2πif)τ0). The spectrum is
-    therefore a pair of Lorentzian lines at ±f with full width Δ at half power. The Allan variance is the real part of
-    the closed form for exponentially correlated noise with this φ. Spectrum and Allan variance are exact for the
-    samples.
+    The autocovariance is σ² exp(−πΔ|t|) cos 2πft. The series is the real part of the complex process z ← φz + w with φ
+    = exp((−πΔ + 2πif)τ0). The spectrum has two Lorentzian peaks at ±f with the full width Δ at half power. Allan
+    variance and spectrum are exact for samples.
 
     >>> hum = Narrowband(sigma=1.0, frequency=20.0, bandwidth=1.0)
-    >>> peak, half = hum.psd(np.array([20.0, 20.5]), 1e-4)
+    >>> peak, half = hum.two_sided_psd(np.array([20.0, 20.5]), 1e-4)
     >>> print(f"{half / peak:.3f}")
     0.500
     """
 
-    sigma: float = parameter("rad/s", "m/s²")
-    frequency: float = parameter("Hz", positive=True, below_nyquist=True)
-    bandwidth: float = parameter("Hz", positive=True)
+    sigma: float = parameter_field("rad/s", "m/s²")
+    frequency: float = parameter_field("Hz", positive=True, below_nyquist=True)
+    bandwidth: float = parameter_field("Hz", positive=True)
 
     description: ClassVar[str] = "A nearby resonance adds an oscillation with a randomly varying amplitude."
 
     @property
     def _decay(self) -> complex:
-        """Return the complex decay rate 1/T_c − iω in 1/s."""
+        """Complex decay rate 1/T_c − iω in 1/s."""
         return pi * self.bandwidth - 2j * pi * self.frequency
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return spectrum and Allan variance in closed form. The position of the peak refines the grid of integrals."""
+        """Return the spectrum and the Allan variance in closed form."""
         peaks = ((self.frequency, self.bandwidth),)
         return replace(gauss_markov_spectrum(self.sigma, self._decay, tau0_s), peaks=peaks)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Resonance":
-        """Return a stationary series."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Resonance":
+        """Start a stationary series."""
         return _Resonance(self.sigma, self._decay / rate_hz, rng)
 
 
 class _Resonance(NoiseSeries):
-    """Series of the real part of complex first-order noise."""
-
     def __init__(self, sigma: float, step: complex, rng: np.random.Generator) -> None:
         self._rng = rng
         phi = np.exp(-step)
@@ -60,7 +56,7 @@ class _Resonance(NoiseSeries):
         self._drive = sigma * float(np.sqrt(-np.expm1(-2.0 * step.real)))
         self._x, self._y = sigma * rng.standard_normal(2)
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal((values.size, 2))
         self._x, self._y = _add_resonance(values, white, self._cos, self._sin, self._drive, self._x, self._y)
 
@@ -69,7 +65,6 @@ class _Resonance(NoiseSeries):
 def _add_resonance(
     values: Floats, white: Floats, c: float, s: float, drive: float, x: float, y: float
 ) -> tuple[float, float]:
-    """Add the real part x of the complex noise x + iy to the values [n], and return the last x and y."""
     for k in range(values.size):
         values[k] += x
         x, y = c * x - s * y + drive * white[k, 0], s * x + c * y + drive * white[k, 1]

@@ -1,23 +1,23 @@
-"""Step of the white noise."""
+"""Step of the white noise amplitude."""
 
 from dataclasses import dataclass
 from typing import ClassVar
 
-from monitor.noise.effect import Effect, parameter
+from monitor.noise.effect import Effect, parameter_field
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseStep(Effect):
-    """Multiplication of the angle random walk by ``ratio``, from the first sample at or after ``time``.
+    """Multiplication of the angle random walk by ``ratio`` from the first sample at or after ``time``.
 
-    The factors of two noise steps multiply. Allan variance and spectrum of the axis depend on the length of the
-    recording, so they are NaN.
+    The ratios of several noise steps are multiplied. Allan variance and spectrum are NaN, because they depend on the
+    length of the recording.
 
     >>> NoiseStep(time=600.0, ratio=2.0).name
     'noise_step'
     """
 
-    time: float = parameter("s")
-    ratio: float = parameter("1")
+    time: float = parameter_field("s")
+    ratio: float = parameter_field("1")
 
     description: ClassVar[str] = "The size of the white noise changes once by a factor."

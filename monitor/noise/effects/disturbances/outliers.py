@@ -6,25 +6,23 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.random_events import RandomEvents
 from monitor.noise.spectrum import Spectrum, white_noise_spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class Outliers(Source):
-    """Tukey's contaminated noise. With probability p, a sample has an additional Gaussian error of standard deviation
-    s.
+    """Additional Gaussian error of standard deviation s on a fraction p of the samples (Tukey's contaminated noise).
 
-    The errors are white noise with a variance of p s² per sample. The spectrum is S(f) = p s² τ0, and the Allan
-    variance is σ²(τ) = p s² τ0/τ.
+    The power spectral density is S(f) = p s² τ0, and the Allan variance is σ²(τ) = p s² τ0/τ.
 
     >>> print(f"{Outliers(fraction=1e-4, scale=0.1).avar(np.array([1.0]), 0.01)[0]:.6g}")
     1e-08
     """
 
-    fraction: float = parameter("1", most=1.0)
-    scale: float = parameter("rad/s", "m/s²")
+    fraction: float = parameter_field("1", maximum=1.0)
+    scale: float = parameter_field("rad/s", "m/s²")
 
     description: ClassVar[str] = "Single samples deviate strongly from their neighbours."
 
@@ -32,23 +30,23 @@ class Outliers(Source):
         """Return the spectrum of white noise with the mean square of the errors."""
         return white_noise_spectrum(self.fraction * self.scale**2, tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_IsolatedErrors":
-        """Return a series of outliers with geometric gaps, which correspond to an independent draw for every sample."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_IsolatedErrors":
+        """Start a series of outliers with geometric gaps."""
         return _IsolatedErrors(self.fraction, self.scale, rate_hz, rng)
 
 
 class _IsolatedErrors(NoiseSeries):
     def __init__(self, fraction: float, scale: float, rate_hz: float, rng: np.random.Generator) -> None:
-        def gaps(n: int) -> Floats:
+        def draw_gaps(n: int) -> Floats:
             if fraction == 0.0:
                 return np.full(n, np.inf)
             return rng.geometric(fraction, n).astype(np.float64)
 
-        self._events = RandomEvents(gaps, lambda n: scale * rng.standard_normal(n), rate_hz, before=-1.0)
+        self._events = RandomEvents(draw_gaps, lambda n: scale * rng.standard_normal(n), rate_hz, before=-1.0)
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
-        when, errors = self._events.take(block.first, values.size)
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
+        when, errors = self._events.take_block_events(block.first, values.size)
         values[when] += errors
 
-    def drawn_values(self) -> dict[str, Any]:
-        return self._events.drawn_values("errors")
+    def drawn_random_values(self) -> dict[str, Any]:
+        return self._events.drawn_random_values("errors")

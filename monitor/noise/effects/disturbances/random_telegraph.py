@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.gauss_markov import gauss_markov_spectrum
 from monitor.noise.random_events import RandomEvents
 from monitor.noise.spectrum import Spectrum
@@ -15,18 +15,18 @@ from monitor.noise.spectrum import Spectrum
 
 @dataclass(frozen=True, slots=True)
 class RandomTelegraph(Source):
-    """Random switching between two levels ±a/2, with exponential dwell times of mean T. The switching rate is λ = 1/T.
+    """Random switching between the two levels ±a/2, with exponentially distributed dwell times of mean T.
 
-    The autocovariance is (a²/4) exp(−2λ|t|) (Machlup, "Noise in semiconductors: spectrum of a two-parameter random
-    signal", 1954). The second moments equal those of exponentially correlated noise with σ = a/2 and T_c = T/2.
+    The autocovariance is (a²/4) exp(−2|t|/T) (Machlup, "Noise in semiconductors: spectrum of a two-parameter random
+    signal", 1954). The spectrum equals the spectrum of exponentially correlated noise with σ = a/2 and T_c = T/2.
 
     >>> popcorn = RandomTelegraph(amplitude=2.0, dwell_time=20.0)
     >>> print(f"{popcorn.avar(np.array([18.9]), 1e-3)[0]:.3f}")
     0.381
     """
 
-    amplitude: float = parameter("rad/s", "m/s²")
-    dwell_time: float = parameter("s", positive=True)
+    amplitude: float = parameter_field("rad/s", "m/s²")
+    dwell_time: float = parameter_field("s", positive=True)
 
     description: ClassVar[str] = (
         "The bias jumps between two levels at random times, which is also called popcorn noise."
@@ -34,18 +34,15 @@ class RandomTelegraph(Source):
 
     @property
     def events_hz(self) -> float:
-        """Return the mean number of switches per second."""
+        """Mean number of level changes per second."""
         return 1.0 / self.dwell_time
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return the spectrum of exponentially correlated noise with σ = a/2, T_c = T/2."""
+        """Return the spectrum of exponentially correlated noise with σ = a/2 and T_c = T/2."""
         return gauss_markov_spectrum(0.5 * self.amplitude, 2.0 / self.dwell_time, tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_TwoLevels":
-        """Return a stationary series that starts at a random level.
-
-        The remainder of the first dwell time has the same distribution as a whole dwell time.
-        """
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_TwoLevels":
+        """Start a stationary series at a random level."""
         return _TwoLevels(0.5 * self.amplitude, self.dwell_time * rate_hz, rate_hz, rng)
 
 
@@ -55,13 +52,13 @@ class _TwoLevels(NoiseSeries):
         self._first_level = self._level
         self._flips = RandomEvents(lambda n: rng.exponential(dwell, n), np.zeros, rate_hz)
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
-        when, _ = self._flips.take(block.first, values.size)
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
+        when, _ = self._flips.take_block_events(block.first, values.size)
         edges = [0, *when.tolist(), values.size]
         for begin, end in pairwise(edges):
             values[begin:end] += self._level
             self._level = -self._level
-        self._level = -self._level  # The loop also switched at the end of the block, where there is no event.
+        self._level = -self._level  # undo the level change at the end of the block
 
-    def drawn_values(self) -> dict[str, Any]:
-        return {"first_level": self._first_level, **self._flips.drawn_values()}
+    def drawn_random_values(self) -> dict[str, Any]:
+        return {"first_level": self._first_level, **self._flips.drawn_random_values()}

@@ -1,4 +1,4 @@
-"""Angle random walk N, which is called velocity random walk on an accelerometer."""
+"""Angle random walk N of a gyroscope, or velocity random walk of an accelerometer."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -6,19 +6,19 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class AngleRandomWalk(Source):
-    """White noise of the rate: S(f) = N² and σ²(τ) = N²/τ (IEEE Std 952 eq. C.18–C.19).
+    """White noise of the rate, with S(f) = N² and σ²(τ) = N²/τ (IEEE Std 952 eq. C.18–C.19).
 
     >>> print(f"{AngleRandomWalk(N=1.5e-4).avar(np.array([9.0]), 0.01)[0]:.6g}")
     2.5e-09
     """
 
-    N: float = parameter("rad/√s", "m/s/√s")
+    N: float = parameter_field("rad/√s", "m/s/√s")
 
     description: ClassVar[str] = "White noise of the rate averages out with the square root of the averaging time."
 
@@ -26,8 +26,8 @@ class AngleRandomWalk(Source):
         """Return the spectrum N² and the Allan variance N²/τ."""
         return Spectrum(lambda f: np.full_like(f, self.N**2), lambda tau: self.N**2 / tau, tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_WhiteNoise":
-        """Return independent samples with standard deviation N √rate."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_WhiteNoise":
+        """Start a series of independent samples with the standard deviation N √rate."""
         return _WhiteNoise(self.N * rate_hz**0.5, rng)
 
 
@@ -35,7 +35,7 @@ class _WhiteNoise(NoiseSeries):
     def __init__(self, deviation: float, rng: np.random.Generator) -> None:
         self._deviation, self._rng = deviation, rng
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal(out=block.scratch)
         white *= self._deviation
         values += white

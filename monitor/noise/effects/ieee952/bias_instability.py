@@ -1,11 +1,8 @@
 """Bias instability B: 1/f noise of the rate.
 
-The series is white noise through a filter. The squared response of the filter is 1/f within 0.1 % from 1e-8 to 1/2 of
-the sample rate, and constant below. 28 hours at 100 Hz correspond to 1e-7. The poles and zeros of the filter are real
-and alternate. Poles and zeros were fitted to the logarithm of the spectrum by least squares. The tables list the
-differences 1 − p and 1 − z, because most poles and zeros are close to one. The filter runs as the sum of its partial
-fractions, which are all driven by the same white noise. This form starts exactly in its stationary state, so the first
-minute of a series has the same statistics as any other.
+The simulated series is white noise after a filter. The power response of the filter is proportional to 1/f within 0.1 %
+from 1e-8 to 1/2 of the sample rate. All poles and zeros are real, and were fitted to the logarithm of the spectrum by
+least squares. The filter is implemented as a sum of partial fractions and starts in the stationary state.
 """
 
 from dataclasses import dataclass
@@ -15,7 +12,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 # fmt: off
@@ -33,27 +30,30 @@ ONE_MINUS_ZERO: Final = np.array([
 """One minus the zeros of the filter."""
 # fmt: on
 RESPONSE_CONSTANT: Final = 5.436556224293264
-"""Constant of the filter: its squared response is 1 / (RESPONSE_CONSTANT · f/fs) within the band."""
+"""Constant of the filter. The squared response is 1 / (RESPONSE_CONSTANT · f/fs)."""
 
 FLICKER_AVAR: Final = float(2.0 * np.log(2.0) / np.pi)
 """Allan variance of continuous flicker noise with B = 1 (IEEE Std 952 eq. C.24)."""
 MAX_SAMPLED_FACTOR: Final = 128
-"""Largest number of samples per cluster for which the sampled form of σ² is integrated. For larger clusters, the
-sampled form differs from the continuous form by less than 1e-4."""
+"""Maximum cluster size for which the Allan variance of the samples is integrated.
+
+For larger clusters, the continuous formula differs by less than 1e-4.
+"""
 
 _MIDPOINT_COUNT: Final = 8192
 
 
 @dataclass(frozen=True, slots=True)
 class BiasInstability(Source):
-    """1/f noise of the rate: S(f) = B²/(2πf) and σ²(τ) = (2 ln 2/π) B² (IEEE Std 952 eq. C.22–C.24). The Allan
-    deviation is 0.664 B.
+    """1/f noise of the rate, with S(f) = B²/(2πf) and σ²(τ) = (2 ln 2/π) B² (IEEE Std 952 eq. C.22–C.24).
+
+    The Allan deviation is 0.664 B.
 
     >>> print(f"{BiasInstability(B=1.0).avar(np.array([100.0]), 0.01)[0] ** 0.5:.3f}")
     0.664
     """
 
-    B: float = parameter("rad/s", "m/s²")
+    B: float = parameter_field("rad/s", "m/s²")
 
     description: ClassVar[str] = (
         "The bias fluctuates with 1/f noise, so longer averaging does not reduce the error below a floor."
@@ -62,7 +62,7 @@ class BiasInstability(Source):
     def spectrum(self, tau0_s: float) -> Spectrum:
         """Return the spectrum B²/(2πf) and the Allan variance (2 ln 2/π) B².
 
-        For clusters of few samples, σ² is integrated over the spectrum up to half the sample rate.
+        For small clusters, the Allan variance is integrated over the spectrum up to half the sample rate.
         """
 
         def avar(tau_s: Floats) -> Floats:
@@ -74,13 +74,13 @@ class BiasInstability(Source):
 
         return Spectrum(lambda f: self.B**2 / (2.0 * np.pi * f), avar, tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Flicker":
-        """Return a stationary series."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Flicker":
+        """Start a stationary series."""
         return _Flicker(self.B, rng)
 
 
 def _sampled_allan_variance(m: Floats) -> Floats:
-    """Return 4 ∫ S sin⁴(πfm) / (m² sin²(πf)) df up to f = 1/2 for S = 1/(2πf), by the midpoint rule."""
+    """Return the Allan variance of the sampled spectrum 1/(2πf), by the midpoint rule."""
     f = (np.arange(_MIDPOINT_COUNT) + 0.5) * (0.5 / _MIDPOINT_COUNT)
     kernel = np.sin(np.pi * f * m[:, None]) ** 4 / (m[:, None] * np.sin(np.pi * f)) ** 2
     integral: Floats = (kernel / f).sum(1) * (1.0 / (np.pi * _MIDPOINT_COUNT))
@@ -88,12 +88,10 @@ def _sampled_allan_variance(m: Floats) -> Floats:
 
 
 class _Flicker(NoiseSeries):
-    """White noise w through the filter in partial fractions: y = direct·w + Σ residue·s, with the states s ← pole·s +
-    w."""
+    """Partial-fraction form of the filter: y = direct·w + Σ residue·s, with white noise w and s ← pole·s + w."""
 
     def __init__(self, B: float, rng: np.random.Generator) -> None:
-        # White noise of variance 1 has the density τ0. The output density gain² / (RESPONSE_CONSTANT f) must equal
-        # B²/(2πf).
+        # The output density gain² / (RESPONSE_CONSTANT f) must equal B²/(2πf).
         gain = B * np.sqrt(RESPONSE_CONSTANT / (2.0 * np.pi))
         self._rng = rng
         self._poles = 1.0 - ONE_MINUS_POLE
@@ -102,7 +100,7 @@ class _Flicker(NoiseSeries):
         overlap = ONE_MINUS_POLE[:, None] + ONE_MINUS_POLE - ONE_MINUS_POLE[:, None] * ONE_MINUS_POLE
         self._states = np.linalg.cholesky(1.0 / overlap) @ rng.standard_normal(ONE_MINUS_POLE.size)
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal(out=block.scratch)
         _add_flicker_noise(values, white, self._states, self._poles, self._residues, self._direct)
 
@@ -121,7 +119,6 @@ def _residues() -> Floats:
 def _add_flicker_noise(
     values: Floats, white: Floats, states: Floats, poles: Floats, residues: Floats, direct: float
 ) -> None:
-    """Filter white noise [n], and add the 1/f noise to the values [n]. The states continue in the next call."""
     for k in range(values.size):
         value = direct * white[k]
         for i in range(states.size):

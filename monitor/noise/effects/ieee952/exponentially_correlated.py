@@ -7,16 +7,16 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.gauss_markov import gauss_markov_spectrum
 from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class ExponentiallyCorrelated(Source):
-    """Sampled Markov noise (IEEE Std 952 annex C) with the autocovariance σ²φ^|n|, φ = exp(−τ0/T_c).
+    """Sampled Markov noise (IEEE Std 952 annex C) with the autocovariance σ²φ^|n| and φ = exp(−τ0/T_c).
 
-    Allan variance and spectrum, with n = τ/τ0, are:
+    With n = τ/τ0, the Allan variance and the power spectral density are:
 
         σ²(τ) = σ²(1 − φ²)[n − 3φ − nφ² + 4φ^(n+1) − φ^(2n+1)] / [n²(1 − φ)²(1 − φ²)]
         S(f) = σ²τ0(1 − φ²)/(1 − 2φ cos 2πfτ0 + φ²)
@@ -26,22 +26,22 @@ class ExponentiallyCorrelated(Source):
     0.381
     """
 
-    sigma: float = parameter("rad/s", "m/s²")
-    correlation_time: float = parameter("s", positive=True)
+    sigma: float = parameter_field("rad/s", "m/s²")
+    correlation_time: float = parameter_field("s", positive=True)
 
     description: ClassVar[str] = "The bias fluctuates about zero with an exponential autocorrelation."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return the closed forms of the class docstring."""
+        """Return the spectrum and the Allan variance in closed form."""
         return gauss_markov_spectrum(self.sigma, 1.0 / self.correlation_time, tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_GaussMarkov":
-        """Return a stationary series."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_GaussMarkov":
+        """Start a stationary series."""
         return _GaussMarkov(self.sigma, 1.0 / (self.correlation_time * rate_hz), rng)
 
 
 class _GaussMarkov(NoiseSeries):
-    """Series of the recursion x ← φx + σ√(1 − φ²) w."""
+    """Series of the recursion x ← φx + σ√(1 − φ²) w with white noise w."""
 
     def __init__(self, sigma: float, step: float, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -49,14 +49,13 @@ class _GaussMarkov(NoiseSeries):
         self._drive = sigma * float(np.sqrt(-np.expm1(-2.0 * step)))
         self._state = sigma * float(rng.standard_normal())
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         white = self._rng.standard_normal(out=block.scratch)
         self._state = _add_gauss_markov(values, white, self._phi, self._drive, self._state)
 
 
 @compiled
 def _add_gauss_markov(values: Floats, white: Floats, phi: float, drive: float, state: float) -> float:
-    """Add the process to the values [n], and return its state."""
     for k in range(values.size):
         values[k] += state
         state = phi * state + drive * white[k]

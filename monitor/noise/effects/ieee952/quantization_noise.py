@@ -1,4 +1,4 @@
-"""Quantization noise Q: white noise of the angle, which appears in the rate as its differences."""
+"""Quantization noise Q: white noise of the angle."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -6,19 +6,19 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class QuantizationNoise(Source):
-    """White noise of the angle: σ²(τ) = 3Q²/τ² and S(f) = 4Q²/τ0 sin²(πfτ0) (IEEE Std 952 eq. C.14–C.15).
+    """White noise of the angle, with σ²(τ) = 3Q²/τ² and S(f) = 4Q²/τ0 sin²(πfτ0) (IEEE Std 952 eq. C.14–C.15).
 
     >>> print(f"{QuantizationNoise(Q=2e-6).avar(np.array([0.1]), 0.01)[0]:.6g}")
     1.2e-09
     """
 
-    Q: float = parameter("rad", "m/s")
+    Q: float = parameter_field("rad", "m/s")
 
     description: ClassVar[str] = "Rounding of the angle adds noise that averages out faster than white noise."
 
@@ -30,8 +30,8 @@ class QuantizationNoise(Source):
             tau0_s,
         )
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Differences":
-        """Return a series of differences of white angle noise."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Differences":
+        """Start a series of differences of white angle noise."""
         return _Differences(self.Q, rate_hz, rng)
 
 
@@ -39,9 +39,9 @@ class _Differences(NoiseSeries):
     def __init__(self, Q: float, rate_hz: float, rng: np.random.Generator) -> None:
         self._rng = rng
         self._scale = Q * rate_hz
-        self._angle = self._scale * float(rng.standard_normal())  # last angle error divided by the sample interval
+        self._angle = self._scale * float(rng.standard_normal())  # last angle error, divided by the sample interval
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         angles = self._rng.standard_normal(out=block.scratch)
         angles *= self._scale
         values += angles

@@ -6,28 +6,28 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.data_types import Floats
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class RateRamp(Source):
-    """Constant slope of the rate: σ²(τ) = R²τ²/2 (IEEE Std 952 eq. C.32). A ramp is deterministic and has no spectrum.
+    """Constant slope of the rate, with σ²(τ) = R²τ²/2 (IEEE Std 952 eq. C.32). A ramp has no spectrum.
 
     >>> float(RateRamp(R=2e-6).avar(np.array([1000.0]), 0.01)[0])
     2e-06
     """
 
-    R: float = parameter("rad/s²", "m/s³")
+    R: float = parameter_field("rad/s²", "m/s³")
 
     description: ClassVar[str] = "The bias changes at a constant rate, for example while a sensor warms up."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return a spectrum that has only a slope."""
+        """Return a spectrum with a slope and no noise."""
         return Spectrum(np.zeros_like, lambda tau: 0.5 * (self.R * tau) ** 2, tau0_s, slope=self.R)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Ramp":
-        """Return a ramp that starts at zero."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Ramp":
+        """Start a ramp at zero."""
         return _Ramp(self.R / rate_hz)
 
 
@@ -36,6 +36,6 @@ class _Ramp(NoiseSeries):
         self._step = step
         self._count = 0
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         values += self._step * np.arange(self._count, self._count + values.size, dtype=np.float64)
         self._count += values.size

@@ -1,4 +1,4 @@
-"""Rate random walk K: integrated white noise."""
+"""Rate random walk K: integrated white noise of the rate."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -7,7 +7,7 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
@@ -15,28 +15,27 @@ from monitor.noise.spectrum import Spectrum
 class RateRandomWalk(Source):
     """Sampled integrated white noise (IEEE Std 952 eq. C.28–C.29).
 
-    The continuous process has the spectrum S(f) = K²/(2πf)² and the Allan variance σ²(τ) = K²τ/3. The sum of
-    independent steps of variance K²τ0 has S(f) = K²τ0²/(4 sin²(πfτ0)) and σ²(τ) = K²τ/3 · (1 + 1/(2m²)) with m = τ/τ0.
-    Sampled and continuous forms differ only for clusters of few samples.
+    The power spectral density is S(f) = K²τ0²/(4 sin²(πfτ0)). The Allan variance is σ²(τ) = K²τ/3 · (1 + 1/(2m²)) with
+    m = τ/τ0. The continuous process has S(f) = K²/(2πf)² and σ²(τ) = K²τ/3.
 
     >>> print(f"{RateRandomWalk(K=3e-6).avar(np.array([1e4]), 0.01)[0]:.6g}")
     3e-08
     """
 
-    K: float = parameter("rad/s/√s", "m/s²/√s")
+    K: float = parameter_field("rad/s/√s", "m/s²/√s")
 
     description: ClassVar[str] = "The bias takes independent random steps, so the error grows with the averaging time."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return the spectrum and the Allan variance of the sampled process."""
+        """Return the spectrum and the Allan variance of the samples."""
         return Spectrum(
             lambda f: (0.5 * self.K * tau0_s / np.sin(np.pi * f * tau0_s)) ** 2,
             lambda tau: self.K**2 / 3.0 * (tau + 0.5 * tau0_s**2 / tau),
             tau0_s,
         )
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_RandomWalk":
-        """Return a random walk that starts at zero."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_RandomWalk":
+        """Start a random walk at zero."""
         return _RandomWalk(self.K / rate_hz**0.5, rng)
 
 
@@ -45,15 +44,13 @@ class _RandomWalk(NoiseSeries):
         self._step, self._rng = step, rng
         self._level = 0.0
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         steps = self._rng.standard_normal(out=block.scratch)
         self._level = _add_random_walk(values, steps, self._step, self._level)
 
 
 @compiled
 def _add_random_walk(values: Floats, steps: Floats, step: float, level: float) -> float:
-    """Add the running sum of the steps to the values [n], and return the sum. The order of additions does not depend on
-    the blocks."""
     for k in range(values.size):
         level += step * steps[k]
         values[k] += level

@@ -8,40 +8,38 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter
-from monitor.noise.spectrum import Spectrum, allan_of_line
+from monitor.noise.effect import NoiseSeries, SampleBlockContext, Source, parameter_field
+from monitor.noise.spectrum import Spectrum, allan_variance_of_line
 
 RENEWAL_SAMPLES: Final = 64
-"""Samples after which the rotation that generates the sinusoid starts from an exact value, which limits the rounding
-error."""
+"""Number of samples after which the sinusoid is computed exactly, which limits the rounding error."""
 
 
 @dataclass(frozen=True, slots=True)
 class Sinusoidal(Source):
-    """Sinusoid A sin(2πft + φ) of IEEE Std 952 annex C.
+    """Sinusoid A sin(2πft + φ) (IEEE Std 952 annex C).
 
-    The Allan variance of the samples is σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)) with m = τ/τ0. The textbook form A²
-    sin⁴(πfτ)/(πfτ)² is the limit for τ0 → 0. The spectrum consists of two lines with the mean square A²/4 at ±f and has
-    no density. If no phase is given, the phase is drawn at random from the seed.
+    The Allan variance is σ²(τ) = A² sin⁴(πfτ)/(m² sin²(πfτ0)) with m = τ/τ0. The spectrum consists of two lines of mean
+    square A²/4 at ±f. If no phase is given, the phase is random.
 
     >>> line = Sinusoidal(amplitude=1.0, frequency=25.0)
     >>> [round(float(x), 6) for x in line.avar(np.array([0.01, 0.02, 0.04]), 0.01)]
     [0.5, 0.5, 0.0]
     """
 
-    amplitude: float = parameter("rad/s", "m/s²")
-    frequency: float = parameter("Hz", positive=True, below_nyquist=True)
-    phase: float | None = parameter("rad", signed=True, optional=True)
+    amplitude: float = parameter_field("rad/s", "m/s²")
+    frequency: float = parameter_field("Hz", positive=True, below_nyquist=True)
+    phase: float | None = parameter_field("rad", signed=True, optional=True)
 
     description: ClassVar[str] = "A steady oscillation adds a line to the spectrum and waves to the Allan deviation."
 
     def spectrum(self, tau0_s: float) -> Spectrum:
-        """Return a spectrum that has only one line, because a line has power but no density."""
+        """Return a spectrum with one line and no density."""
         line = self.frequency, 0.5 * self.amplitude**2
-        return Spectrum(np.zeros_like, lambda tau: allan_of_line(*line, tau, tau0_s), tau0_s, lines=(line,))
+        return Spectrum(np.zeros_like, lambda tau: allan_variance_of_line(*line, tau, tau0_s), tau0_s, lines=(line,))
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_Sinusoid":
-        """Return a sinusoid whose time counts from the first sample of the stream."""
+    def start_series(self, rate_hz: float, rng: np.random.Generator) -> "_Sinusoid":
+        """Start a sinusoid. The time is relative to the first sample of the stream."""
         drawn = self.phase is None
         phase = float(rng.uniform(0.0, 2.0 * pi)) if self.phase is None else self.phase
         return _Sinusoid(self.amplitude, self.frequency / rate_hz, phase, drawn)
@@ -51,16 +49,16 @@ class _Sinusoid(NoiseSeries):
     def __init__(self, amplitude: float, step: float, phase: float, drawn: bool) -> None:
         self._amplitude, self._step, self._phase, self._drawn = amplitude, step, phase, drawn
 
-    def add(self, values: Floats, block: SampleBlockContext) -> None:
+    def add_next_samples(self, values: Floats, block: SampleBlockContext) -> None:
         _add_sinusoid(values, block.first, self._amplitude, self._step, self._phase)
 
-    def drawn_values(self) -> dict[str, Any]:
+    def drawn_random_values(self) -> dict[str, Any]:
         return {"phase": self._phase} if self._drawn else {}
 
 
 @compiled
 def _add_sinusoid(values: Floats, first: int, amplitude: float, step: float, phase: float) -> None:
-    """Add A sin(2π·step·k + phase) for k = first, …, with ``step`` in cycles per sample."""
+    """Add A sin(2π·step·k + phase) for k ≥ first. ``step`` is in cycles per sample."""
     c, s = cos(2.0 * pi * step), sin(2.0 * pi * step)
     k = first - first % RENEWAL_SAMPLES
     while k < first + values.size:

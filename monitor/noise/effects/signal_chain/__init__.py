@@ -1,1 +1,1 @@
-"""Effects of the sensor's signal chain, which act on the finished signal."""
+"""Effects of the signal chain of the sensor, such as filters and rounding."""

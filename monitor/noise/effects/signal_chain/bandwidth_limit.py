@@ -7,16 +7,16 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import RunningTransform, Transform, parameter
+from monitor.noise.effect import RunningTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class BandwidthLimit(Transform):
-    """Butterworth low-pass, digital by the bilinear transform: |H|² = 1/(1 + (tan(πfτ0)/tan(πf_cτ0))^(2n)).
+    """Digital Butterworth low-pass filter of order n (Butterworth, "On the theory of filter amplifiers", 1930).
 
-    Butterworth, "On the theory of filter amplifiers", 1930. The Allan variance after the filter is an integral over the
-    spectrum. The filter starts in the steady state for the first sample, so that gravity causes no transient.
+    The power response is |H|² = 1/(1 + (tan(πfτ0)/tan(πf_cτ0))^(2n)). The filter starts in the steady state of the
+    first sample, so gravity causes no transient.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> filtered = BandwidthLimit(cutoff=10.0, order=2).transform_spectrum(white_noise_spectrum(1.0, 0.01))
@@ -24,41 +24,40 @@ class BandwidthLimit(Transform):
     0.005
     """
 
-    cutoff: float = parameter("Hz", positive=True, below_nyquist=True)
-    order: int = parameter("1", positive=True, whole=True, most=8)
+    cutoff: float = parameter_field("Hz", positive=True, below_nyquist=True)
+    order: int = parameter_field("1", positive=True, whole_number=True, maximum=8)
 
     description: ClassVar[str] = "The low-pass filter of the sensor attenuates fast motion and high-frequency noise."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum times |H|²."""
+        """Return the spectrum after the filter."""
         tau0_s = spectrum.tau0_s
         corner = np.tan(np.pi * self.cutoff * tau0_s)
 
-        def gain(f_hz: Floats) -> Floats:
-            # At half the sample rate the tangent is 1e16. Its power overflows to infinity, and the gain is zero.
+        def squared_response(f_hz: Floats) -> Floats:
+            # At half the sample rate, the power of the tangent overflows to infinity, and the response is zero.
             with np.errstate(over="ignore"):
                 return np.asarray(1.0 / (1.0 + (np.tan(np.pi * f_hz * tau0_s) / corner) ** (2 * int(self.order))))
 
-        return spectrum.filtered(gain)
+        return spectrum.filtered_by(squared_response)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
-        """Return the filter. The first sample sets the state of the filter, so there is no transient."""
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> "_LowPass":
+        """Start the filter in the steady state of the first sample."""
         return _LowPass(butterworth_sections(int(self.order), self.cutoff, rate_hz))
 
 
 def butterworth_sections(order: int, cutoff_hz: float, rate_hz: float) -> Floats:
-    """Return the second-order sections of a digital Butterworth low-pass with unit gain at f = 0.
+    """Return the second-order sections of a digital Butterworth low-pass filter with unit gain at f = 0.
 
-    In the s plane, the poles lie on a circle at angles θ from the negative real axis. Each pair of poles gives a
-    section of s² + 2 cos θ s + 1. A filter of odd order has one more section, s + 1. The bilinear transform sets s = (1
-    − z⁻¹)/(1 + z⁻¹) / tan(πf_c/f_s).
+    Each pair of poles at angles ±θ from the negative real axis gives a section s² + 2 cos θ s + 1. A filter of odd
+    order has an additional section s + 1. The bilinear transform is s = (1 − z⁻¹)/(1 + z⁻¹) / tan(πf_c/f_s).
 
     Parameters
     ----------
     order : int
         Order of the filter.
     cutoff_hz : float
-        Frequency of half power, Hz.
+        Cutoff frequency (half power), Hz.
     rate_hz : float
         Sample rate, Hz.
 
@@ -87,7 +86,7 @@ class _LowPass(RunningTransform):
         self._sections = sections
         self._state: Floats | None = None
 
-    def apply(self, values: Floats) -> None:
+    def transform_in_place(self, values: Floats) -> None:
         if self._state is None:
             b0, _, b2, _, a2 = self._sections.T
             self._state = np.stack([1.0 - b0, b2 - a2], axis=1) * values[0]
@@ -98,7 +97,7 @@ class _LowPass(RunningTransform):
 
 @compiled
 def _filter_sections(values: Floats, sections: Floats, state: Floats) -> None:
-    """Filter values [n] in place, in direct form II transposed. The state [sections, 2] continues in the next call."""
+    """Filter values [n] in place (direct form II transposed). The state [sections, 2] is updated."""
     for i in range(sections.shape[0]):
         b0, b1, b2, a1, a2 = sections[i]
         one, two = state[i]

@@ -7,50 +7,49 @@ import numpy as np
 
 from drivers.data_types import Floats
 from monitor.common.compiled import compiled
-from monitor.noise.effect import RunningTransform, Transform, parameter
+from monitor.noise.effect import RunningTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class RandomSampleHold(Transform):
-    """Random repetition of samples. With probability h, a sample repeats the previous output.
+    """Random repetition of samples. Each sample repeats the previous output with probability h.
 
-    The age of an output value has a geometric distribution. On average, the output equals the input after the filter G
-    = (1 − h)/(1 − h/z). The remainder is noise whose correlation decays as hⁿ. The output spectrum is S_out(f) = |G|² S
-    + V τ0 (1 − h²)/|1 − h/z|², where V is the mean square of (1 − |G|²) S. This formula is exact for any input with
-    stationary increments. The Allan variance is an integral over this spectrum.
+    On average, the output equals the input after the filter G = (1 − h)/(1 − h/z). The remainder is noise with a
+    correlation that decays as hⁿ. The power spectral density is S_out(f) = |G|² S + V τ0 (1 − h²)/|1 − h/z|², where V
+    is the mean square of (1 − |G|²) S. The formula is exact for all inputs with stationary increments.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> held = RandomSampleHold(fraction=0.5).transform_spectrum(white_noise_spectrum(1.0, 0.01))
-    >>> print(f"{held.avar(np.array([0.01]))[0]:.3f}")  # r(0) − r(1) of white_noise_spectrum noise held: 1 − h
+    >>> print(f"{held.avar(np.array([0.01]))[0]:.3f}")  # 1 − h for white noise
     0.500
     """
 
-    fraction: float = parameter("1", most=0.999)
+    fraction: float = parameter_field("1", maximum=0.999)
 
     description: ClassVar[str] = "Some samples repeat the previous value."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum by the formula of the class docstring."""
+        """Return the spectrum after the repetition of samples."""
         h, tau0_s = self.fraction, spectrum.tau0_s
 
-        def squared(f_hz: Floats) -> Floats:
+        def squared_denominator(f_hz: Floats) -> Floats:
             return np.asarray((1.0 - h) ** 2 + 4.0 * h * np.sin(np.pi * f_hz * tau0_s) ** 2)  # |1 − h/z|²
 
-        def gain(f_hz: Floats) -> Floats:
-            return (1.0 - h) ** 2 / squared(f_hz)
+        def squared_response(f_hz: Floats) -> Floats:
+            return (1.0 - h) ** 2 / squared_denominator(f_hz)
 
         lowest = 1e-7 / tau0_s
-        # 4h sin²(πfτ0)/|1 − h/z|² equals 1 − |G|², without cancellation at low frequencies.
+        # 1 − |G|² = 4h sin²(πfτ0)/|1 − h/z|² avoids cancellation at low frequencies.
         lost = (
-            spectrum.mean_square(lowest, lambda f: 4.0 * h * np.sin(np.pi * f * tau0_s) ** 2 / squared(f))
+            spectrum.mean_square(lowest, lambda f: 4.0 * h * np.sin(np.pi * f * tau0_s) ** 2 / squared_denominator(f))
             + spectrum.slope**2 * tau0_s**2 * h / (1.0 - h) ** 2
         )
-        rest = Spectrum(lambda f: lost * tau0_s * (1.0 - h**2) / squared(f), None, tau0_s)
-        return spectrum.filtered(gain, around=((0.0, (1.0 - h) / (2.0 * np.pi * tau0_s)),)) + rest
+        rest = Spectrum(lambda f: lost * tau0_s * (1.0 - h**2) / squared_denominator(f), None, tau0_s)
+        return spectrum.filtered_by(squared_response, narrow_peaks=((0.0, (1.0 - h) / (2.0 * np.pi * tau0_s)),)) + rest
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> "_RepeatedSamples":
-        """Return a transform that never repeats a sample from before its first call."""
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> "_RepeatedSamples":
+        """Start the repetition of samples. The first sample is never a repetition."""
         return _RepeatedSamples(self.fraction, rng)
 
 
@@ -61,18 +60,18 @@ class _RepeatedSamples(RunningTransform):
         self._last = np.nan
         self._repeat_count = 0
 
-    def apply(self, values: Floats) -> None:
+    def transform_in_place(self, values: Floats) -> None:
         tosses = self._rng.random(values.size)
         self._last, held = _repeat_samples(values, tosses, self._fraction, self._last)
         self._repeat_count += held
 
-    def drawn_values(self) -> dict[str, Any]:
+    def drawn_random_values(self) -> dict[str, Any]:
         return {"count": self._repeat_count}
 
 
 @compiled
 def _repeat_samples(values: Floats, tosses: Floats, fraction: float, last: float) -> tuple[float, int]:
-    """Repeat samples in place at random, and return the last value and the number of repeated samples."""
+    """Repeat samples at random in place, and return the last value and the number of repeated samples."""
     held = 0
     for k in range(values.size):
         if tosses[k] < fraction and not np.isnan(last):

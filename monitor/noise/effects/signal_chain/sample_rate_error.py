@@ -1,4 +1,4 @@
-"""Error of the stated sample rate of a recording."""
+"""Error of the stated sample rate."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -6,36 +6,35 @@ from typing import ClassVar
 import numpy as np
 
 from drivers.number_ranges import RATE_RATIO
-from monitor.noise.effect import MemorylessTransform, Transform, parameter
+from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
 from monitor.noise.spectrum import Spectrum
 
 
 @dataclass(frozen=True, slots=True)
 class SampleRateError(Transform):
-    """Ratio r of the true sample rate to the sample rate that the recording states.
+    """Ratio r of the true sample rate to the stated sample rate.
 
-    At the stated rate, the Allan variance becomes σ²(τ/r), and the spectrum becomes r·S(rf). All axes are simulated at
-    the true rate, so only the times of the samples are wrong. The effect applies to all axes, even if a model lists the
-    effect on one axis only. If a model lists the effect twice, the ratios must be equal.
+    With the stated rate, the Allan variance becomes σ²(τ/r), and the power spectral density becomes r·S(rf). The effect
+    applies to all axes, even if the model contains the effect on one axis only.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
-    >>> stated = SampleRateError(ratio=2.0).restate_spectrum(white_noise_spectrum(1.0, 0.005))
+    >>> stated = SampleRateError(ratio=2.0).convert_to_stated_rate(white_noise_spectrum(1.0, 0.005))
     >>> stated.tau0_s, float(stated.avar(np.array([0.01]))[0])
     (0.01, 1.0)
     """
 
-    ratio: float = parameter("1", positive=True, quantity=RATE_RATIO)
+    ratio: float = parameter_field("1", positive=True, number_range=RATE_RATIO)
 
     description: ClassVar[str] = (
         "The true sample rate differs from the stated rate, which scales all times and frequencies."
     )
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum unchanged; ``restate_spectrum`` converts its time scale after all transforms."""
+        """Return the spectrum unchanged, because ``convert_to_stated_rate`` is applied after all transforms."""
         return spectrum
 
-    def restate_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum of samples at the true rate, converted to the time scale that the recording states."""
+    def convert_to_stated_rate(self, spectrum: Spectrum) -> Spectrum:
+        """Convert a spectrum at the true sample rate to the stated sample rate."""
         r, closed = self.ratio, spectrum.closed_form_avar
         return Spectrum(
             lambda f: r * spectrum.density(r * f),
@@ -47,6 +46,6 @@ class SampleRateError(Transform):
             tuple((f / r, width / r) for f, width in spectrum.peaks),
         )
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
-        """Return a transform that does nothing."""
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
+        """Start a transform that does not change the samples."""
         return MemorylessTransform(lambda values: None)

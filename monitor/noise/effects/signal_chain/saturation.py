@@ -1,4 +1,4 @@
-"""Saturation at the end of the range."""
+"""Saturation at the limits of the measurement range."""
 
 from dataclasses import dataclass
 from typing import ClassVar, Final
@@ -6,22 +6,21 @@ from typing import ClassVar, Final
 import numpy as np
 
 from drivers.number_ranges import HOUR_S
-from monitor.noise.effect import MemorylessTransform, Transform, parameter
-from monitor.noise.spectrum import Spectrum, undefined_spectrum
+from monitor.noise.effect import MemorylessTransform, Transform, parameter_field
+from monitor.noise.spectrum import Spectrum, nan_spectrum
 
 OBSERVATION_S: Final = float(HOUR_S)
-"""Time in seconds over which noise and slope must stay within the range."""
+"""Time in seconds for which a signal must stay within the range to be unaffected."""
 NOISE_SIGMAS: Final = 6.0
-"""Standard deviations of the noise that must stay within the range."""
+"""Number of standard deviations of the noise that must be within the range."""
 
 
 @dataclass(frozen=True, slots=True)
 class Saturation(Transform):
-    """Clipping of the measurement at ± limit.
+    """Clipping of the measurement at ±``limit``.
 
-    The range must contain the bias, all sinusoids, the slope, and six standard deviations of the noise during one hour.
-    In this case, nothing is clipped, and spectrum and Allan variance do not change. Otherwise, no closed form is known,
-    and spectrum and Allan variance are NaN.
+    The spectrum does not change if the range contains the signal for one hour. The signal consists of the bias, all
+    sinusoids, the slope and six standard deviations of the noise. Otherwise, the spectrum is NaN.
 
     >>> from monitor.noise.spectrum import white_noise_spectrum
     >>> clipped = [Saturation(limit=x).transform_spectrum(white_noise_spectrum(1.0, 0.01)) for x in (10.0, 1.0)]
@@ -29,17 +28,17 @@ class Saturation(Transform):
     [0.01, nan]
     """
 
-    limit: float = parameter("rad/s", "m/s²", positive=True)
+    limit: float = parameter_field("rad/s", "m/s²", positive=True)
 
     description: ClassVar[str] = "Values beyond the measurement range are replaced by the end of the range."
 
     def transform_spectrum(self, spectrum: Spectrum) -> Spectrum:
-        """Return the spectrum unchanged if the series stays within the range for an hour, else NaN."""
+        """Return the spectrum unchanged if the signal stays within the range for one hour, otherwise NaN."""
         steady = abs(spectrum.level) + sum((2.0 * size) ** 0.5 for _, size in spectrum.lines)
         steady += spectrum.slope * OBSERVATION_S
         noise = spectrum.without_lines().mean_square(1.0 / max(OBSERVATION_S, 4.0 * spectrum.tau0_s)) ** 0.5
-        return spectrum if steady + NOISE_SIGMAS * noise < self.limit else undefined_spectrum(spectrum.tau0_s)
+        return spectrum if steady + NOISE_SIGMAS * noise < self.limit else nan_spectrum(spectrum.tau0_s)
 
-    def start(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
-        """Return a clipping transform."""
+    def start_transform(self, rate_hz: float, rng: np.random.Generator) -> MemorylessTransform:
+        """Start a clipping transform."""
         return MemorylessTransform(lambda values: np.clip(values, -self.limit, self.limit, out=values))

@@ -57,7 +57,7 @@ class Asked:
 
 def job(device: str = "bench-1", model: Path | None = None, folder: Path | None = None, warm: bool = True) -> Job:
     estimator = Estimator(100.0, N / 100.0)
-    estimator.update(make_block(np.arange(N) * 10_000_000, VALUES.copy()))
+    estimator.add_samples(make_block(np.arange(N) * 10_000_000, VALUES.copy()))
     temperature_c = WARM if warm else np.full(N, np.nan)
     return Job(device, 1_763_700_000.0, 360_000, estimator.copy_window(), temperature_c, model, folder)
 

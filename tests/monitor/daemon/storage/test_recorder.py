@@ -335,12 +335,12 @@ def test_the_window_after_a_restart_is_the_one_before(tmp_path: Path) -> None:
     assert not after._can_take()  # new samples wait
     after.rebuild_window()
     assert after._can_take()
-    old, new = before.pipeline.estimator.get(), after.pipeline.estimator.get()
+    old, new = before.pipeline.estimator.get_estimate(), after.pipeline.estimator.get_estimate()
     assert new.curve.n == old.curve.n == 3000
     np.testing.assert_array_equal(new.curve.terms, old.curve.terms)
     np.testing.assert_allclose(new.curve.avar, old.curve.avar, rtol=1e-9)
     for _ in range(10):  # the live fit takes a step each look
-        old = before.pipeline.estimator.get()
+        old = before.pipeline.estimator.get_estimate()
     np.testing.assert_allclose(new.coefficients.value, old.coefficients.value, rtol=1e-9)
     # bounds are sought to seven digits
     np.testing.assert_allclose(new.coefficients.hi, old.coefficients.hi, rtol=1e-6)
@@ -360,7 +360,7 @@ def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path:
         before._push(rows(first, 50, start_ns=mono_ns - 6000 * 10_000_000))
         before.process_new_samples(first / 100.0)
         if first == 5000:
-            before.pipeline.estimator.restart(2, 1000)
+            before.pipeline.estimator.restart_axis(2, 1000)
             before.pipeline.since_ns[2] = before.timeline._newest_ns - 9_995_000_000
             before.slew_and_publish_status({}, 0)
             all_written(keeper)
@@ -369,7 +369,7 @@ def test_an_axis_that_began_anew_counts_from_there_after_a_restart_too(tmp_path:
     after = station(tmp_path, Recorder(Storage(folder=tmp_path), [segment_metadata("bench", AxisMap())]))
     after.restore.resume_from(after._recorder.find_recording_tail("bench"))
     after.rebuild_window()
-    old, new = before.pipeline.estimator.get(), after.pipeline.estimator.get()
+    old, new = before.pipeline.estimator.get_estimate(), after.pipeline.estimator.get_estimate()
     assert old.curve.terms[0, 2] < old.curve.terms[0, 0]
     np.testing.assert_array_equal(new.curve.terms, old.curve.terms)
     np.testing.assert_allclose(new.curve.avar, old.curve.avar, rtol=1e-9)
@@ -395,7 +395,9 @@ def test_what_came_while_nobody_was_there_is_lost_and_keeps_its_place(tmp_path: 
             assert counts.lost == 40
         else:
             assert counts.lost <= RATE * (time.monotonic() - begun_s)
-        wait_for(lambda: after.process_new_samples(time.monotonic()) or after.pipeline.estimator.samples >= 6059)
+        wait_for(
+            lambda: after.process_new_samples(time.monotonic()) or after.pipeline.estimator.samples_received >= 6059
+        )
         assert after.pipeline.estimator.samples_in_window == 3000
     finally:
         after.stop()

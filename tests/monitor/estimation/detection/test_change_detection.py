@@ -8,7 +8,7 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from monitor.estimation.detection.change_detection import LEARN_S, ChangeDetector
 from monitor.estimation.detection.change_kernel import TICK_SAMPLES, F, N, S
-from monitor.estimation.detection.changed_coefficients import HaarVariancesBeforeAfter, identify_noise_change
+from monitor.estimation.detection.changed_coefficients import HaarVariancesBeforeAfter, identify_changed_coefficients
 from monitor.noise.effects.ieee952.angle_random_walk import AngleRandomWalk
 from monitor.noise.effects.ieee952.bias_instability import BiasInstability
 from monitor.noise.effects.ieee952.quantization_noise import QuantizationNoise
@@ -26,8 +26,8 @@ def white(n, seed=0):
 
 def found(values, rate_hz=100.0, **options):
     detector = ChangeDetector(rate_hz, **options)
-    detector.update(values)
-    return detector.take()
+    detector.process_samples(values)
+    return detector.take_changes()
 
 
 def only(values, **options):
@@ -53,11 +53,11 @@ def eventful():
 def test_blocks_of_any_cut_equal_one_by_one(seed):
     values = eventful()
     whole, cut = ChangeDetector(100.0), ChangeDetector(100.0)
-    whole.update(values)
+    whole.process_samples(values)
     edges = np.unique(np.random.default_rng(seed).integers(0, len(values), 200))
     for part in np.split(values, edges):
-        cut.update(part)
-    one, other = whole.take(), cut.take()
+        cut.process_samples(part)
+    one, other = whole.take_changes(), cut.take_changes()
     assert {change.kind for change in one} == {"noise_changed", "bias_stepped", "outlier_burst"}
     assert one == other
     for a, b in zip(whole._state, cut._state, strict=True):
@@ -67,17 +67,17 @@ def test_blocks_of_any_cut_equal_one_by_one(seed):
 def test_one_by_one_equals_the_block():
     values = eventful()[:13_000]
     whole, single = ChangeDetector(100.0), ChangeDetector(100.0)
-    whole.update(values)
+    whole.process_samples(values)
     for row in values:
-        single.update(row[None])
-    assert whole.take() == single.take()
+        single.process_samples(row[None])
+    assert whole.take_changes() == single.take_changes()
     assert np.array_equal(whole._state.cusum, single._state.cusum)
 
 
 def test_the_reference_is_the_allan_variance_of_disjoint_pairs():
     values = white(1 << 16)
     detector = ChangeDetector(100.0)
-    detector.update(values)
+    detector.process_samples(values)
     band = detector._state.band
     for j in (0, 3, 4, 5, 8):
         means = values[:, GZ].reshape(-1, 1 << j).mean(1)
@@ -91,7 +91,7 @@ def test_a_missing_sample_costs_its_own_differences_only():
     values = white(4096)
     values[1000, GZ] = np.nan
     detector = ChangeDetector(100.0)
-    detector.update(values)
+    detector.process_samples(values)
     terms = detector._state.band[GZ, :9, N]
     pairs = 4096 // (2 << np.arange(9))
     short = 2 ** np.arange(9) < TICK_SAMPLES
@@ -104,11 +104,11 @@ def test_a_missing_sample_costs_its_own_differences_only():
 def test_skipped_samples_are_missing_samples():
     values = white(12_000)
     one, other = ChangeDetector(100.0), ChangeDetector(100.0)
-    one.update(values[:5000])
-    one.skip(700)
-    one.update(values[5000:])
-    other.update(np.concatenate([values[:5000], np.full((700, 6), np.nan), values[5000:]]))
-    assert one.samples == other.samples == 12_700
+    one.process_samples(values[:5000])
+    one.skip_missing_samples(700)
+    one.process_samples(values[5000:])
+    other.process_samples(np.concatenate([values[:5000], np.full((700, 6), np.nan), values[5000:]]))
+    assert one.samples_since_start == other.samples_since_start == 12_700
     assert np.array_equal(one._state.cum, other._state.cum)
 
 
@@ -146,8 +146,8 @@ def test_a_steady_resonance_has_fewer_degrees_of_freedom():
     values = white(200_000)
     values[:, GZ] += 3.0 * SIGMA * lfilter([0.2], [1.0, -1.2, 0.98], rng.standard_normal(200_000))
     detector = ChangeDetector(100.0)
-    detector.update(values)
-    assert detector.take() == []
+    detector.process_samples(values)
+    assert detector.take_changes() == []
     assert detector._state.band[GZ, 1, F] > 3.0
 
 
@@ -222,8 +222,8 @@ def test_a_burst_is_told_once_and_forgotten():
     at = 20_000 + np.random.default_rng(1).choice(300, 20, replace=False)
     values[at, GZ] += 0.05 * np.random.default_rng(3).standard_normal(20)
     detector = ChangeDetector(100.0)
-    detector.update(values)
-    (change,) = detector.take()
+    detector.process_samples(values)
+    (change,) = detector.take_changes()
     assert (change.kind, AXES[change.axis]) == ("outlier_burst", "gz")
     assert 8 <= change.what["count"][1] <= 20
     assert change.what["scale"][1] == pytest.approx(0.05, rel=0.5)
@@ -290,19 +290,19 @@ MIX = {"Q": 2e-6, "N": 1.5e-4, "B": 4e-5, "K": 1.5e-6}
 
 @pytest.mark.parametrize(("letter", "factor"), [("N", 1.5), ("N", 0.7), ("Q", 10.0), ("B", 10.0), ("K", 100.0)])
 def test_exact_variances_name_the_letter_that_changed(letter, factor):
-    what = identify_noise_change(octaves(MIX, MIX | {letter: factor * MIX[letter]}), 100.0)
+    what = identify_changed_coefficients(octaves(MIX, MIX | {letter: factor * MIX[letter]}), 100.0)
     assert list(what) == [letter]
     assert what[letter][1] == pytest.approx(factor * MIX[letter], rel=0.05)
 
 
 def test_two_letters():
-    what = identify_noise_change(octaves(MIX, MIX | {"Q": 2e-5, "N": 3e-4}, terms=100_000.0), 100.0)
+    what = identify_changed_coefficients(octaves(MIX, MIX | {"Q": 2e-5, "N": 3e-4}, terms=100_000.0), 100.0)
     assert list(what) == ["Q", "N"]
 
 
 def test_nothing_known_names_nothing():
     none = np.zeros(12)
-    assert identify_noise_change(HaarVariancesBeforeAfter(none, none, none, none), 100.0) == {}
+    assert identify_changed_coefficients(HaarVariancesBeforeAfter(none, none, none, none), 100.0) == {}
 
 
 # --- learning and refusing
@@ -310,15 +310,15 @@ def test_nothing_known_names_nothing():
 
 def test_learned_after_its_time():
     detector = ChangeDetector(100.0)
-    detector.update(white(int(LEARN_S * 100) - TICK_SAMPLES))
-    assert not detector.watched_octaves[0].any()
-    detector.update(white(4 * TICK_SAMPLES))
-    assert detector.watched_octaves[0].all()
-    assert detector.watched_octaves[:, 0].sum() >= 6
-    detector.restart(GZ)
-    assert detector.watched_octaves[0].tolist() == [True, True, False, True, True, True]
-    detector.restart()
-    assert not detector.watched_octaves[0].any()
+    detector.process_samples(white(int(LEARN_S * 100) - TICK_SAMPLES))
+    assert not detector.octaves_ready_for_alarm[0].any()
+    detector.process_samples(white(4 * TICK_SAMPLES))
+    assert detector.octaves_ready_for_alarm[0].all()
+    assert detector.octaves_ready_for_alarm[:, 0].sum() >= 6
+    detector.restart_references(GZ)
+    assert detector.octaves_ready_for_alarm[0].tolist() == [True, True, False, True, True, True]
+    detector.restart_references()
+    assert not detector.octaves_ready_for_alarm[0].any()
 
 
 @pytest.mark.parametrize(("rate", "alarms"), [(0.0, 1.0), (float("nan"), 1.0), (100.0, 0.0), (100.0, -1.0)])
@@ -329,7 +329,7 @@ def test_impossible_arguments(rate, alarms):
 
 def test_samples_of_another_shape():
     with pytest.raises(ValueError, match="expected is"):
-        ChangeDetector(100.0).update(np.zeros((3, 5)))
+        ChangeDetector(100.0).process_samples(np.zeros((3, 5)))
 
 
 @pytest.mark.parametrize(("rate_hz", "alarms_per_day"), [(1e6, 1e-6), (1e-3, 1e4), (1e9, 1e-6)])

@@ -13,9 +13,9 @@ from monitor.estimation.detection.line_and_outlier_detection import (
     MIN_LINE_SHARE,
     MIN_STRETCHES,
     ROWS,
-    detect_lines,
-    line_share,
-    outlier_share,
+    allan_variance_share_of_line,
+    detect_spectral_lines,
+    outlier_share_of_axes,
 )
 
 RATE_HZ = 100.0
@@ -35,11 +35,13 @@ def curve_of(values):
 
 
 def found(values, moving=None):
-    return detect_lines(values, np.zeros(len(values), bool) if moving is None else moving, RATE_HZ, curve_of(values))
+    return detect_spectral_lines(
+        values, np.zeros(len(values), bool) if moving is None else moving, RATE_HZ, curve_of(values)
+    )
 
 
 def shares(values, moving=None):
-    return outlier_share(values, np.zeros(len(values), bool) if moving is None else moving)
+    return outlier_share_of_axes(values, np.zeros(len(values), bool) if moving is None else moving)
 
 
 def with_line(n, amplitude, hz, seed=0):
@@ -99,7 +101,7 @@ def test_what_adds_less_than_matters_is_not_told():
     assert len(line_detection._peaks(line_detection._spectrum(np.stack(parts)), len(parts))) == 1
     quiet = curve_of(strong)
     quiet.avar[:] *= 2.0 * line.share / MIN_LINE_SHARE
-    assert detect_lines(strong, np.zeros(600_000, bool), RATE_HZ, quiet) == []
+    assert detect_spectral_lines(strong, np.zeros(600_000, bool), RATE_HZ, quiet) == []
 
 
 def test_the_strongest_of_an_axis_come_first_and_no_more_than_three():
@@ -230,7 +232,7 @@ def test_what_a_line_adds_at_each_averaging_time(hz):
     without, values = curve_of(white(60_000)), with_line(60_000, 5e-4, hz)
     [line] = found(values)
     more = 1.0 - without.avar[:, 1] / curve_of(values).avar[:, 1]
-    told = line_share(line, curve_of(values))
+    told = allan_variance_share_of_line(line, curve_of(values))
     assert told[:9] == pytest.approx(more[:9], abs=0.03)
     assert told.max() == pytest.approx(line.share)
 
@@ -256,7 +258,7 @@ def test_next_to_no_samples_are_no_error(n):
     values = np.ones((n, 6))
     nothing = np.full((1, 6), np.nan)
     curve = AllanCurve(np.ones(1), np.ones(1, np.int64), nothing, nothing, nothing, nothing, nothing, n)
-    assert detect_lines(values, np.zeros(n, bool), RATE_HZ, curve) == []
+    assert detect_spectral_lines(values, np.zeros(n, bool), RATE_HZ, curve) == []
     assert shares(values).shape == (6,)
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import AXES, make_block
-from monitor.estimation.detection.motion_detection import BLOCK_S, MotionDetector, block_size, detect_motion
+from monitor.estimation.detection.motion_detection import BLOCK_S, MotionDetector, detect_motion, samples_per_block
 from monitor.estimation.detection.motion_kernel import REFERENCE_BLOCKS, REMOVED_AFTER
 from tests.support.recordings import recordings
 
@@ -41,7 +41,7 @@ def stream(values, edges, lost_before=None, rate=RATE):
         out += came
         given, taken = given + b - a, taken + sum(len(one) for one in came)
         most = max(most, given - taken)
-    out += rest.flush()
+    out += rest.flush_delayed_samples()
     return np.concatenate([one.values for one in out]), np.concatenate([one.t_ns for one in out]), rest, most
 
 
@@ -78,14 +78,14 @@ def test_any_cut_gives_the_same(cut):
     out, t, rest, _ = stream(values, list(edges))
     assert np.array_equal(out, np.where(mask[:, None], np.nan, values), equal_nan=True)
     assert np.array_equal(t, np.arange(4000))
-    assert rest.take() == motions
-    assert rest.take() == []
-    assert (rest.episodes, rest.moved_samples) == (2, mask.sum())
+    assert rest.take_motions() == motions
+    assert rest.take_motions() == []
+    assert (rest.episodes, rest.samples_in_motion) == (2, mask.sum())
 
 
 def test_samples_are_held_back_for_two_blocks():
     *_, most = stream(still(20), list(range(2001)))
-    assert most == 2 * block_size(RATE)
+    assert most == 2 * samples_per_block(RATE)
 
 
 def test_missing_samples_keep_their_places():
@@ -96,8 +96,8 @@ def test_missing_samples_keep_their_places():
     rest = MotionDetector(RATE)
     for a, b in pairwise(edges):
         rest.advance_and_take_decided(make_block(np.arange(a, b), kept[a:b].copy(), lost=260 if a == 1000 else 0))
-    rest.flush()
-    (found,) = rest.take()
+    rest.flush_delayed_samples()
+    (found,) = rest.take_motions()
     assert (found.kind, found.since, found.until) == (motion.kind, motion.since, motion.until)
 
 
@@ -105,8 +105,8 @@ def test_a_very_long_pause_is_no_work():
     rest = MotionDetector(RATE)
     rest.advance_and_take_decided(make_block(np.arange(2000), still(20)))
     rest.advance_and_take_decided(make_block(np.arange(2000), still(20, seed=1), lost=10**12))
-    rest.flush()
-    assert rest.take() == []
+    rest.flush_delayed_samples()
+    assert rest.take_motions() == []
 
 
 def test_moving_is_shown_while_it_lasts():
@@ -115,12 +115,12 @@ def test_moving_is_shown_while_it_lasts():
     shown = []
     for a in range(0, 3000, 10):
         rest.advance_and_take_decided(make_block(np.arange(a, a + 10), values[a : a + 10].copy()))
-        shown.append(rest.moving)
+        shown.append(rest.is_moving)
     seconds = np.flatnonzero(shown) / 10.0
     assert 20.0 < seconds[0] < 20.6
     assert 23.0 < seconds[-1] < 25.0
-    rest.flush()
-    assert not rest.moving
+    rest.flush_delayed_samples()
+    assert not rest.is_moving
 
 
 def test_a_knock_rings_and_an_outlier_does_not():
@@ -132,7 +132,7 @@ def test_a_knock_rings_and_an_outlier_does_not():
     assert (knock.kind, knock.axis) == ("knock", "az")
     assert knock.since <= 4000 < knock.until
     assert knock.text == "knocked: az up to 410 mg"
-    assert mask.sum() <= (2 + 1 + REMOVED_AFTER) * block_size(RATE)
+    assert mask.sum() <= (2 + 1 + REMOVED_AFTER) * samples_per_block(RATE)
 
 
 def test_another_orientation_is_handling_and_rest_soon_after():

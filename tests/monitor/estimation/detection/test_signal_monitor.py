@@ -21,7 +21,7 @@ def feed(watch, values, size=250, lost=0):
     for at in range(0, len(values), size):
         part = values[at : at + size]
         t_ns = FIRST_NS + STEP_NS * (np.arange(at, at + len(part)) + lost)
-        out += watch.update(make_block(t_ns, part, lost=lost if at == 0 else 0))
+        out += watch.process_samples(make_block(t_ns, part, lost=lost if at == 0 else 0))
     return out
 
 
@@ -40,11 +40,11 @@ def test_louder_noise_is_an_event_with_its_time_and_a_restart_with_its_samples(l
     assert event.values["N"]["after"] / event.values["N"]["before"] == pytest.approx(2.0, rel=0.15)
     assert seconds(event.since_ns) == pytest.approx(300.0 + lost / RATE_HZ, abs=1.0)
     assert seconds(event.since_ns) < seconds(event.t_ns) < 310.0 + lost / RATE_HZ
-    (restart,) = watch.take_restarts()
+    (restart,) = watch.take_restart_requests()
     assert restart.axis == 1
     assert 100 < restart.samples < 1500  # as many as had come since when it was found
     assert not watch.take_events()
-    assert not watch.take_restarts()
+    assert not watch.take_restart_requests()
 
 
 @pytest.mark.parametrize("remove_motion", [False, True])
@@ -53,15 +53,15 @@ def test_motion_is_told_and_left_out_only_where_that_is_wanted(remove_motion):
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
     watch = SignalMonitor(RATE_HZ, remove_motion)
     passed = feed(watch, values)
-    assert not watch.moving
-    passed += watch.flush()
+    assert not watch.is_moving
+    passed += watch.flush_delayed_samples()
     out = np.concatenate([one.values for one in passed])
     assert len(out) == len(values)
     struck = np.isnan(out[:, 0])
     assert struck[8_000:8_300].all() if remove_motion else not struck.any()
     assert struck.sum() < 500
     assert np.array_equal(out[~struck], values[~struck])
-    assert watch.moved_samples == (struck.sum() if remove_motion else watch.moved_samples) > 300
+    assert watch.samples_in_motion == (struck.sum() if remove_motion else watch.samples_in_motion) > 300
     (event,) = watch.take_events()
     assert (event.kind, event.axis) == ("moved", "gx")
     assert seconds(event.since_ns) == pytest.approx(80.0, abs=0.6)
@@ -76,10 +76,10 @@ def test_what_is_at_rest_can_be_had_whatever_is_handed_on(remove_motion):
     feed(watch, values)
     still = np.concatenate([one.values for one in watch.take_samples_at_rest()])
     assert len(still) < len(values)  # the last are not judged yet
-    watch.flush()
+    watch.flush_delayed_samples()
     still = np.concatenate([still, *(one.values for one in watch.take_samples_at_rest())])
     struck = np.isnan(still[:, 0])
-    assert struck.sum() == watch.moved_samples > 300
+    assert struck.sum() == watch.samples_in_motion > 300
     assert np.array_equal(still[~struck], values[~struck])
     assert watch.take_samples_at_rest() == []
     assert watch.orientation_changes == 0
@@ -98,7 +98,7 @@ def test_being_left_in_another_orientation_is_counted():
     values[6_100:, 3:6] = noise(12_000, 1)[6_100:, 3:6] + [9.81, 0.0, 0.0]
     watch = SignalMonitor(RATE_HZ)
     feed(watch, values)
-    watch.flush()
+    watch.flush_delayed_samples()
     assert watch.orientation_changes == 1
 
 
@@ -108,7 +108,7 @@ def test_motion_is_no_change_of_noise():
     watch = SignalMonitor(RATE_HZ)
     feed(watch, values)
     assert {event.kind for event in watch.take_events()} == {"moved"}
-    assert not watch.take_restarts()
+    assert not watch.take_restart_requests()
 
 
 def test_who_wants_no_changes_looks_for_none():
@@ -124,13 +124,13 @@ def test_a_rate_that_is_another_begins_to_learn_anew_and_keeps_its_counts():
     values[8_000:8_300, 0] += 0.5 * np.sin(np.arange(300) / 15.0)
     watch = SignalMonitor(RATE_HZ)
     feed(watch, values)
-    moved = watch.moved_samples
+    moved = watch.samples_in_motion
     watch.set_rate(RATE_HZ * 1.001)
-    assert watch.moved_samples == moved > 0
+    assert watch.samples_in_motion == moved > 0
     watch.set_rate(RATE_HZ * 2.0)
-    assert watch.moved_samples == moved
+    assert watch.samples_in_motion == moved
     feed(watch, noise(1000, 5))
-    assert watch.moved_samples == moved
+    assert watch.samples_in_motion == moved
 
 
 @pytest.mark.parametrize("at", [2_600, 7_900, 9_050])
@@ -141,13 +141,13 @@ def test_at_another_rate_nothing_that_was_held_back_is_lost(at):
     watch, passed = SignalMonitor(RATE_HZ, remove_motion=True), []
     for first in range(0, len(values), 130):
         part = values[first : first + 130]
-        passed += watch.update(make_block(STEP_NS * np.arange(first, first + len(part)), part))
+        passed += watch.process_samples(make_block(STEP_NS * np.arange(first, first + len(part)), part))
         if first <= at < first + 130:
             watch.set_rate(1.05 * RATE_HZ)
-    passed += watch.flush()
+    passed += watch.flush_delayed_samples()
     assert np.array_equal(np.concatenate([one.t_ns for one in passed]), STEP_NS * np.arange(12_000))
     assert {event.kind for event in watch.take_events()} == {"moved"}
-    assert watch.moved_samples == np.isnan(np.concatenate([one.values for one in passed])[:, 0]).sum() > 150
+    assert watch.samples_in_motion == np.isnan(np.concatenate([one.values for one in passed])[:, 0]).sum() > 150
 
 
 @pytest.mark.parametrize("remove_motion", [False, True])
@@ -158,10 +158,10 @@ def test_after_an_outage_of_years_changes_are_learned_anew_with_their_times(remo
     watch = SignalMonitor(RATE_HZ, remove_motion)
     feed(watch, noise(5_000, 9))
     t_ns = FIRST_NS + STEP_NS * (5_000 + lost + np.arange(len(values)))
-    handed_on = watch.update(make_block(t_ns[:250], values[:250], lost=lost))
+    handed_on = watch.process_samples(make_block(t_ns[:250], values[:250], lost=lost))
     for at in range(250, len(values), 250):
-        handed_on += watch.update(make_block(t_ns[at : at + 250], values[at : at + 250]))
-        if restarts := watch.take_restarts():
+        handed_on += watch.process_samples(make_block(t_ns[at : at + 250], values[at : at + 250]))
+        if restarts := watch.take_restart_requests():
             break
     (event,) = watch.take_events()
     assert (event.kind, event.axis, restarts[0].axis) == ("noise_changed", "ax", 3)

@@ -116,7 +116,7 @@ def test_intervals_of_deviations_hold_the_truth():
 def test_errors_are_near_the_cramer_rao_limit():
     looked, _ = fits(MIX)
     f = np.arange(1, N // 2) * (RATE_HZ / N)
-    spectra = np.stack([source.psd(f, 1.0 / RATE_HZ) for source in MIX])
+    spectra = np.stack([source.two_sided_psd(f, 1.0 / RATE_HZ) for source in MIX])
     shares = spectra / spectra.sum(0)
     limit = 0.5 * np.sqrt(np.diag(np.linalg.inv(shares @ shares.T)))
     theta = np.concatenate([one.theta for one in looked], axis=1)[:4]

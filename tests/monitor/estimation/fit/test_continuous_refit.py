@@ -133,11 +133,11 @@ def test_a_term_on_the_verge_costs_no_fit_at_every_sample():
     estimator = Estimator(1.0, float(length), tuple(sizes.astype(float).tolist()), every_sample=True)
     walk = np.cumsum(1e-4 * np.sqrt(3.0) * 30.0 / length * rng.standard_normal((2 * length + 1000, 6)), axis=0)
     values = walk + 1e-4 * rng.standard_normal(walk.shape)
-    estimator.update(make_block(np.arange(2 * length), values[: 2 * length]))
+    estimator.add_samples(make_block(np.arange(2 * length), values[: 2 * length]))
     refit, anew = estimator._refit, np.zeros(6, int)
     verge = 0
     for i in range(2 * length, len(values)):
-        estimator.update(make_block(np.array([i]), values[i : i + 1]))
+        estimator.add_samples(make_block(np.array([i]), values[i : i + 1]))
         anew += refit._ages == 0
         verge += int((refit._state.output.status[:, 3] == 1).sum())
     assert verge > 1000

@@ -76,11 +76,11 @@ def test_white_noise_and_lines_have_no_bandwidth():
 def test_the_live_estimate_finds_it_too():
     values = filtered(2, 20.0, 120_000)
     estimator = Estimator(RATE_HZ, 1200.0)
-    estimator.update(make_block(np.arange(len(values)) * 10_000_000, values))
-    before = estimator.get()
+    estimator.add_samples(make_block(np.arange(len(values)) * 10_000_000, values))
+    before = estimator.get_estimate()
     for _ in range(6 * 65):  # pieces of six searches
         estimator.step_slow_statistics()
-    after = estimator.get()
+    after = estimator.get_estimate()
     assert np.isnan(before.fitted[0]).any() or (before.fitted[0] != after.fitted[0]).any()
     c = after.coefficients
     assert ((c.lo[1] <= N) & (c.hi[1] >= N)).sum() >= 5

@@ -15,9 +15,9 @@ from monitor.estimation.allan.curve import AllanCurve
 from monitor.estimation.allan.dynamic_allan import DynamicAllan
 from monitor.estimation.allan.hadamard import HadamardCurve
 from monitor.estimation.allan.total import TotalCurve
-from monitor.estimation.analysis import Analysis
+from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.detection.change_detection import Change
-from monitor.estimation.detection.model_comparison import AxisGap, ModelGap
+from monitor.estimation.detection.model_comparison import AxisModelComparison, ModelComparison
 from monitor.estimation.detection.motion_detection import Motion
 from monitor.estimation.estimate import Estimate
 from monitor.estimation.fit.coefficient_fit import empty_fit
@@ -70,14 +70,16 @@ def coefficients(scale: float = 1.0) -> Coefficients:
     return Coefficients(value, lo, hi, status)
 
 
-def gap() -> ModelGap:
-    def axis(name: str) -> AxisGap:
-        return AxisGap(
+def gap() -> ModelComparison:
+    def axis(name: str) -> AxisModelComparison:
+        return AxisModelComparison(
             name, np.array([3e-4, 2e-4, np.nan]), np.array([2e-4, 2.5e-4, 1e-4]), np.array([6.5, -1.25, np.nan]),
             6.5, (0.01, 0.02), 0, 2.5, 3.5, 4.5, 1500,
         )  # fmt: skip
 
-    return ModelGap(10**18, 100.0, 60.0, 360_000, 1500, TAU_S, {"gx": axis("gx"), "gz": axis("gz")}, {"gz": False})
+    return ModelComparison(
+        10**18, 100.0, 60.0, 360_000, 1500, TAU_S, {"gx": axis("gx"), "gz": axis("gz")}, {"gz": False}
+    )
 
 
 def thermal() -> ThermalIntervalResult:
@@ -114,12 +116,12 @@ def health() -> Health:
     )  # fmt: skip
 
 
-def analysis() -> Analysis:
+def analysis() -> RecordingAnalysis:
     motion = Motion("knock", 250, 400, 0.5, "gx", 0.25, "knocked")
     noise = Change("noise_changed", 2, 25_000, 25_100, 9.5, {"N": (1.5e-4, 2.5e-4)}, "gz rose")
     line = Change("noise_changed", 0, 30_000, 30_100, 12.0, {"band": (10.0, 20.0), "rms": (1e-3, 2e-3)}, "gx line")
     found = estimate()
-    return Analysis(
+    return RecordingAnalysis(
         found, 15.0, ("a note",), np.zeros((1, 6)), empty_fit(found.curve.avar),
         np.array([np.nan, 33.5, *[np.nan] * 4]), (motion,), (noise, line), False, ("gz",),
     )  # fmt: skip

@@ -12,7 +12,7 @@ import pytest
 
 from drivers.errors import ConfigError
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
-from monitor.estimation.analysis import Analysis
+from monitor.estimation.analysis import RecordingAnalysis
 from monitor.estimation.fit.coefficient_values import SYMBOLS
 from monitor.noise.effects import AngleRandomWalk, BiasInstability, QuantizationNoise, RateRandomWalk
 from monitor.noise.model import NoiseModel
@@ -25,7 +25,7 @@ pytest.importorskip("matplotlib")
 pytest.importorskip("jinja2")
 
 
-def analysis(**changed: object) -> Analysis:
+def analysis(**changed: object) -> RecordingAnalysis:
     return made.analysis(replace(made.estimate(), **changed), notes=("3 samples < 4 & more",))
 
 
@@ -86,7 +86,7 @@ def test_numbers_stand_with_unit_interval_or_word() -> None:
     assert len(cells) == 2 * 5 * 4
 
 
-def vars_of(result: Analysis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def vars_of(result: RecordingAnalysis) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     known = result.estimate.coefficients
     return known.value, known.lo, known.hi
 

@@ -61,7 +61,7 @@ def test_spectrum_is_the_one_that_the_model_states(name):
     y = NoiseModel({"gz": effects}).simulate(n, RATE_HZ, 3)[:, 2].copy()
     one = axis(y, effects)
     found = fit_with_fixed_noise(one, effects)
-    expected = NoiseModel({"gz": effects}).psd("gz", one.bins.f_hz, 1.0 / RATE_HZ)
+    expected = NoiseModel({"gz": effects}).two_sided_psd("gz", one.bins.f_hz, 1.0 / RATE_HZ)
     # a little white noise behind a filter is fitted too
     np.testing.assert_allclose(found.fit.whittle.variance / RATE_HZ, expected, rtol=0.02, atol=3e-5 * expected.max())
     assert found.effects == effects

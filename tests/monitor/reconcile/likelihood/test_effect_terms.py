@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.noise.effect import Leak, SampleBlockContext, Source
+from monitor.noise.effect import AxisLeak, SampleBlockContext, Source
 from monitor.noise.effects import EFFECTS, CrossAxis, Sinusoidal, TemperatureBias
 from monitor.reconcile.likelihood.effect_roles import (
     DETERMINISTIC_SIZE_PARAMETERS,
@@ -17,19 +17,21 @@ from tests.contracts.effect_examples import effect
 from tests.monitor.reconcile.axes import RATE_HZ, warmth
 
 NOISES = [EFFECTS[kind.name] for kind in NOISE_SIZE_PARAMETERS]
-COURSES = [kind for kind in DETERMINISTIC_SIZE_PARAMETERS if not issubclass(kind, Leak)]
+COURSES = [kind for kind in DETERMINISTIC_SIZE_PARAMETERS if not issubclass(kind, AxisLeak)]
 n = 3000
 
 
 def drawn(one):
     values = np.zeros(n)
-    one.start(RATE_HZ, np.random.default_rng(1)).add(values, SampleBlockContext(0, warmth(n), np.empty(n)))
+    one.start_series(RATE_HZ, np.random.default_rng(1)).add_next_samples(
+        values, SampleBlockContext(0, warmth(n), np.empty(n))
+    )
     return values
 
 
 def test_every_source_has_its_place():
     beside = {"bias", "outliers"}  # a mean is always free; outliers are single samples
-    kinds = {kind for name, kind in EFFECTS.items() if issubclass(kind, Source | Leak) and name not in beside}
+    kinds = {kind for name, kind in EFFECTS.items() if issubclass(kind, Source | AxisLeak) and name not in beside}
     assert set(NOISE_SIZE_PARAMETERS) | set(DETERMINISTIC_SIZE_PARAMETERS) == kinds
     assert not set(NOISE_SIZE_PARAMETERS) & set(DETERMINISTIC_SIZE_PARAMETERS)
 
@@ -39,10 +41,12 @@ def test_a_spectrum_grows_with_the_square_of_the_size(kind):
     one = effect(kind.name)
     f_hz, tau0_s = np.geomspace(0.01, 0.5 * RATE_HZ, 40), 1.0 / RATE_HZ
     np.testing.assert_allclose(
-        size(one) ** 2 * with_size(one, 1.0).psd(f_hz, tau0_s), one.psd(f_hz, tau0_s), rtol=1e-12
+        size(one) ** 2 * with_size(one, 1.0).two_sided_psd(f_hz, tau0_s), one.two_sided_psd(f_hz, tau0_s), rtol=1e-12
     )
     bigger = with_size(one, 7.0)
-    np.testing.assert_allclose(49.0 * with_size(one, 1.0).psd(f_hz, tau0_s), bigger.psd(f_hz, tau0_s), rtol=1e-12)
+    np.testing.assert_allclose(
+        49.0 * with_size(one, 1.0).two_sided_psd(f_hz, tau0_s), bigger.two_sided_psd(f_hz, tau0_s), rtol=1e-12
+    )
     assert size(with_size(one, -7.0)) == 7.0
 
 

@@ -127,7 +127,7 @@ def test_the_noise_around_has_the_spectrum_of_its_effects():
         turn = 2.0 * np.pi * f_hz
         density = rest.white + rest.walk / turn**2 + rest.flicker / turn
         density += sum(2.0 * s**2 * t / (1.0 + (turn * t) ** 2) for s, t in rest.correlated)
-        expected = sum(one.psd(f_hz, 1.0 / RATE_HZ) for one in some)
+        expected = sum(one.two_sided_psd(f_hz, 1.0 / RATE_HZ) for one in some)
         np.testing.assert_allclose(density, expected, rtol=2e-3)
 
 

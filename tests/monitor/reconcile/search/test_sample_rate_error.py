@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from monitor.noise.effect import Leak, SampleBlockContext, Source
+from monitor.noise.effect import AxisLeak, SampleBlockContext, Source
 from monitor.noise.effects import EFFECTS, AngleRandomWalk, Narrowband, SampleRateError, Sinusoidal
 from monitor.noise.model import NoiseModel
 from monitor.reconcile.likelihood.effect_roles import DETERMINISTIC_SIZE_PARAMETERS, NOISE_SIZE_PARAMETERS
@@ -22,22 +22,26 @@ def test_a_spectrum_is_that_of_the_resampled_noise(kind):
     """In stated time f is f/r and a density r times as much: S'(f) = r S(rf), of samples τ0/r apart."""
     one, tau0_s = effect(kind.name), 1.0 / RATE_HZ
     f_hz = np.geomspace(0.01, 0.499 * RATE_HZ, 50)
-    expected = RATIO * one.psd(RATIO * f_hz, tau0_s / RATIO)
-    np.testing.assert_allclose(convert_to_stated_time(one, RATIO).psd(f_hz, tau0_s), expected, rtol=1e-9)
+    expected = RATIO * one.two_sided_psd(RATIO * f_hz, tau0_s / RATIO)
+    np.testing.assert_allclose(convert_to_stated_time(one, RATIO).two_sided_psd(f_hz, tau0_s), expected, rtol=1e-9)
     clocked = NoiseModel({"gz": (one, SampleRateError(ratio=RATIO))})
     np.testing.assert_allclose(
-        convert_to_stated_time(one, RATIO).psd(f_hz, tau0_s), clocked.psd("gz", f_hz, tau0_s), rtol=1e-9
+        convert_to_stated_time(one, RATIO).two_sided_psd(f_hz, tau0_s),
+        clocked.two_sided_psd("gz", f_hz, tau0_s),
+        rtol=1e-9,
     )
 
 
-COURSES = [kind for kind in DETERMINISTIC_SIZE_PARAMETERS if not issubclass(kind, Leak)]
+COURSES = [kind for kind in DETERMINISTIC_SIZE_PARAMETERS if not issubclass(kind, AxisLeak)]
 
 
 @pytest.mark.parametrize("kind", COURSES, ids=lambda kind: kind.name)
 def test_a_course_is_that_of_samples_at_the_true_rate(kind):
     def drawn(one: Source, rate_hz: float):
         values = np.zeros(n)
-        one.start(rate_hz, np.random.default_rng(1)).add(values, SampleBlockContext(0, warmth(n), np.empty(n)))
+        one.start_series(rate_hz, np.random.default_rng(1)).add_next_samples(
+            values, SampleBlockContext(0, warmth(n), np.empty(n))
+        )
         return values
 
     one = effect(kind.name)
