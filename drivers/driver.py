@@ -1,9 +1,9 @@
 """Driver of one device: reads bytes from a link, decodes the bytes and assigns a time to each sample.
 
-``Driver.step`` reads, decodes, time-stamps and passes on samples once. ``Driver.run`` repeats ``step`` in the thread of
-the device. If a link cannot be opened, is lost or falls silent, the driver closes the link and reports an event. The
-driver then tries to open the link again, with growing pauses, until the driver is stopped or a replay has ended. A
-fault of one device does not affect other devices.
+``Driver.run_once`` reads, decodes, time-stamps and passes on samples once. ``Driver.run`` repeats ``run_once`` in the
+thread of the device. If a link cannot be opened, is lost or falls silent, the driver closes the link and reports an
+event. The driver then tries to open the link again, with growing pauses, until the driver is stopped or a replay has
+ended. A fault of one device does not affect other devices.
 """
 
 import threading
@@ -58,7 +58,7 @@ class AxisMap:
 
 
 @dataclass(slots=True)
-class Counts:
+class SampleCounts:
     """Sample counts of one device since the start. received + bad + lost is the number of samples sent."""
 
     received: int = 0
@@ -105,7 +105,7 @@ class Driver:
         self.link = link
         self.decoder = decoder
         self.clock = clock
-        self.counts = Counts()
+        self.counts = SampleCounts()
         self.state: State = "waiting"
         self.text = f"waiting for {link.name}"
         self.iterations = 0  # number of reads and attempts to open the link; constant while the driver is blocked
@@ -163,7 +163,7 @@ class Driver:
                     self.clock.note_no_unread_data(opening_ns)
                 self._last_data_s = time.monotonic()
                 while not self._stop.is_set():
-                    self.step()
+                    self.run_once()
             except LinkEnded as error:
                 self.state, self.text = "ended", str(error)
                 self.link.close()
@@ -177,7 +177,7 @@ class Driver:
             pause_s = min(2.0 * pause_s, MAX_RETRY_PAUSE_S)
         self.link.close()
 
-    def step(self) -> None:
+    def run_once(self) -> None:
         """Read once, and decode, time-stamp and pass on the samples."""
         self.iterations += 1
         asked_ns = time.monotonic_ns()

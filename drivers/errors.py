@@ -24,13 +24,13 @@ class ImuError(Exception):
     """Base class of the exceptions of this project. The error text is one line without control characters."""
 
     def __str__(self) -> str:
-        return format_one_line(super().__str__())
+        return sanitize_error_text(super().__str__())
 
 
-def format_one_line(text: str) -> str:
+def sanitize_error_text(text: str) -> str:
     """Replace control characters by blanks, and shorten the text to MAX_TEXT_CHARACTERS characters.
 
-    >>> format_one_line("no key \\x1b[2J\\nhere")
+    >>> sanitize_error_text("no key \\x1b[2J\\nhere")
     'no key  [2J here'
     """
     text = "".join(c if c.isprintable() else " " for c in text[: MAX_TEXT_CHARACTERS + 1].strip())
@@ -57,10 +57,10 @@ class ConfigError(ImuError, ValueError):
     @property
     def lines(self) -> tuple[str, ...]:
         """Lines of the message, one for each mistake."""
-        return tuple(format_one_line(str(line)) for line in self.args)
+        return tuple(sanitize_error_text(str(line)) for line in self.args)
 
     def __str__(self) -> str:
-        return format_one_line("; ".join(self.lines))
+        return sanitize_error_text("; ".join(self.lines))
 
 
 class LinkError(ImuError, OSError):

@@ -18,7 +18,7 @@ def find_missing_packages(extra: str) -> tuple[str, ...]:
     return tuple(package for module, package in EXTRAS[extra].items() if importlib.util.find_spec(module) is None)
 
 
-def check_extra(extra: str, feature: str) -> None:
+def require_extra(extra: str, feature: str) -> None:
     """Check that all packages of an extra are installed.
 
     Parameters

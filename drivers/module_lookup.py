@@ -47,7 +47,7 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
     """
     known = list_modules(package, suffix)
     if name not in known:
-        raise ConfigError(f'unknown name "{name}"{format_choices(name, known)}')
+        raise ConfigError(f'unknown name "{name}"{format_choices_by_similarity(name, known)}')
     return importlib.import_module(f"{package.__name__}.{name}{suffix}")
 
 
@@ -70,7 +70,7 @@ def format_suggestion(word: str, known: Sequence[str]) -> str:
     return f'; did you mean "{close[0]}"?' if close else f"; known are {', '.join(known)}"
 
 
-def format_choices(word: str, known: Sequence[str]) -> str:
+def format_choices_by_similarity(word: str, known: Sequence[str]) -> str:
     """Return the known words to append to an error message about an unknown word, the most similar word first.
 
     Parameters
@@ -80,7 +80,7 @@ def format_choices(word: str, known: Sequence[str]) -> str:
     known
         All known words.
 
-    >>> format_choices("serail", ("can", "serial"))
+    >>> format_choices_by_similarity("serail", ("can", "serial"))
     '; possible are serial, can'
     """
     near = {one: SequenceMatcher(None, word.lower(), one.lower()).ratio() for one in known}

@@ -88,14 +88,14 @@ class NumberRange:
 
         kind = "a whole number" if source is int else "a number"
 
-        def check(value: Any, convert: Callable[[Any], Any]) -> Any:
+        def convert_and_check(value: Any, convert: Callable[[Any], Any]) -> Any:
             try:
                 number = convert(value)
             except ValidationError:
                 raise ConfigError(f"expected {kind} from {self.format_range()}, got {format_value(value)}") from None
             return self.check(number)
 
-        return core_schema.no_info_wrap_validator_function(check, handler(source))
+        return core_schema.no_info_wrap_validator_function(convert_and_check, handler(source))
 
 
 # --- time and rates

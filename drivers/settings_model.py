@@ -29,7 +29,7 @@ from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from drivers import file_access
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices, format_suggestion
+from drivers.module_lookup import format_choices_by_similarity, format_suggestion
 from drivers.number_ranges import format_value
 
 MAX_PASSES: Final = 4
@@ -85,16 +85,16 @@ class SettingsModel(BaseModel):
 class Problem(NamedTuple):
     """Mistake in a table."""
 
-    place: str  # path of the key, such as "signals.gx" or "tau[1]"; "" for the whole table
+    key_path: str  # path of the key, such as "signals.gx" or "tau[1]"; "" for the whole table
     text: str
 
-    def nest_under(self, place: str) -> "Problem":
-        """Return the problem with the path ``place`` of the table put before the path of the key."""
-        dot = "." if place and self.place and not self.place.startswith("[") else ""
-        return Problem(f"{place}{dot}{self.place}", self.text)
+    def nest_under(self, table_path: str) -> "Problem":
+        """Return the problem with ``table_path`` put before the path of the key."""
+        dot = "." if table_path and self.key_path and not self.key_path.startswith("[") else ""
+        return Problem(f"{table_path}{dot}{self.key_path}", self.text)
 
     def __str__(self) -> str:
-        return f"{self.place}: {self.text}" if self.place else self.text
+        return f"{self.key_path}: {self.text}" if self.key_path else self.text
 
 
 class TableError(ConfigError):
@@ -122,32 +122,32 @@ class TableCheckResult(Generic[Model]):
     problems: list[Problem] = field(default_factory=list)
     partial: dict[str, object] = field(default_factory=dict)  # ``TableError.partial`` by path of the table
 
-    def is_sound(self, *places: str) -> bool:
+    def has_no_problem(self, *key_paths: str) -> bool:
         """Return True if no problem was found in these keys, their parent tables or their subkeys."""
-        return not any(_nested(place, wrong.place) for place in places for wrong in self.problems)
+        return not any(_nested(key_path, wrong.key_path) for key_path in key_paths for wrong in self.problems)
 
-    def add_problem(self, place: str, text: str) -> None:
+    def add_problem(self, key_path: str, text: str) -> None:
         """Add a problem, unless a problem with the same key has been found before.
 
         Parameters
         ----------
-        place
+        key_path
             Path of the key that the message names.
         text
             Message.
         """
-        if self.is_sound(place):
-            self.problems.append(Problem(place, text))
+        if self.has_no_problem(key_path):
+            self.problems.append(Problem(key_path, text))
 
 
-def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> TableCheckResult[Model]:
+def check_table(model: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> TableCheckResult[Model]:
     """Convert a table to settings, and find all mistakes in the table.
 
     Wrong values are replaced by defaults or examples, so that one mistake does not hide another mistake.
 
     Parameters
     ----------
-    kind
+    model
         Settings model of the table.
     table
         Keys and values from a TOML file.
@@ -158,45 +158,45 @@ def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None
     repaired = copy.deepcopy(dict(table))
     for _ in range(MAX_PASSES):
         try:
-            checked.value = kind.model_validate(repaired, context=_ReadContext(folder), by_alias=True, by_name=False)
+            checked.value = model.model_validate(repaired, context=_ReadContext(folder), by_alias=True, by_name=False)
         except ValidationError as error:
             details = error.errors(include_url=False)
-            found = [problem for one in details for problem in _problems(kind, one, checked)]
-            checked.problems += [one for one in found if checked.is_sound(one.place)]
+            found = [problem for one in details for problem in _problems(model, one, checked)]
+            checked.problems += [one for one in found if checked.has_no_problem(one.key_path)]
             for one in reversed(details):
-                _repair(kind, repaired, one)
+                _repair(model, repaired, one)
         else:
             _add_conflicts(checked, checked.value, "")
             break
     return checked
 
 
-def fields_by_key(kind: type[SettingsModel]) -> dict[str, FieldInfo]:
+def fields_by_key(model: type[SettingsModel]) -> dict[str, FieldInfo]:
     """Return the fields of a model by their keys in the file."""
-    return {found.alias or name: found for name, found in kind.model_fields.items()}
+    return {found.alias or name: found for name, found in model.model_fields.items()}
 
 
-def find_model(annotation: Any) -> type[SettingsModel] | None:
+def find_settings_model(annotation: Any) -> type[SettingsModel] | None:
     """Return the settings model that a type annotation contains; None if the annotation contains no model."""
     if isinstance(annotation, type) and issubclass(annotation, SettingsModel):
         return annotation
-    return next((found for one in get_args(annotation) if (found := find_model(one))), None)
+    return next((found for one in get_args(annotation) if (found := find_settings_model(one))), None)
 
 
 def _problems(kind: type[SettingsModel], error: ErrorDetails, checked: TableCheckResult[Any]) -> Iterator[Problem]:
     """Convert one pydantic error to problems."""
-    place = _format_place(error["loc"])
+    key_path = _format_location(error["loc"])
     cause = error.get("ctx", {}).get("error")
     if isinstance(cause, TableError):
-        checked.partial[place] = cause.partial
-        yield from (problem.nest_under(place) for problem in cause.problems)
+        checked.partial[key_path] = cause.partial
+        yield from (problem.nest_under(key_path) for problem in cause.problems)
     elif isinstance(cause, ConfigError):
-        yield from (Problem(place, line) for line in cause.lines)
+        yield from (Problem(key_path, line) for line in cause.lines)
     elif error["type"] == "extra_forbidden":
         model = _field_at(kind, error["loc"])[0]
-        yield Problem(place, f"unknown key{format_suggestion(str(error['loc'][-1]), tuple(fields_by_key(model)))}")
+        yield Problem(key_path, f"unknown key{format_suggestion(str(error['loc'][-1]), tuple(fields_by_key(model)))}")
     else:
-        yield Problem(place, _describe(error))
+        yield Problem(key_path, _describe(error))
 
 
 def _describe(error: ErrorDetails) -> str:
@@ -206,23 +206,23 @@ def _describe(error: ErrorDetails) -> str:
         return "missing"
     if error["type"] == "literal_error":
         words = [word or number for word, number in re.findall(r"'([^']*)'|(\d+)", error["ctx"]["expected"])]
-        return f"{format_value(value)}{format_choices(str(value), words)}"
+        return f"{format_value(value)}{format_choices_by_similarity(str(value), words)}"
     return f"expected {EXPECTED.get(error['type'], 'another value')}, got {format_value(value)}"
 
 
-def _add_conflicts(checked: TableCheckResult[Any], value: object, place: str) -> None:
+def _add_conflicts(checked: TableCheckResult[Any], value: object, key_path: str) -> None:
     """Add the conflicts of a model and of all models that the fields contain."""
     if isinstance(value, SettingsModel):
         for one in value.find_conflicts():
-            problem = Problem(one.key, one.text).nest_under(place)
+            problem = Problem(one.key, one.text).nest_under(key_path)
             keys = (*one.others, one.key) if one.key else one.others
-            if checked.is_sound(*(Problem(key, "").nest_under(place).place for key in keys)):
+            if checked.has_no_problem(*(Problem(key, "").nest_under(key_path).key_path for key in keys)):
                 checked.problems.append(problem)
         for key, info in zip(fields_by_key(type(value)), type(value).model_fields, strict=True):
-            _add_conflicts(checked, getattr(value, info), Problem(key, "").nest_under(place).place)
+            _add_conflicts(checked, getattr(value, info), Problem(key, "").nest_under(key_path).key_path)
     elif isinstance(value, tuple):
         for i, one in enumerate(value):
-            _add_conflicts(checked, one, f"{place}[{i}]")
+            _add_conflicts(checked, one, f"{key_path}[{i}]")
 
 
 def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
@@ -240,24 +240,24 @@ def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
             del table[last]
 
 
-def _field_at(kind: type[SettingsModel], place: Sequence[str | int]) -> tuple[type[SettingsModel], FieldInfo | None]:
+def _field_at(kind: type[SettingsModel], location: Sequence[str | int]) -> tuple[type[SettingsModel], FieldInfo | None]:
     """Return the innermost model on a path of keys, and the field of the last key; None for an unknown key."""
     found = None
-    for part in place:
+    for part in location:
         if found is not None:
-            kind = find_model(found.annotation) or kind
+            kind = find_settings_model(found.annotation) or kind
         if isinstance(part, str):
             found = fields_by_key(kind).get(part)
     return kind, found
 
 
-def _format_place(place: Sequence[str | int]) -> str:
+def _format_location(location: Sequence[str | int]) -> str:
     """Format the location of a pydantic error as a path of keys.
 
-    >>> _format_place(("device", 0, "tau", 1)), _format_place(("scale", "gw", "[key]"))
+    >>> _format_location(("device", 0, "tau", 1)), _format_location(("scale", "gw", "[key]"))
     ('device[0].tau[1]', 'scale.gw')
     """
-    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in place if part != "[key]")
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in location if part != "[key]")
     return "".join(parts).removeprefix(".")
 
 
@@ -274,7 +274,7 @@ ListOf = Annotated[tuple[T, ...], Strict(False)]
 """List in the file that becomes a tuple in the model. The items are not converted to other types."""
 
 
-class ReadAs:
+class ConvertedFrom:
     """Annotation of a field whose value has different types in the file and in the model.
 
     Parameters
@@ -294,15 +294,15 @@ class ReadAs:
         """Return a schema that validates the value in the file and then converts the value."""
         converted = get_origin(source) or source
 
-        def read(value: Any, inner: Callable[[Any], Any], info: ValidationInfo) -> Any:
+        def convert_value(value: Any, validate: Callable[[Any], Any], info: ValidationInfo) -> Any:
             if info.context is None and isinstance(value, converted):
                 return value
-            return self._convert(inner(value), info.context.folder if info.context else None)
+            return self._convert(validate(value), info.context.folder if info.context else None)
 
-        return core_schema.with_info_wrap_validator_function(read, handler.generate_schema(self._kind))
+        return core_schema.with_info_wrap_validator_function(convert_value, handler.generate_schema(self._kind))
 
 
-class WordOr:
+class KeywordOrType:
     """Annotation of a field that accepts certain words in addition to the values of a type.
 
     Parameters
@@ -320,26 +320,26 @@ class WordOr:
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         """Return a schema that replaces a word by its value and validates any other value."""
 
-        def read(value: Any, inner: Callable[[Any], Any], info: ValidationInfo) -> Any:
+        def replace_keyword(value: Any, validate: Callable[[Any], Any], info: ValidationInfo) -> Any:
             if isinstance(value, str) and value in self._words:
                 return self._words[value]
             if info.context is None and value in self._words.values():
                 return value
             try:
-                return inner(value)
+                return validate(value)
             except ValidationError as error:
                 (first, *_) = error.errors(include_url=False)
                 if first["loc"]:  # an item of a list is wrong, and the error describes the item
                     raise
                 raise ConfigError(self._describe(value, first)) from None
 
-        return core_schema.with_info_wrap_validator_function(read, handler.generate_schema(self._kind))
+        return core_schema.with_info_wrap_validator_function(replace_keyword, handler.generate_schema(self._kind))
 
     def _describe(self, value: object, error: ErrorDetails) -> str:
         """Describe a value that is neither one of the words nor valid for the type."""
         cause = error.get("ctx", {}).get("error")
         text = str(cause) if isinstance(cause, ConfigError) else _describe(error)
-        near = format_choices(str(value), tuple(self._words)).partition("are ")[2].split(", ")
+        near = format_choices_by_similarity(str(value), tuple(self._words)).partition("are ")[2].split(", ")
         words = ", ".join(f'"{word}"' for word in near)
         if text.startswith("expected "):
             return f"expected {words} or {text.removeprefix('expected ')}"
@@ -349,12 +349,12 @@ class WordOr:
 def one_of(words: Sequence[str]) -> AfterValidator:
     """Return a validator that accepts only certain words."""
 
-    def check(value: str) -> str:
+    def check_word(value: str) -> str:
         if value not in words:
-            raise ConfigError(f'"{value}"{format_choices(value, words)}')
+            raise ConfigError(f'"{value}"{format_choices_by_similarity(value, words)}')
         return value
 
-    return AfterValidator(check)
+    return AfterValidator(check_word)
 
 
 def checked_by(check: Callable[[T], object]) -> AfterValidator:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from typing import Final, TypeVar
 
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import HOUR_S
 
 G0: Final = 9.80665
@@ -80,10 +80,10 @@ TIME: Final[Mapping[str, float]] = {
 T = TypeVar("T")
 
 
-def rate_factor(unit: str) -> float:
+def angular_rate_factor(unit: str) -> float:
     """Return the factor that converts a unit of angular rate to rad/s. Raise ConfigError if the unit is unknown.
 
-    >>> round(rate_factor("deg/s"), 6)
+    >>> round(angular_rate_factor("deg/s"), 6)
     0.017453
     """
     return _look_up(RATE, unit, "angular rate")
@@ -98,12 +98,12 @@ def acceleration_factor(unit: str) -> float:
     return _look_up(ACCELERATION, unit, "acceleration")
 
 
-def temperature_scale(unit: str) -> tuple[float, float]:
+def temperature_factor_and_offset(unit: str) -> tuple[float, float]:
     """Return the factor and the offset that convert a unit of temperature to °C.
 
     The temperature in °C is factor · number + offset. The function raises ConfigError if the unit is unknown.
 
-    >>> temperature_scale("K")
+    >>> temperature_factor_and_offset("K")
     (1.0, -273.15)
     """
     return _look_up(TEMPERATURE, unit, "temperature")
@@ -119,5 +119,5 @@ def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
     # Unicode has two characters for the prefix micro, and both are in use
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     if name not in table:
-        raise ConfigError(f'"{unit}" is not a unit of {quantity}{format_choices(name, tuple(table))}')
+        raise ConfigError(f'"{unit}" is not a unit of {quantity}{format_choices_by_similarity(name, tuple(table))}')
     return table[name]

@@ -63,7 +63,7 @@ class Decoder(Protocol):
 
 
 @runtime_checkable
-class AddressFilter(Protocol):
+class AddressFilteringDecoder(Protocol):
     """Interface of a decoder that accepts only chunks with certain addresses."""
 
     @property
@@ -104,9 +104,9 @@ class RecentRejection:
         """Store the reason for a rejected frame."""
         self._reason, self._good_frames = reason, 0
 
-    def count_good_frames(self, frames: int = 1) -> None:
+    def add_good_frames(self, count: int = 1) -> None:
         """Add frames to the number of good frames since the last rejected frame."""
-        self._good_frames += frames
+        self._good_frames += count
 
 
 class BlockBuilder:
@@ -202,25 +202,25 @@ class Frames:
     adjacent: NDArray[np.bool_]  # [n] True if the frame follows the previous one without other bytes
     bad_after: int = 0  # number of frames rejected after the last frame
 
-    def select_frames(self, rows: Sequence[int]) -> "Frames":
+    def select_frames(self, indices: Sequence[int]) -> "Frames":
         """Return the frames with these indices.
 
         The rejected frames before an omitted frame are added to ``bad_before`` of the next selected frame, or to
         ``bad_after``.
         """
-        if len(rows) == len(self.data):
+        if len(indices) == len(self.data):
             return self
-        at = list(rows)
+        at = list(indices)
         rejected = np.cumsum(self.bad_before)
         rejected_at = rejected[at]
         after = int(rejected[-1] if rejected.size else 0) - int(rejected_at[-1] if rejected_at.size else 0)
         bad_before = np.diff(rejected_at, prepend=0)
         return Frames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at], after)
 
-    def stack_bytes(self, rows: Ints) -> Bytes:
+    def stack_frames(self, indices: Ints) -> Bytes:
         """Return the bytes of frames of equal length as an array [n, length] of uint8."""
-        data = self.data if rows.size == len(self.data) else [self.data[i] for i in rows.tolist()]
-        return np.frombuffer(b"".join(data), np.uint8).reshape(rows.size, -1)
+        data = self.data if indices.size == len(self.data) else [self.data[i] for i in indices.tolist()]
+        return np.frombuffer(b"".join(data), np.uint8).reshape(indices.size, -1)
 
 
 NEED_MORE: Final = 0
@@ -320,7 +320,7 @@ class FrameBuffer:
         self._buffer_offset += at
         while len(self._arrivals) > 1 and self._arrivals[0][0] <= self._buffer_offset:
             self._arrivals.popleft()
-        self._rejection.count_good_frames(len(found))
+        self._rejection.add_good_frames(len(found))
         return frames
 
     def _examine_candidate(self, buffer: bytes, at: int) -> tuple[int, int]:
@@ -480,7 +480,7 @@ def quantize(values: Floats, step: float, bits: int) -> Ints:
     return np.clip(np.rint(np.nan_to_num(values / step, nan=0.0)), -top, top - 1).astype(np.int64)
 
 
-def chunk_per_sample(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
+def make_chunks(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
     """Return a chunk for each sample, with the encoded sample and the time ``t_ns`` [n]."""
     return [Chunk(data, t) for data, t in zip(frames, t_ns.tolist(), strict=True)]
 

@@ -101,7 +101,7 @@ class Ros2ImuDecoder(RejectingDecoder):
                 self._rejection.note_rejection(str(error))
                 rejected += 1
                 continue
-            self._rejection.count_good_frames()
+            self._rejection.add_good_frames()
             ticks.append(sequence)
             missing.append(self._lost + rejected)
             self._lost_in_builder += self._lost

@@ -54,7 +54,7 @@ class SamplesDecoder(RejectingDecoder):
         for chunk in chunks:
             try:
                 found += self._decode_message(chunk.data)
-                self._rejection.count_good_frames()
+                self._rejection.add_good_frames()
             except DecodeError as error:
                 self._rejected += 1
                 self._rejection.note_rejection(str(error))
@@ -69,7 +69,9 @@ class SamplesDecoder(RejectingDecoder):
         """Return the samples of one message. ``lost`` of the first block counts the samples lost before the message."""
         message = decode_samples(data)
         rows = message.block
-        self._lost = min(self._lost + rows.lost + self._count_skipped(message.samples, len(rows)), MAX_GAP_SAMPLES)
+        self._lost = min(
+            self._lost + rows.lost + self._count_skipped(message.total_samples, len(rows)), MAX_GAP_SAMPLES
+        )
         blocks = self._builder.build_plausible_blocks(rows.t_ns, rows.values, rows.temperature_c, rows.ticks)
         if blocks and self._lost:
             blocks[0] = replace(blocks[0], lost=blocks[0].lost + self._lost)

@@ -31,7 +31,7 @@ from drivers.data_types import Chunk, CounterTimedFormat, Floats, Ints, SampleBl
 from drivers.decoders import base
 from drivers.errors import ConfigError
 from drivers.number_ranges import RATE_HZ
-from drivers.settings_model import Conflict, SettingsModel, WordOr, checked_by
+from drivers.settings_model import Conflict, KeywordOrType, SettingsModel, checked_by
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
@@ -94,7 +94,7 @@ class Settings(SettingsModel):
         None, examples=[500.0], description="sample rate in Hz, which is needed if an output is an increment"
     )
     identifier: Annotated[
-        int | Literal["auto"], WordOr({"auto": "auto"}, Annotated[int, checked_by(_check_identifier)])
+        int | Literal["auto"], KeywordOrType({"auto": "auto"}, Annotated[int, checked_by(_check_identifier)])
     ] = Field("auto", description="first byte of the datagrams, such as 0x93; auto takes it from the first datagram")
     crlf: bool = Field(False, description="true: a simulated sensor ends datagrams with CR LF; both can be read")
 
@@ -135,7 +135,7 @@ class Stim300Decoder(base.FrameStreamDecoder):
         temperature_c = np.full(n, np.nan)
         ticks = np.empty(n, np.int64)
         for identifier, rows in base.group_indices([frame[0] for frame in frames.data]):
-            data = frames.stack_bytes(rows)
+            data = frames.stack_frames(rows)
             values[rows], temperature_c[rows] = self._read_measurements(data, IDENTIFIERS[identifier])
             ticks[rows] = data[:, -7]
         return self._builder.build_plausible_blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
@@ -193,7 +193,7 @@ class Stim300Decoder(base.FrameStreamDecoder):
             data[:, at + 6] = np.where(np.isnan(samples.temperature_c), CHANNEL_ERROR, 0)
         data[:, -3] = samples.ticks & 0xFF
         tail = b"\r\n" if self._settings.crlf else b""
-        return base.chunk_per_sample([row + datagram_crc(row) + tail for row in map(bytes, data)], samples.t_ns)
+        return base.make_chunks([row + datagram_crc(row) + tail for row in map(bytes, data)], samples.t_ns)
 
 
 def _temperature_offset(parts: int) -> int:

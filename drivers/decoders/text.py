@@ -24,7 +24,7 @@ from drivers import units
 from drivers.data_types import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import COUNTER_MODULUS, HEADER_LINES, SCALE
 from drivers.settings_model import ListOf, SettingsModel, checked_by, one_of
 
@@ -46,7 +46,9 @@ UNWRAPPED_TICKS: Final = 1 << 62
 def _check_columns(columns: tuple[str, ...]) -> None:
     """Raise ConfigError if the columns contain mistakes. The error has one line for each mistake."""
     given = [name for name in columns if name != SKIP]
-    wrong = [f'unknown column "{name}"{format_choices(name, COLUMNS)}' for name in given if name not in COLUMNS]
+    wrong = [
+        f'unknown column "{name}"{format_choices_by_similarity(name, COLUMNS)}' for name in given if name not in COLUMNS
+    ]
     if len(given) != len(set(given)):
         wrong.append("a name is given twice")
     if not set(given) & set(AXES):
@@ -60,14 +62,14 @@ def _check_columns(columns: tuple[str, ...]) -> None:
 def _unit(look_up: Callable[[str], object], axis: str) -> AfterValidator:
     """Return a validator for a unit. The error message also explains how raw counts are converted."""
 
-    def check(unit: str) -> None:
+    def check_unit(unit: str) -> None:
         try:
             look_up(unit)
         except ConfigError as error:
             counts = f"name one of these units, and the size of a count: scale = {{ {axis} = 0.0305 }}"
             raise ConfigError(f"{error}; for raw counts {counts}") from error
 
-    return checked_by(check)
+    return checked_by(check_unit)
 
 
 def _check_delimiter(delimiter: str) -> None:
@@ -87,13 +89,13 @@ class Settings(SettingsModel):
         "auto",
         description='text between two fields, " " = any number of blanks; auto: comma, semicolon, tab or blanks',
     )
-    gyro_unit: Annotated[str, _unit(units.rate_factor, "gx")] = Field(
+    gyro_unit: Annotated[str, _unit(units.angular_rate_factor, "gx")] = Field(
         "rad/s", description="unit of gx gy gz: rad/s, mrad/s, deg/s, dps, deg/h, ..."
     )
     accel_unit: Annotated[str, _unit(units.acceleration_factor, "ax")] = Field(
         "m/s²", description="unit of ax ay az: m/s², g, mg, ..."
     )
-    temperature_unit: Annotated[str, _unit(units.temperature_scale, "temperature")] = Field(
+    temperature_unit: Annotated[str, _unit(units.temperature_factor_and_offset, "temperature")] = Field(
         "°C", description="unit of the temperature: °C, K, °F"
     )
     scale: dict[Annotated[str, one_of(COLUMNS)], Annotated[float, SCALE]] = Field(
@@ -196,7 +198,7 @@ class TextDecoder(base.RejectingDecoder):
         """Return the numbers [n, columns]. All lines are parsed together if they are regular, otherwise one by one."""
         table = self._parse_regular_lines(bodies)
         if table is not None:
-            self._rejection.count_good_frames(len(bodies))
+            self._rejection.add_good_frames(len(bodies))
             return table
         rows = []
         for body in bodies:
@@ -205,7 +207,7 @@ class TextDecoder(base.RejectingDecoder):
             if error:
                 self._rejection.note_rejection(error)
             else:
-                self._rejection.count_good_frames()
+                self._rejection.add_good_frames()
         return np.array(rows).reshape(-1, self._width)
 
     def _parse_regular_lines(self, bodies: list[bytes | None]) -> Floats | None:
@@ -285,7 +287,7 @@ class TextDecoder(base.RejectingDecoder):
         if self._settings.nmea:
             bodies = [b"$%b*%02X" % (body, base.xor_checksum(body)) for body in bodies]
         lines = [body + b"\r\n" for body in bodies]
-        return base.chunk_per_sample([b"\r\n" + lines[0], *lines[1:]], samples.t_ns)
+        return base.make_chunks([b"\r\n" + lines[0], *lines[1:]], samples.t_ns)
 
 
 def _parse_number(field: bytes) -> float:
@@ -312,11 +314,11 @@ def _scales(settings: Settings) -> tuple[Floats, Floats]:
     for i, name in enumerate(settings.columns):
         factor, offset = 1.0, 0.0
         if name in AXES[:3]:
-            factor = units.rate_factor(settings.gyro_unit)
+            factor = units.angular_rate_factor(settings.gyro_unit)
         elif name in AXES[3:]:
             factor = units.acceleration_factor(settings.accel_unit)
         elif name == "temperature":
-            factor, offset = units.temperature_scale(settings.temperature_unit)
+            factor, offset = units.temperature_factor_and_offset(settings.temperature_unit)
         elif name == "t":
             factor = round(units.time_factor(settings.time_unit) / TICK_S)
         factors[i], offsets[i] = factor * settings.scale.get(name, 1.0), offset

@@ -97,7 +97,7 @@ class VectornavAsciiDecoder(base.FrameStreamDecoder):
                 parts = ["VNYMR", *["+000.000"] * 3, *magnetic, *parts]
             body = ",".join(parts).encode()
             frames.append(b"$%b*%02X\r\n" % (body, base.xor_checksum(body)))
-        return base.chunk_per_sample(frames, samples.t_ns)
+        return base.make_chunks(frames, samples.t_ns)
 
 
 def _parse_numbers(bodies: list[bytes], width: int) -> Floats:

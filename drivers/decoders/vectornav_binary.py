@@ -61,14 +61,14 @@ class Settings(SettingsModel):
 
 
 @lru_cache(maxsize=256)
-def find_layout(header: bytes, compensated: bool) -> np.dtype[np.void] | None:
+def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.void] | None:
     """Return the layout of the messages with this header.
 
     Parameters
     ----------
     header
         Group byte and field masks.
-    compensated
+    prefer_compensated
         True if compensated fields are preferred.
 
     Returns
@@ -89,12 +89,12 @@ def find_layout(header: bytes, compensated: bool) -> np.dtype[np.void] | None:
             if mask >> bit & 1:
                 offsets[group, bit] = end
                 end += size
-    return _build_layout(offsets, end + 2, compensated)
+    return _build_layout(offsets, end + 2, prefer_compensated)
 
 
-def _build_layout(offsets: dict[tuple[int, int], int], length: int, compensated: bool) -> np.dtype[np.void]:
+def _build_layout(offsets: dict[tuple[int, int], int], length: int, prefer_compensated: bool) -> np.dtype[np.void]:
     """Return the layout of messages of ``length`` bytes. ``offsets`` maps (group, bit) to the offset of the field."""
-    order = -1 if compensated else 1
+    order = -1 if prefer_compensated else 1
     gyro = (UNCOMPENSATED_GYRO, COMPENSATED_GYRO)[::order]
     accel = (UNCOMPENSATED_ACCEL, COMPENSATED_ACCEL)[::order]
     sources = (
@@ -147,9 +147,9 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         temperature_c = np.full(n, np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
         for header, rows in base.group_indices([f[1 : HEADER_END[f[1]]] for f in frames.data]):
-            layout = find_layout(header, self._compensated)
+            layout = build_message_dtype(header, self._compensated)
             assert layout is not None, "the buffer accepts only messages with a known layout"
-            messages = frames.stack_bytes(rows).view(layout)[:, 0]
+            messages = frames.stack_frames(rows).view(layout)[:, 0]
             fields = layout.names or ()
             if "gyro" in fields:
                 values[rows, :3] = base.nan_to_infinity(_as_float64(messages["gyro"]))
@@ -173,7 +173,7 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
             return base.REJECT
         if len(buffer) < at + header_end:
             return base.NEED_MORE
-        layout = find_layout(buffer[at + 1 : at + header_end], self._compensated)
+        layout = build_message_dtype(buffer[at + 1 : at + header_end], self._compensated)
         if layout is None:
             return base.REJECT
         length = layout.itemsize
@@ -185,7 +185,7 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         """Return messages with TimeStartup and Imu of group 1. If the block has temperatures, add MagPres."""
         has_temperature = bool(np.isfinite(samples.temperature_c).any())
         header = bytes.fromhex("01 01 06" if has_temperature else "01 01 02")
-        layout = find_layout(header, compensated=False)
+        layout = build_message_dtype(header, prefer_compensated=False)
         assert layout is not None, "this header is in the tables"
         rows = np.zeros(len(samples), layout)
         rows["time"] = samples.ticks & (TICKS - 1)
@@ -194,7 +194,7 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
             rows["temperature"] = samples.temperature_c
         inner = [header + row.tobytes()[1 + len(header) : -2] for row in rows]
         frames = [b"\xfa" + part + binascii.crc_hqx(part, 0).to_bytes(2, "big") for part in inner]
-        return base.chunk_per_sample(frames, samples.t_ns)
+        return base.make_chunks(frames, samples.t_ns)
 
 
 def _as_float64(numbers: NDArray[np.float32]) -> Floats:

@@ -73,7 +73,7 @@ class WitmotionDecoder(base.FrameStreamDecoder):
         self._gyro_step = settings.gyro_range * DEGREE / 2**15
         self._temperature_step, self._temperature_offset = TEMPERATURE[settings.temperature]
         self._harmless_rejects = 0  # number of rejected packets that did not belong to a lost sample
-        self._pairs = PairFinder()
+        self._pairs = PacketPairFinder()
 
     @property
     def bad(self) -> int:
@@ -90,7 +90,7 @@ class WitmotionDecoder(base.FrameStreamDecoder):
     def reset(self) -> None:
         """Discard an incomplete packet or pair."""
         super().reset()
-        self._pairs = PairFinder()
+        self._pairs = PacketPairFinder()
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
         """Return the samples in these packets."""
@@ -123,7 +123,7 @@ class WitmotionDecoder(base.FrameStreamDecoder):
         accel = base.quantize(samples.values[:, 3:], self._accel_step, 16)
         if self._bluetooth:
             words = np.hstack([accel, gyro, np.zeros((n, 3), np.int64)]).astype("<i2")
-            return base.chunk_per_sample([HEADERS[0] + row.tobytes() for row in words], samples.t_ns)
+            return base.make_chunks([HEADERS[0] + row.tobytes() for row in words], samples.t_ns)
         excess = samples.temperature_c - self._temperature_offset
         temperature = base.quantize(excess, self._temperature_step, 16)[:, None]
         frames = [
@@ -134,10 +134,10 @@ class WitmotionDecoder(base.FrameStreamDecoder):
                 strict=True,
             )
         ]
-        return base.chunk_per_sample(frames, samples.t_ns)
+        return base.make_chunks(frames, samples.t_ns)
 
 
-class PairFinder:
+class PacketPairFinder:
     """Finder of pairs of 0x51 and 0x52 packets. The finder also counts the samples lost in each gap."""
 
     def __init__(self) -> None:
@@ -201,17 +201,17 @@ class PairFinder:
         return missing, int(np.maximum(holes - missing, 0).sum())
 
 
-def encode_packet(kind: int, data: bytes) -> bytes:
+def encode_packet(packet_type: int, data: bytes) -> bytes:
     """Return an 11-byte packet.
 
     Parameters
     ----------
-    kind
+    packet_type
         Type of the packet, such as 0x51.
     data
         Content of 8 bytes.
     """
-    body = bytes([0x55, kind]) + data
+    body = bytes([0x55, packet_type]) + data
     return body + bytes([sum(body) & 0xFF])
 
 

@@ -62,18 +62,18 @@ class Settings(SettingsModel):
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
+class PacketLayout:
     """Positions of the items in a packet."""
 
     items: tuple[tuple[int, int, int], ...]  # DID, offset of the data and size of each item
     header_offsets: tuple[int, ...]  # offsets of the DID and size bytes of all items
 
-    def find_numbers(self, did: int, count: int) -> tuple[int, int] | None:
+    def locate_numbers(self, data_id: int, count: int) -> tuple[int, int] | None:
         """Find the first item with a given DID and number of values.
 
         Parameters
         ----------
-        did
+        data_id
             DID without its low nibble.
         count
             Number of values in the item.
@@ -84,24 +84,24 @@ class Layout:
             Offset of the data, and index of the number format in FORMATS.
         """
         for found, at, size in self.items:
-            if found & 0xFFF0 == did and size == count * SIZES[found & 3]:
+            if found & 0xFFF0 == data_id and size == count * SIZES[found & 3]:
                 return at, found & 3
         return None
 
-    def find_integer(self, did: int, size: int) -> int:
+    def locate_integer(self, data_id: int, size: int) -> int:
         """Return the offset of an item that is an unsigned integer; 0 if there is no such item.
 
         Parameters
         ----------
-        did
+        data_id
             DID without its low nibble.
         size
             Size of the integer in bytes.
         """
-        return next((at for found, at, n in self.items if found & 0xFFF0 == did and n == size), 0)
+        return next((at for found, at, n in self.items if found & 0xFFF0 == data_id and n == size), 0)
 
 
-def _parse_layout(frame: bytes) -> Layout | None:
+def _parse_layout(frame: bytes) -> PacketLayout | None:
     """Return the layout of a packet; None if the items do not fill the payload exactly."""
     at = 6 if frame[3] == 0xFF else 4
     end = len(frame) - 1
@@ -111,14 +111,14 @@ def _parse_layout(frame: bytes) -> Layout | None:
         items.append((frame[at] << 8 | frame[at + 1], at + 3, size))
         at += 3 + size
     headers = tuple(start - back for _, start, _ in items for back in (3, 2, 1))
-    return Layout(tuple(items), headers) if at == end else None
+    return PacketLayout(tuple(items), headers) if at == end else None
 
 
 class XsensMtdata2Decoder(base.FrameStreamDecoder):
     """Decoder and encoder of MTData2 packets."""
 
     def __init__(self, settings: Settings) -> None:
-        super().__init__(SYNC, match_message, LONGEST)
+        super().__init__(SYNC, _match_message, LONGEST)
         self._settings = settings
         # (timing, DID, size of the counter in bytes)
         clocks: dict[str, tuple[Timing, int, int]] = {
@@ -153,12 +153,12 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
             if layout is None:
                 values[rows] = np.inf
                 continue
-            for did, axes in ((self._gyro, slice(0, 3)), (self._accel, slice(3, 6))):
-                if found := layout.find_numbers(did, 3):
+            for data_id, axes in ((self._gyro, slice(0, 3)), (self._accel, slice(3, 6))):
+                if found := layout.locate_numbers(data_id, 3):
                     values[rows, axes] = base.nan_to_infinity(_read_numbers(packets, *found, 3))
-            if found := layout.find_numbers(TEMPERATURE, 1):
+            if found := layout.locate_numbers(TEMPERATURE, 1):
                 temperature_c[rows] = _read_numbers(packets, *found, 1)[:, 0]
-            if self._clock and (at := layout.find_integer(self._clock, self._clock_size)):
+            if self._clock and (at := layout.locate_integer(self._clock, self._clock_size)):
                 weights = 256 ** np.arange(self._clock_size - 1, -1, -1)
                 ticks[rows] = packets[:, at : at + self._clock_size].astype(np.int64) @ weights
         blocks, last = self._build_measured_blocks(frames, values, self._fill_temperatures(temperature_c), ticks)
@@ -184,18 +184,18 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
             payload += struct.pack(">HBI", SAMPLE_TIME_FINE, 4, tick & 0xFFFFFFFF)
             if not np.isnan(temperature_c):
                 payload += struct.pack(">HBf", TEMPERATURE, 4, temperature_c)
-            for did, triple in ((self._accel, row[3:]), (self._gyro, row[:3])):
+            for data_id, triple in ((self._accel, row[3:]), (self._gyro, row[:3])):
                 if not np.isnan(triple).all():
-                    payload += struct.pack(">HB", did | number_format, 3 * SIZES[number_format])
+                    payload += struct.pack(">HB", data_id | number_format, 3 * SIZES[number_format])
                     payload += _encode_numbers(triple, number_format)
             frames.append(encode_message(payload))
-        return base.chunk_per_sample(frames, samples.t_ns)
+        return base.make_chunks(frames, samples.t_ns)
 
 
-def _group_by_layout(frames: base.Frames) -> Iterator[tuple[Layout | None, Ints, base.Bytes]]:
+def _group_by_layout(frames: base.Frames) -> Iterator[tuple[PacketLayout | None, Ints, base.Bytes]]:
     """Yield each layout with the indices and the bytes [k, length] of its packets. An invalid layout is None."""
     for _, rows in base.group_indices([len(packet) for packet in frames.data]):
-        packets, at = frames.stack_bytes(rows), rows
+        packets, at = frames.stack_frames(rows), rows
         while at.size:
             layout = _parse_layout(packets[0].tobytes())
             compared = list(layout.header_offsets) if layout else slice(None)
@@ -240,7 +240,7 @@ def encode_message(payload: bytes) -> bytes:
     return b"\xfa" + body + bytes([-sum(body) & 0xFF])
 
 
-def match_message(buffer: bytes, at: int) -> int:
+def _match_message(buffer: bytes, at: int) -> int:
     """Return the length of a message at an offset of the buffer (see ``drivers.decoders.base.FrameMatcher``).
 
     Parameters

@@ -29,9 +29,9 @@ from pydantic import Field, SkipValidation
 
 from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
-from drivers.extras import check_extra
+from drivers.extras import require_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BIT_RATE, format_value
 from drivers.settings_model import checked_by
 
@@ -304,10 +304,10 @@ def build(settings: Settings) -> Link:
     ConfigError
         If python-can is not installed or does not know the interface.
     """
-    check_extra("can", "a CAN bus")
+    require_extra("can", "a CAN bus")
     from can.interfaces import VALID_INTERFACES
 
     if settings.interface not in VALID_INTERFACES:
         known = sorted(VALID_INTERFACES)
-        raise ConfigError(f'interface: "{settings.interface}"{format_choices(settings.interface, known)}')
+        raise ConfigError(f'interface: "{settings.interface}"{format_choices_by_similarity(settings.interface, known)}')
     return CanLink(settings)

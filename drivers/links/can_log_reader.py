@@ -57,7 +57,7 @@ def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterato
             yield from _data_frames(iter(reader), channel, lambda: None)
         else:
             lines = _BoundedLineReader(stream)
-            yield from _data_frames(iter(TEXT_READERS[suffix](lines.as_text(None))), channel, lines.note_frame)
+            yield from _data_frames(iter(TEXT_READERS[suffix](lines.open_as_text(None))), channel, lines.note_frame)
     except blf.BLFParseError as error:
         raise ValueError(f"no BLF log: {error}") from error
 
@@ -80,7 +80,7 @@ def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
         If the file is damaged or exceeds a limit.
     """
     lines = _BoundedLineReader(stream)
-    rows = csv.reader(lines.as_text(""))
+    rows = csv.reader(lines.open_as_text(""))
     columns = {name: i for i, name in enumerate(next(rows))}
     t, identifier, data = columns["t"], columns["id_hex"], columns["data_hex"]
     channel_column = columns.get("channel", columns.get("bus"))
@@ -126,7 +126,7 @@ class _BoundedLineReader(io.RawIOBase):
         self._line_bytes = 0  # number of bytes since the last line end
         self._bytes_without_frame = 0
 
-    def as_text(self, newline: str | None) -> io.TextIOWrapper:
+    def open_as_text(self, newline: str | None) -> io.TextIOWrapper:
         """Return a text file. ``newline`` has the same meaning as in the function ``open``."""
         return io.TextIOWrapper(io.BufferedReader(self), "utf-8", newline=newline)
 

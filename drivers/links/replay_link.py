@@ -34,13 +34,13 @@ from pydantic import Field
 from drivers import file_access
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError, describe_error
-from drivers.extras import check_extra
+from drivers.extras import require_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples
 from drivers.recordings import segment_file as segment
-from drivers.settings_model import FilePath, WordOr
+from drivers.settings_model import FilePath, KeywordOrType
 from drivers.zenoh.sample_message import encode_samples
 
 DEFAULT_DECODER: Final = "samples"
@@ -81,7 +81,7 @@ class Settings(LinkSettings):
     path: FilePath = Field(
         examples=["recording.csv"], description="recording, CAN log, file of captured bytes, or folder of segments"
     )
-    speed: Annotated[float, WordOr(PACES, Annotated[float, REPLAY_SPEED])] = Field(
+    speed: Annotated[float, KeywordOrType(PACES, Annotated[float, REPLAY_SPEED])] = Field(
         1.0, examples=["recorded"], description="recorded, max, or a factor: 10 = ten times as fast as recorded"
     )
     rate: Annotated[float, RATE_HZ] | None = Field(
@@ -284,7 +284,7 @@ def _detect_kind(path: Path) -> Kind:
     if suffix in FORMATS:
         return "recording"
     known = (*FORMATS, *CAN_LOGS, *CAPTURES)
-    raise ConfigError(f'path: "{path}" has no suffix of a file to replay{format_choices(suffix, known)}')
+    raise ConfigError(f'path: "{path}" has no suffix of a file to replay{format_choices_by_similarity(suffix, known)}')
 
 
 def _plain_suffix(path: Path) -> str:
@@ -306,7 +306,7 @@ def _read_header(path: Path) -> str:
 
 def _open_binary(path: Path) -> IO[bytes]:
     """Open a binary file for reading. Decompress the content if the name ends in ".gz"."""
-    file = file_access.open_regular(path)
+    file = file_access.open_regular_file(path)
     if path.suffix.lower() != ".gz":
         return file
     unzipped: Any = gzip.GzipFile(fileobj=file, mode="rb")
@@ -331,7 +331,7 @@ def build(settings: Settings) -> Link:
     _check_path(path)
     kind = _detect_kind(path)
     if kind == "log":
-        check_extra("can", "a CAN log")
+        require_extra("can", "a CAN log")
     return ReplayLink(settings, kind)
 
 
@@ -340,7 +340,7 @@ def _check_path(path: Path) -> None:
     if path.is_dir():
         return
     try:
-        file_access.check_regular(path)
+        file_access.check_regular_file(path)
     except FileNotFoundError:
         return
     except OSError as error:

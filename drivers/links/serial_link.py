@@ -26,7 +26,7 @@ from drivers.credential_masking import mask_secrets
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BIT_RATE, READ_TIMEOUT_S
 from drivers.settings_model import checked_by
 
@@ -47,7 +47,9 @@ def _check_port(port: str) -> None:
     if not port:
         raise ConfigError('empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")')
     if found and scheme.lower() not in SCHEMES and not _has_handler(scheme.lower()):
-        raise ConfigError(f'"{port}" has an unknown kind of URL "{scheme}"{format_choices(scheme, SCHEMES)}')
+        raise ConfigError(
+            f'"{port}" has an unknown kind of URL "{scheme}"{format_choices_by_similarity(scheme, SCHEMES)}'
+        )
 
 
 def _check_stop_bits(number: float) -> None:

@@ -62,12 +62,12 @@ class SampleMessage:
     """Content of one message."""
 
     device: str
-    samples: int  # number of samples that the publisher has received since its start, including this message
+    total_samples: int  # number of samples that the publisher has received since its start, including this message
     block: SampleBlock  # t_ns are Unix times
 
 
 def encode_samples(
-    device: str, samples: int, rows: SampleBlock, offset_ns: Ints | int = 0, schema: str = SCHEMA
+    device: str, total_samples: int, block: SampleBlock, unix_offset_ns: Ints | int = 0, schema: str = SCHEMA
 ) -> bytes:
     """Encode samples as one message.
 
@@ -75,21 +75,21 @@ def encode_samples(
     ----------
     device
         Name of the device.
-    samples
+    total_samples
         Number of samples of the device since the start, including the samples of the message.
-    rows
+    block
         Samples to encode. Axes without a value are omitted. If all values are NaN, all six axes are kept.
-    offset_ns
+    unix_offset_ns
         Offset from ``t_ns`` to Unix time in ns.
     schema
         Name of the schema.
     """
-    table = np.column_stack((rows.values, rows.temperature_c))
+    table = np.column_stack((block.values, block.temperature_c))
     measured: NDArray[np.bool_] = ~np.all(np.isnan(table), axis=0)
     if not measured.any():
         measured[: len(AXES)] = True
     t: float | bytes
-    t, t0, rate = _encode_times(rows.t_ns + offset_ns)
+    t, t0, rate = _encode_times(block.t_ns + unix_offset_ns)
     return _ENCODER.encode(
         _Payload(
             schema=schema,
@@ -97,8 +97,8 @@ def encode_samples(
             axes=[name for name, there in zip(COLUMNS, measured, strict=True) if there],
             data=np.ascontiguousarray(table[:, measured], "<f8").tobytes(),
             t=t,
-            samples=samples,
-            lost=rows.lost,
+            samples=total_samples,
+            lost=block.lost,
             t0=t0,
             rate=rate,
         )

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.credential_masking import mask_secrets
-from drivers.file_access import check_regular
+from drivers.file_access import check_regular_file
 
 if TYPE_CHECKING:
     import zenoh
@@ -49,13 +49,13 @@ PUBLIC_FILES: Final = (
 
 
 def build_session_config(
-    own: Mapping[str, Any], file: str | Path | None = None, defaults: Mapping[str, Any] = DEFAULT_CONFIGURATION
+    overrides: Mapping[str, Any], file: str | Path | None = None, defaults: Mapping[str, Any] = DEFAULT_CONFIGURATION
 ) -> "zenoh.Config":
     """Return the configuration of a session.
 
     Parameters
     ----------
-    own
+    overrides
         Values by configuration key, which take precedence over the file. A value of None is ignored.
     file
         zenoh configuration file. None for the defaults of zenoh.
@@ -78,7 +78,7 @@ def build_session_config(
     for key, value in defaults.items():
         if config.get_json(key) == unchanged.get_json(key):
             config.insert_json5(key, json.dumps(value))
-    for key, value in own.items():
+    for key, value in overrides.items():
         if value is not None:
             config.insert_json5(key, json.dumps(value))
     return config
@@ -134,7 +134,7 @@ def _check_file(path: Path) -> None:
     import zenoh
 
     try:
-        check_regular(path)
+        check_regular_file(path)
     except FileNotFoundError:
         return  # zenoh reports a missing file
     except OSError as error:

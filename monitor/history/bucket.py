@@ -58,7 +58,7 @@ class RunningStatistics:
 
     >>> seen = RunningStatistics(("a", "b"))
     >>> for numbers in ([1.0, 5.0], [3.0, np.nan], [2.0, 4.0]):
-    ...     seen.add(np.array(numbers))
+    ...     seen.add_values(np.array(numbers))
     >>> seen.count.tolist(), seen.minimum.tolist(), seen.maximum.tolist(), seen.last.tolist()
     ([3, 2], [1.0, 4.0], [3.0, 5.0], [2.0, 4.0])
     """
@@ -70,10 +70,10 @@ class RunningStatistics:
         self.maximum: Singles = self.minimum.copy()
         self.last: Singles = self.minimum.copy()
 
-    def add(self, numbers: Floats) -> None:
+    def add_values(self, values: Floats) -> None:
         """Update the statistics with one value per column ([k], SI); NaN marks a missing value."""
         with np.errstate(over="ignore"):
-            single = numbers.astype(np.float32)
+            single = values.astype(np.float32)
         there = ~np.isnan(single)
         self.count += there
         np.fmin(self.minimum, single, out=self.minimum)
@@ -148,30 +148,30 @@ def pack_count_min_max_last(row: HistoryRow) -> bytes:
     return zlib.compress(words.view(np.uint8).reshape(-1, 4).T.tobytes(), 6)
 
 
-def unpack_count_min_max_last(data: bytes, count: int) -> tuple[Ints, Singles, Singles, Singles]:
+def unpack_count_min_max_last(data: bytes, column_count: int) -> tuple[Ints, Singles, Singles, Singles]:
     """Return the count, minimum, maximum and last value of each column in packed bytes.
 
     Parameters
     ----------
     data
         Bytes made by ``pack_count_min_max_last``.
-    count
+    column_count
         Number of columns.
 
     Raises
     ------
     RecordingError
-        If the bytes cannot be decompressed, or do not contain ``count`` columns.
+        If the bytes cannot be decompressed, or do not contain ``column_count`` columns.
     """
-    size = 16 * count
+    size = 16 * column_count
     try:
         raw = zlib.decompressobj().decompress(data, size + 1)
     except zlib.error as error:
         raise RecordingError(f"a row cannot be read: {error}") from error
-    if len(raw) != size or count > MAX_COLUMNS:
-        raise RecordingError(f"a row of {count} numbers has {len(raw)} bytes, not {size}")
+    if len(raw) != size or column_count > MAX_COLUMNS:
+        raise RecordingError(f"a row of {column_count} numbers has {len(raw)} bytes, not {size}")
     bytes_of = np.frombuffer(raw, np.uint8).reshape(4, -1).T
-    words = np.ascontiguousarray(bytes_of).view("<u4").reshape(4, count).astype(np.uint32)
+    words = np.ascontiguousarray(bytes_of).view("<u4").reshape(4, column_count).astype(np.uint32)
     low = words[1]
     return (
         words[0].astype(np.int64),

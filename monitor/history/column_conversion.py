@@ -59,13 +59,13 @@ class ColumnConverter:
         )
         self._coefficient_count = len(self._coefficient_indices)
 
-    def is_compatible(self, estimate: Estimate) -> bool:
+    def matches_axes_and_taus(self, estimate: Estimate) -> bool:
         """Return True if an estimate has the same measured axes and averaging times as the first estimate."""
         tau_s = estimate.curve.tau_s
         same = tau_s is self._tau_s or np.array_equal(tau_s, self._tau_s)
         return same and bool((_measured(estimate) == self._measured).all())
 
-    def convert(self, estimate: Estimate) -> Floats:
+    def convert_estimate(self, estimate: Estimate) -> Floats:
         """Return the column values of an estimate ([k], SI) in the order of ``names``; NaN marks a missing value."""
         c, m = estimate.coefficients, self._coefficient_count
         status, hi = c.status.take(self._coefficient_indices), c.hi.take(self._coefficient_indices)

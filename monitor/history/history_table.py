@@ -59,7 +59,7 @@ class HistoryTable:
         """Unix time at which each bucket ends [s], shape [p]."""
         return self.start_s + self.width_s
 
-    def column(self, name: str) -> "ColumnStatistics":
+    def select_column(self, name: str) -> "ColumnStatistics":
         """Return one column over time; all values are missing if the table has no column of this name."""
         if name not in self.names:
             nothing: Floats = np.full(len(self), np.nan)
@@ -68,12 +68,12 @@ class HistoryTable:
         parts = [np.asarray(part[:, at], np.float64) for part in (self.low, self.high, self.last)]
         return ColumnStatistics(self.n[:, at], *parts)
 
-    def axes(self) -> tuple[str, ...]:
+    def list_axes(self) -> tuple[str, ...]:
         """Return the axes that have at least one column."""
         found = dict.fromkeys(name.split(".")[0] for name in self.names if "." in name)
         return tuple(found)
 
-    def taus(self) -> tuple[str, ...]:
+    def list_tau_labels(self) -> tuple[str, ...]:
         """Return the averaging times of the deviations [s] as written in the column names, in ascending order."""
         found = {name.split(".sigma.")[1] for name in self.names if ".sigma." in name}
         return tuple(sorted(found, key=float))
@@ -93,7 +93,7 @@ def read_history(
     reader: HistoryReader,
     device: str,
     span: TimeRange | None,
-    wanted: Callable[[str], bool] = lambda _name: True,
+    wants_column: Callable[[str], bool] = lambda _name: True,
     step_s: int | None = None,
     points: int = DEFAULT_POINTS,
 ) -> HistoryTable:
@@ -107,7 +107,7 @@ def read_history(
         Name of the device.
     span
         Time range; None for the last stored day.
-    wanted
+    wants_column
         Returns True for the name of a column that is wanted.
     step_s
         Minimum bucket width [s]; None for the width that follows from ``points``.
@@ -125,18 +125,18 @@ def read_history(
     if held is None:
         raise NotReady(f"{device}: no history yet")
     span = _clip_to_stored(span or TimeRange(held[1] - DAY_S, held[1]), held)
-    step_s = bucket_width_s(
+    step_s = choose_bucket_width_s(
         replace(span, start_s=max(span.start_s, held[0]), end_s=min(span.end_s, held[1])), step_s, points
     )
     parts: dict[tuple[int, int], list[HistoryRow]] = {}
     names: dict[tuple[str, ...], tuple[str, ...]] = {}
-    for key, rows in groupby(reader.rows(device, span), key=lambda row: _bucket(row, step_s)):
+    for key, rows in groupby(reader.read_rows(device, span), key=lambda row: _bucket(row, step_s)):
         one = merge_rows(list(rows), *key)
         if one.names not in names:
-            names[one.names] = tuple(name for name in one.names if wanted(name))
+            names[one.names] = tuple(name for name in one.names if wants_column(name))
         parts.setdefault(key, []).append(select_columns(one, names[one.names]))
     found = [merge_rows(part, *key) for key, part in sorted(parts.items())]
-    events, in_all = reader.events(device, span, MAX_EVENTS)
+    events, in_all = reader.read_events(device, span, MAX_EVENTS)
     if not found and not events:
         raise NotReady(f"{device}: no results in this time range; stored are {_format_range(held)}")
     return build_table(device, span, step_s, found, events, in_all)
@@ -188,12 +188,12 @@ def build_table(
     )
 
 
-def bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
+def choose_bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
     """Return the smallest permitted bucket width [s] for a number of points, at least ``step_s``.
 
-    >>> bucket_width_s(TimeRange(0.0, 86_400.0)), bucket_width_s(TimeRange(0.0, 5 * 31_536_000.0))
+    >>> choose_bucket_width_s(TimeRange(0.0, 86_400.0)), choose_bucket_width_s(TimeRange(0.0, 5 * 31_536_000.0))
     (300, 172800)
-    >>> bucket_width_s(TimeRange(0.0, 3600.0), 900)
+    >>> choose_bucket_width_s(TimeRange(0.0, 3600.0), 900)
     900
 
     Parameters

@@ -46,7 +46,7 @@ class MinuteAggregator:
             Estimate to add.
         """
         full = self._advance(unix_s)
-        if self._numbers is None or not self._numbers.is_compatible(estimate):
+        if self._numbers is None or not self._numbers.matches_axes_and_taus(estimate):
             self._numbers = ColumnConverter(estimate)
         if self._estimates is not None and self._estimates.names != self._numbers.names:
             start_s = self._start_s
@@ -54,7 +54,7 @@ class MinuteAggregator:
             self._start_s, self._newest_s = start_s, unix_s
         if self._estimates is None:
             self._estimates = RunningStatistics(self._numbers.names)
-        self._estimates.add(self._numbers.convert(estimate))
+        self._estimates.add_values(self._numbers.convert_estimate(estimate))
         return full
 
     def add_temperature(self, unix_s: float, temperature_c: Floats) -> HistoryRow | None:
@@ -71,7 +71,7 @@ class MinuteAggregator:
         if not there.size:
             return None
         full = self._advance(unix_s)
-        self._temperature.add(np.array([there.mean()]))
+        self._temperature.add_values(np.array([there.mean()]))
         return full
 
     def add_health(self, unix_s: float, health: Health) -> HistoryRow | None:
@@ -86,7 +86,7 @@ class MinuteAggregator:
         """
         full = self._advance(unix_s)
         known = [np.nan if one is None else float(one) for one in (health.rate_hz, health.latency_p99_s)]
-        self._health.add(np.array([*known, float(health.memory_bytes)]))
+        self._health.add_values(np.array([*known, float(health.memory_bytes)]))
         counted = (health.received, health.lost, health.bad, health.overflowed)
         # a counter below the previous value was restarted from zero
         more = tuple(

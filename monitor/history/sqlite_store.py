@@ -23,7 +23,7 @@ from typing import Any, Final
 import msgspec
 
 from drivers.errors import RecordingError
-from drivers.file_access import check_folder_or_absent, check_regular
+from drivers.file_access import check_folder_or_absent, check_regular_file
 from drivers.number_ranges import DAY_S
 from monitor.history.bucket import (
     MAX_COLUMNS,
@@ -37,7 +37,7 @@ from monitor.history.stored_events import (
     MAX_EVENTS,
     THINNING_SPANS_S,
     StoredEvent,
-    clamp_time,
+    clamp_to_sqlite_range,
     count_events,
     insert_event,
     read_events,
@@ -138,7 +138,9 @@ class HistoryStore:
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
 
-    def add(self, rows: Sequence[tuple[str, HistoryRow]], events: Sequence[tuple[str, StoredEvent]] = ()) -> None:
+    def write_rows_and_events(
+        self, rows: Sequence[tuple[str, HistoryRow]], events: Sequence[tuple[str, StoredEvent]] = ()
+    ) -> None:
         """Write rows and events in one transaction.
 
         Parameters
@@ -162,14 +164,14 @@ class HistoryStore:
                 insert_event(self._db, self._device_id(device), event)
         self._files = _file_states(self.path)
 
-    def merge_old_rows(self, now_s: float, at_most: int = 100) -> int:
+    def merge_old_rows(self, now_s: float, max_buckets: int = 100) -> int:
         """Merge rows that are old enough, and return the number of merged buckets.
 
         Parameters
         ----------
         now_s
             Current Unix time [s].
-        at_most
+        max_buckets
             Largest number of buckets to merge in this call.
 
         Raises
@@ -189,7 +191,7 @@ class HistoryStore:
                 for (width_s, age_s), (wider_s, _) in pairwise(LEVELS):
                     assert age_s is not None
                     limit_s = (age_from_s - age_s) // wider_s * wider_s
-                    while done < at_most and self._merge_oldest(device, width_s, wider_s, limit_s):
+                    while done < max_buckets and self._merge_oldest(device, width_s, wider_s, limit_s):
                         done += 1
         if done:
             self._files = _file_states(self.path)
@@ -242,14 +244,14 @@ class HistoryStore:
         found = self._db.execute(
             f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start = ?", (device, width_s, start_s)
         ).fetchone()
-        return None if found is None else self._layouts.row(found)
+        return None if found is None else self._layouts.parse_row(found)
 
     def _write(self, device: int, row: HistoryRow) -> None:
         """Insert a row, or replace the stored row of the same bucket."""
         self._db.execute(
             f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
-                *(device, row.start_s, row.width_s, row.newest_s, self._layouts.id(row.names)),
+                *(device, row.start_s, row.width_s, row.newest_s, self._layouts.layout_id(row.names)),
                 *(*row.counts, row.state, pack_count_min_max_last(row)),
             ),
         )
@@ -274,7 +276,7 @@ class HistoryStore:
         where = "device = ? AND width = ? AND start >= ? AND start < ?"
         with self._transaction():
             found = self._db.execute(f"SELECT {_FIELDS} FROM row WHERE {where} ORDER BY start", bucket).fetchall()
-            rows = [self._layouts.row(one) for one in found]
+            rows = [self._layouts.parse_row(one) for one in found]
             held = self._stored_row(device, wider_s, start_s)
             self._write(device, merge_rows([*([held] if held else []), *rows], start_s, wider_s))
             self._db.execute(f"DELETE FROM row WHERE {where}", bucket)
@@ -302,7 +304,7 @@ class HistoryStore:
         if version != self._version:
             self._version = version
             self._devices.clear()
-            self._layouts.forget()
+            self._layouts.clear()
 
     def _committed_by_others(self) -> bool:
         """Return True if another SQLite connection has changed the file; False if the file has been overwritten."""
@@ -325,7 +327,7 @@ class HistoryStore:
             self._db.execute("COMMIT")
         except BaseException:
             self._devices.clear()  # identifiers created in this transaction may no longer exist
-            self._layouts.forget()
+            self._layouts.clear()
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
             raise
@@ -339,7 +341,7 @@ class HistoryReader:
         self.path = path
         self._layouts = _LayoutCache(db)
 
-    def devices(self) -> tuple[str, ...]:
+    def list_devices(self) -> tuple[str, ...]:
         """Return the names of all devices in the file, sorted."""
         return tuple(name for (name,) in self._db.execute("SELECT name FROM device ORDER BY name"))
 
@@ -347,13 +349,13 @@ class HistoryReader:
         """Return the start and end of the stored rows of a device (Unix time [s]); None without rows."""
         return _stored_span(self._db, self._id(device))
 
-    def newest_s(self, device: str) -> float:
+    def newest_result_s(self, device: str) -> float:
         """Return the Unix time of the newest result of a device [s]; NaN without rows."""
         query = "SELECT newest FROM row WHERE device = ? AND width = ? ORDER BY start DESC LIMIT 1"
         found = [self._db.execute(query, (self._id(device), width_s)).fetchone() for width_s, _ in LEVELS]
         return max((one[0] for one in found if one is not None), default=math.nan)
 
-    def rows(self, device: str, span: TimeRange) -> Iterator[HistoryRow]:
+    def read_rows(self, device: str, span: TimeRange) -> Iterator[HistoryRow]:
         """Iterate over the rows that overlap a time range: wide rows first, rows of one width in order of time.
 
         Parameters
@@ -366,14 +368,19 @@ class HistoryReader:
         for width_s, _ in LEVELS[::-1]:
             found = self._db.execute(
                 f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start > ? AND start <= ? ORDER BY start",
-                (self._id(device), width_s, clamp_time(span.start_s - width_s), clamp_time(span.end_s)),
+                (
+                    self._id(device),
+                    width_s,
+                    clamp_to_sqlite_range(span.start_s - width_s),
+                    clamp_to_sqlite_range(span.end_s),
+                ),
             )
             for one in found:
-                row = self._layouts.row(one)
+                row = self._layouts.parse_row(one)
                 if span.overlaps(row.start_s, row.end_s):
                     yield row
 
-    def events(self, device: str, span: TimeRange, at_most: int) -> tuple[list[StoredEvent], int]:
+    def read_events(self, device: str, span: TimeRange, max_events: int) -> tuple[list[StoredEvent], int]:
         """Return the newest events in a time range, in order of time, and the number of all events in this range.
 
         Parameters
@@ -382,10 +389,10 @@ class HistoryReader:
             Name of the device.
         span
             Time range.
-        at_most
+        max_events
             Largest number of events to return.
         """
-        return read_events(self._db, self._id(device), span, at_most)
+        return read_events(self._db, self._id(device), span, max_events)
 
     def _id(self, device: str) -> int:
         """Return the identifier of a device; -1 if the file does not contain the device."""
@@ -458,20 +465,20 @@ class _LayoutCache:
         self._ids: dict[tuple[str, ...], int] = {}
         self._names: dict[int, tuple[str, ...]] = {}
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Clear the cache."""
         self._ids.clear()
         self._names.clear()
 
-    def id(self, names: tuple[str, ...]) -> int:
+    def layout_id(self, names: tuple[str, ...]) -> int:
         """Return the identifier of a layout. A new layout gets a new identifier."""
         if names not in self._ids:
             self._ids[names] = _identifier(self._db, "layout", "names", " ".join(names))
         return self._ids[names]
 
-    def row(self, found: Sequence[Any]) -> HistoryRow:
+    def parse_row(self, record: Sequence[Any]) -> HistoryRow:
         """Convert a record of the database into a row."""
-        start, width, newest, layout, received, lost, bad, overflowed, state, data = found
+        start, width, newest, layout, received, lost, bad, overflowed, state, data = record
         whole = (start, width, layout, received, lost, bad, overflowed, state)
         if not (all(isinstance(one, int) for one in whole) and isinstance(newest, float) and isinstance(data, bytes)):
             raise RecordingError("a row has fields of another kind")
@@ -525,7 +532,7 @@ def _check_files(path: Path) -> None:
     """Raise OSError if the file, or an additional file of the database, is not a regular file."""
     for end in ("", *SQLITE_SUFFIXES):
         with contextlib.suppress(FileNotFoundError):
-            check_regular(Path(f"{path}{end}"))
+            check_regular_file(Path(f"{path}{end}"))
 
 
 @contextlib.contextmanager

@@ -54,7 +54,7 @@ class TimeRange:
         before = t_s <= self.end_s if self.end_included else t_s < self.end_s
         return after and before
 
-    def to_zenoh(self) -> str:
+    def format_for_zenoh(self) -> str:
         """Return the range in the notation of zenoh. A time before 1970 or after 9999 is omitted."""
         ends = [
             "" if not 0.0 <= one < MAX_DATE_S else f"{datetime.fromtimestamp(one, UTC):%Y-%m-%dT%H:%M:%S.%fZ}"

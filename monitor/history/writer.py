@@ -168,7 +168,7 @@ class HistoryWriter:
             while batch := self._next_batch():
                 rows = [(device, what) for device, what in batch if isinstance(what, HistoryRow)]
                 events = [(device, what) for device, what in batch if isinstance(what, StoredEvent)]
-                store.add(rows, events)
+                store.write_rows_and_events(rows, events)
                 self._remove_written(len(batch))
             while (
                 store.merge_old_rows(self._now_s(), MERGES_PER_STEP)

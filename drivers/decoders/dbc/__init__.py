@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from drivers.data_types import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock, Timing
 from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Bytes, Decoder
 from drivers.decoders.dbc.database import Database
-from drivers.decoders.dbc.sample_assembly import Message, SampleAssembler, SampleFrames
+from drivers.decoders.dbc.sample_assembly import CanMessage, SampleAssembler, SampleFrames
 from drivers.decoders.dbc.settings import COLUMNS, Settings, SignalSettings
 
 __all__ = ["DbcDecoder", "Settings", "SignalSettings", "build"]
@@ -50,8 +50,8 @@ class DbcDecoder:
 
     carrier: ClassVar[str] = "frames"
 
-    def __init__(self, messages: Sequence[Message], settings: Settings, timing: Timing) -> None:
-        slow = [m for m in messages if m.only_temperature and len(messages) > 1]
+    def __init__(self, messages: Sequence[CanMessage], settings: Settings, timing: Timing) -> None:
+        slow = [m for m in messages if m.has_only_temperature and len(messages) > 1]
         self._slow = slow[0] if slow else None
         self._messages = [m for m in messages if m is not self._slow]
         self._settings = settings
@@ -118,7 +118,7 @@ class DbcDecoder:
         """Return the frames of each sample. Bits without a signal are 0, or 1 in J1939 messages."""
         n = len(samples)
         table = np.column_stack((samples.values, samples.temperature_c))
-        sent: list[tuple[Message, Bytes]] = []
+        sent: list[tuple[CanMessage, Bytes]] = []
         # the temperature is sent first, since the decoder applies it to the following samples
         for _, message in sorted(self._numbered_messages()):
             frames = np.full((n, message.length), 0xFF if message.j1939 else 0, np.uint8)
@@ -136,7 +136,7 @@ class DbcDecoder:
             if message is not self._slow or not np.isnan(samples.temperature_c[row])
         ]
 
-    def _numbered_messages(self) -> list[tuple[int, Message]]:
+    def _numbered_messages(self) -> list[tuple[int, CanMessage]]:
         """Return the messages and their indices. The message that contains only the temperature has the index -1."""
         slow = [(-1, self._slow)] if self._slow is not None else []
         return [*slow, *enumerate(self._messages)]

@@ -13,11 +13,11 @@ from typing import Any, Final
 import drivers
 from drivers import file_access, units
 from drivers.data_types import ArrivalTimedFormat, CounterTimedFormat, Timing
-from drivers.decoders.dbc.sample_assembly import Column, Message
+from drivers.decoders.dbc.sample_assembly import CanMessage, MeasuredSignal
 from drivers.decoders.dbc.settings import COLUMNS, TEMPERATURE, Settings, SignalSettings
 from drivers.decoders.dbc.signal_bits import SignalBits
 from drivers.errors import ConfigError
-from drivers.extras import check_extra
+from drivers.extras import require_extra
 from drivers.module_lookup import format_suggestion
 
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
@@ -43,7 +43,7 @@ class Database:
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._errors: list[str] = []
-        self._used: dict[str, Message] = {}
+        self._used: dict[str, CanMessage] = {}
         self.timing: Timing = ArrivalTimedFormat()
         """Timing of the samples."""
         with self._collecting():
@@ -54,9 +54,9 @@ class Database:
             raise ConfigError(*self._errors)
 
     @property
-    def messages(self) -> list[Message]:
+    def messages(self) -> list[CanMessage]:
         """Messages with the configured signals, beginning with the message that contains only the counter."""
-        return sorted(self._used.values(), key=lambda m: not m.only_counter)
+        return sorted(self._used.values(), key=lambda m: not m.has_only_counter)
 
     @contextlib.contextmanager
     def _collecting(self) -> Iterator[None]:
@@ -99,7 +99,7 @@ class Database:
         if "." in name or self._settings.join == "time":
             return [self._find_signal("counter", name)]
         # a message with only the temperature needs no counter
-        inertial = [m.name for m in self._used.values() if not m.only_temperature]
+        inertial = [m.name for m in self._used.values() if not m.has_only_temperature]
         return [self._find_signal("counter", f"{message}.{name}") for message in inertial]
 
     def _add_axis(self, axis: str, entry: SignalSettings) -> None:
@@ -107,7 +107,7 @@ class Database:
         message, signal = self._find_signal(f"signals.{axis}", entry.signal)
         factor, offset = self._conversion_to_si(axis, entry, signal)
         bits = self._signal_bits(message, signal)
-        column = Column(COLUMNS.index(axis), bits, factor, offset)
+        column = MeasuredSignal(COLUMNS.index(axis), bits, factor, offset)
         self._register_message(message, bits).columns.append(column)
 
     def _conversion_to_si(self, axis: str, entry: SignalSettings, signal: Any) -> tuple[float, float]:
@@ -115,9 +115,9 @@ class Database:
         unit = entry.unit or signal.unit or ""
         try:
             if axis == TEMPERATURE:
-                factor, offset = units.temperature_scale(unit)
+                factor, offset = units.temperature_factor_and_offset(unit)
             else:
-                look_up = units.rate_factor if axis.startswith("g") else units.acceleration_factor
+                look_up = units.angular_rate_factor if axis.startswith("g") else units.acceleration_factor
                 factor, offset = look_up(unit), 0.0
         except ConfigError as error:
             where = "" if entry.unit else f" (the unit in {self._path.name})"
@@ -146,10 +146,10 @@ class Database:
             raise ConfigError(f"{key}: {name} is multiplexed; such signals are not supported")
         return message, signal
 
-    def _register_message(self, message: Any, bits: SignalBits) -> Message:
+    def _register_message(self, message: Any, bits: SignalBits) -> CanMessage:
         """Add a message to the used messages, and extend its ``size`` so that a frame contains the signal."""
         extended, j1939 = bool(message.is_extended_frame), self._is_j1939(message)
-        new = Message(message.name, message.frame_id, extended, j1939, size=0, length=message.length, columns=[])
+        new = CanMessage(message.name, message.frame_id, extended, j1939, size=0, length=message.length, columns=[])
         entry = self._used.setdefault(message.name, new)
         entry.size = max(entry.size, bits.end_byte)
         return entry
@@ -204,7 +204,7 @@ def _locate(file: str) -> Path:
 
 def _load(path: Path) -> Any:
     """Read a database without strict checks, since unused signals overlap in many files."""
-    check_extra("can", "a CAN database")
+    require_extra("can", "a CAN database")
     import cantools
 
     try:

@@ -36,7 +36,7 @@ MAX_UNDECIDED_PER_MESSAGE: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
+class MeasuredSignal:
     """Signal of one axis, with the conversion to SI units."""
 
     index: int  # in COLUMNS
@@ -46,7 +46,7 @@ class Column:
 
 
 @dataclass(slots=True)
-class Message:
+class CanMessage:
     """CAN message that contains a part of a sample."""
 
     name: str
@@ -55,7 +55,7 @@ class Message:
     j1939: bool
     size: int  # number of bytes from the start of the message to the end of the last used signal
     length: int  # number of bytes of the complete message
-    columns: list[Column]
+    columns: list[MeasuredSignal]
     valid: SignalBits | None = None
     counter: SignalBits | None = None
 
@@ -65,12 +65,12 @@ class Message:
         return self.frame_id | (EXTENDED_ID if self.extended else 0)
 
     @property
-    def only_counter(self) -> bool:
+    def has_only_counter(self) -> bool:
         """True if the message contains only the counter."""
         return self.counter is not None and not self.columns and self.valid is None
 
     @property
-    def only_temperature(self) -> bool:
+    def has_only_temperature(self) -> bool:
         """True if the message contains only the temperature. Such a message may be sent less often than samples."""
         indices = {column.index for column in self.columns}
         return indices == {len(AXES)} and self.valid is None and self.counter is None
@@ -105,11 +105,11 @@ class SampleAssembler:
         Settings of the decoder.
     """
 
-    def __init__(self, messages: Sequence[Message], settings: Settings) -> None:
+    def __init__(self, messages: Sequence[CanMessage], settings: Settings) -> None:
         self._n = len(messages)
         self._by_count = settings.join == "counter"
         self._counters = [m.counter for m in messages]
-        self._counter_message = next((i for i, m in enumerate(messages) if m.only_counter), None)
+        self._counter_message = next((i for i, m in enumerate(messages) if m.has_only_counter), None)
         self._window_ns = round(settings.window * 1e9) or (1 << 62)
         self._partial = settings.partial
         self.dropped_late_samples = 0
@@ -141,78 +141,84 @@ class SampleAssembler:
         delay_ns, self._delay_ns = self._delay_ns, 0
         return delay_ns
 
-    def add_frame(self, which: int, data: bytes, t_ns: int, done: list[SampleFrames]) -> None:
+    def add_frame(self, message_index: int, data: bytes, t_ns: int, finished: list[SampleFrames]) -> None:
         """Add one frame to the sample to which it belongs.
 
         Parameters
         ----------
-        which
+        message_index
             Index of the message.
         data
             Bytes of the frame; b"" if it is too short.
         t_ns
             Arrival time in ns.
-        done
+        finished
             List to which finished samples are appended.
         """
         if self._newest_ns is not None:
-            self._pauses[which].append(t_ns - self._newest_ns)
+            self._pauses[message_index].append(t_ns - self._newest_ns)
         self._newest_ns = t_ns
-        if not self._undecided and self._assign_frame(which, data, t_ns, done):
+        if not self._undecided and self._assign_frame(message_index, data, t_ns, finished):
             return
-        self._undecided.append((which, data, t_ns))
-        while self._undecided and self._assign_frame(*self._undecided[0], done):
+        self._undecided.append((message_index, data, t_ns))
+        while self._undecided and self._assign_frame(*self._undecided[0], finished):
             self._undecided.popleft()
 
-    def _assign_frame(self, which: int, data: bytes, t_ns: int, done: list[SampleFrames]) -> bool:
+    def _assign_frame(self, message_index: int, data: bytes, t_ns: int, finished: list[SampleFrames]) -> bool:
         """Add a frame to the current or the next sample. Return False if the order of the messages is unknown."""
-        count = self._read_count(which, data)
+        count = self._read_count(message_index, data)
         sample = self._current
         if sample is not None:
             delay_ns = t_ns - sample.start_ns
-            next_one = self._begins_next(sample, which, count, delay_ns)
+            next_one = self._begins_next(sample, message_index, count, delay_ns)
             if next_one is None:
                 return False
             if next_one:
                 if NO_TICK != count == self._count_before:
                     return True  # the frame belongs to the previous sample, which has already been counted
-                self._finish(sample, done)
+                self._finish(sample, finished)
                 sample = None
             elif delay_ns > self._window_ns:
                 self._delay_ns = delay_ns
-                self._add_late_frame(sample, which, data, done)
+                self._add_late_frame(sample, message_index, data, finished)
                 return True
         if sample is None:
             sample = self._current = SampleFrames([None] * self._n, t_ns, t_ns, NO_TICK)
-        sample.frames[which] = data
+        sample.frames[message_index] = data
         sample.t_ns = t_ns
         if count != NO_TICK:
             sample.count = count
         if sample.complete:
-            self._finish(sample, done)
+            self._finish(sample, finished)
             self._current = None
         return True
 
-    def _add_late_frame(self, sample: SampleFrames, which: int, data: bytes, done: list[SampleFrames]) -> None:
+    def _add_late_frame(
+        self, sample: SampleFrames, message_index: int, data: bytes, finished: list[SampleFrames]
+    ) -> None:
         """Mark a message of the current sample as late."""
         if data:
-            sample.late.add(which)
+            sample.late.add(message_index)
         else:
-            sample.frames[which] = data  # the frame is too short, so the sample is bad
+            sample.frames[message_index] = data  # the frame is too short, so the sample is bad
         if sample.frames.count(None) == len(sample.late):
-            self._finish(sample, done)
+            self._finish(sample, finished)
             self._current = None
 
-    def _read_count(self, which: int, data: bytes) -> int:
+    def _read_count(self, message_index: int, data: bytes) -> int:
         """Return the counter value in a frame; NO_TICK if the frame contains no counter."""
-        bits = self._counters[which]
+        bits = self._counters[message_index]
         if bits is None or not data or not self._by_count:
             return NO_TICK
         return int(bits.extract_raw(np.frombuffer(data, np.uint8)[None, :])[0])
 
-    def _begins_next(self, sample: SampleFrames, which: int, count: int, delay_ns: int) -> bool | None:
+    def _begins_next(self, sample: SampleFrames, message_index: int, count: int, delay_ns: int) -> bool | None:
         """Return True if a frame starts the next sample; None if this depends on the unknown order of the messages."""
-        if sample.frames[which] is not None or which in sample.late or which == self._counter_message:
+        if (
+            sample.frames[message_index] is not None
+            or message_index in sample.late
+            or message_index == self._counter_message
+        ):
             return True
         if NO_TICK not in (count, sample.count):
             return count != sample.count
@@ -224,17 +230,17 @@ class SampleAssembler:
         pauses = [median(newest) if newest else 0 for newest in self._pauses]
         first = pauses.index(max(pauses)) if self._counter_message is None else self._counter_message
         # the sum of the pauses before all messages is the sample period
-        return which == first or delay_ns >= sum(pauses)
+        return message_index == first or delay_ns >= sum(pauses)
 
-    def _finish(self, sample: SampleFrames, done: list[SampleFrames]) -> None:
-        """Append a good sample to ``done``, or count a late or bad sample."""
+    def _finish(self, sample: SampleFrames, finished: list[SampleFrames]) -> None:
+        """Append a good sample to ``finished``, or count a late or bad sample."""
         self._count_before = sample.count
         whole = sample.complete and b"" not in sample.frames
         if whole or (self._partial and any(sample.frames)):
             sample.missing_before = self.take_missing_samples()
             sample.temperature = self.temperature
             self._synchronized = True
-            done.append(sample)
+            finished.append(sample)
         elif sample.late and b"" not in sample.frames and sample.frames.count(None) == len(sample.late):
             self._synchronized = True
             self.dropped_late_samples += 1

@@ -96,7 +96,7 @@ def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES
 
 def _estimated_coefficients(past: HistoryTable, axis: str) -> list[str]:
     """Return the coefficients of an axis that were estimated in at least one bucket."""
-    return [letter for letter in SYMBOLS if np.isfinite(past.column(f"{axis}.{letter}").last).any()]
+    return [letter for letter in SYMBOLS if np.isfinite(past.select_column(f"{axis}.{letter}").last).any()]
 
 
 def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str, axes: Sequence[str]) -> None:
@@ -104,8 +104,8 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
     unit = COEFFICIENT_UNITS[kind][letter]
     lows, highs = [], []
     for axis in axes:
-        column, colour = past.column(f"{axis}.{letter}"), style.axis_colour(axis)
-        ends = [past.column(f"{axis}.{letter}.{end}").last for end in ("lo", "hi")]
+        column, colour = past.select_column(f"{axis}.{letter}"), style.axis_colour(axis)
+        ends = [past.select_column(f"{axis}.{letter}.{end}").last for end in ("lo", "hi")]
         t, low, high, last, lo, hi = _with_gaps(past, *(
             unit.factor * part for part in (column.low, column.high, column.last, *ends)
         ))  # fmt: skip
@@ -127,7 +127,7 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
 
 def _draw_temperature(panel: "Axes", past: HistoryTable) -> None:
     """Draw the temperature with its extremes."""
-    column = past.column("temperature")
+    column = past.select_column("temperature")
     t, low, high, last = _with_gaps(past, column.low, column.high, column.last)
     if np.isfinite(last).any():
         style.draw_band(panel, t, low, high, style.ORANGE, alpha=EXTREMES_ALPHA)
