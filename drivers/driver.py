@@ -211,11 +211,9 @@ class Driver:
             self._handle_recovery()
 
     def _decoder_drops(self) -> int:
-        """Return the number of samples that the decoder has dropped because they were bad or late."""
         return self.decoder.bad + (self._counts_late.dropped_late_samples if self._counts_late else 0)
 
     def _count_decoder_drops(self) -> None:
-        """Update the counts of bad and late samples."""
         self.counts.bad = self.decoder.bad
         if self._counts_late:
             self.counts.lost += self._counts_late.dropped_late_samples - self.counts.late
@@ -242,7 +240,6 @@ class Driver:
         self._last_report_s = time.monotonic()
 
     def _check_silence(self) -> None:
-        """Raise LinkLost if the link has been silent for longer than the limit."""
         silent_s = time.monotonic() - self._last_data_s
         if self._silence_s and silent_s > self._silence_s:
             raise LinkLost(f"{self.link.name} silent for {silent_s:.1f} s")
@@ -263,13 +260,11 @@ class Driver:
             self.clock.note_link_closed()
 
     def _handle_recovery(self) -> None:
-        """Report that samples arrive again."""
         if self.state == "lost":
             self._event("link_back", f"{self.link.name} is back")
         self.state, self.text = "running", ""
 
     def _handle_link_error(self, error: LinkError) -> None:
-        """Report a lost link, close the link and reset the decoder."""
         if self.state == "running":
             self._event("link_lost", str(error))
             self.state = "lost"
@@ -280,7 +275,6 @@ class Driver:
         self.clock.note_link_closed()
 
     def _event(self, kind: str, text: str) -> None:
-        """Queue an event."""
         # the present time, on the clock of the sample times
         t_ns = self._newest_t_ns if self.times_are_unix else time.monotonic_ns()
         self._events.append(Event(kind, t_ns, text))

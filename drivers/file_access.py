@@ -123,7 +123,6 @@ def read_small_file(path: Path, *, allow_pipe: bool = False) -> bytes:
 
 
 def _is_fifo(path: Path) -> bool:
-    """Return True if the path is a FIFO."""
     try:
         return stat.S_ISFIFO(os.stat(path).st_mode)
     except (OSError, ValueError):  # reading the file reports the error
@@ -131,7 +130,6 @@ def _is_fifo(path: Path) -> bool:
 
 
 def _check_mode(path: Path, mode: int) -> None:
-    """Raise OSError if the mode does not belong to a regular file."""
     if not stat.S_ISREG(mode):
         kind = FILE_KINDS.get(stat.S_IFMT(mode), "something else")
         number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL

@@ -184,7 +184,6 @@ def find_settings_model(annotation: Any) -> type[SettingsModel] | None:
 
 
 def _problems(kind: type[SettingsModel], error: ErrorDetails, checked: TableCheckResult[Any]) -> Iterator[Problem]:
-    """Convert one pydantic error to problems."""
     key_path = _format_location(error["loc"])
     cause = error.get("ctx", {}).get("error")
     if isinstance(cause, TableError):
@@ -200,7 +199,6 @@ def _problems(kind: type[SettingsModel], error: ErrorDetails, checked: TableChec
 
 
 def _describe(error: ErrorDetails) -> str:
-    """Describe a wrong value without the names of Python types."""
     value = error["input"]
     if error["type"] == "missing":
         return "missing"
@@ -211,7 +209,6 @@ def _describe(error: ErrorDetails) -> str:
 
 
 def _add_conflicts(checked: TableCheckResult[Any], value: object, key_path: str) -> None:
-    """Add the conflicts of a model and of all models that the fields contain."""
     if isinstance(value, SettingsModel):
         for one in value.find_conflicts():
             problem = Problem(one.key, one.text).nest_under(key_path)
@@ -226,7 +223,6 @@ def _add_conflicts(checked: TableCheckResult[Any], value: object, key_path: str)
 
 
 def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
-    """Replace a wrong or missing value by a default or an example."""
     *path, last = [part for part in error["loc"] if part != "[key]"]
     found = _field_at(kind, error["loc"])[1]
     with contextlib.suppress(LookupError):  # an earlier repair may have removed the value
@@ -336,7 +332,6 @@ class KeywordOrType:
         return core_schema.with_info_wrap_validator_function(replace_keyword, handler.generate_schema(self._kind))
 
     def _describe(self, value: object, error: ErrorDetails) -> str:
-        """Describe a value that is neither one of the words nor valid for the type."""
         cause = error.get("ctx", {}).get("error")
         text = str(cause) if isinstance(cause, ConfigError) else _describe(error)
         near = format_choices_by_similarity(str(value), tuple(self._words)).partition("are ")[2].split(", ")
@@ -368,7 +363,6 @@ def checked_by(check: Callable[[T], object]) -> AfterValidator:
 
 
 def _existing_file(value: str, info: ValidationInfo) -> str:
-    """Return the path of a file. Raise ConfigError if the file does not exist."""
     path = _beside(value, info)
     if path is not None and not os.path.exists(path):  # unlike Path.exists, accepts an invalid name
         raise ConfigError(f"{path}: no such file")

@@ -115,7 +115,6 @@ def time_factor(unit: str) -> float:
 
 
 def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
-    """Return the entry of a unit. Raise ConfigError if the table does not contain the unit."""
     # Unicode has two characters for the prefix micro, and both are in use
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     if name not in table:

@@ -1,17 +1,17 @@
 """VectorNav VN-100/200/300 binary messages.
 
-The format is ``FA | groups u8 | a field mask u16le for each group | payload little-endian | CRC u16be``. The masks
-state which fields follow, in the order of groups and bits. Messages of groups 1, 2, 3 and 5 are decoded. Messages of
-other groups are rejected, since the decoder does not know the sizes of their fields. The CRC-16 has the polynomial
-0x1021 and the initial value 0, and covers all bytes after 0xFA. The CRC of a valid message, including the CRC field, is
-0 (VN-100 user manual UM001 v2.1, pages 27-43).
+The format is ``FA | groups u8 | a field mask u16le for each group | payload little-endian | CRC u16be``. The field
+masks specify the fields of the payload, in the order of groups and bits. Messages of groups 1, 2, 3 and 5 are decoded.
+Messages of other groups are rejected, since the decoder does not know the sizes of their fields. The CRC-16 has the
+polynomial 0x1021 and the initial value 0, and covers all bytes after 0xFA. The CRC of a valid message, including the
+CRC field, is 0 (VN-100 user manual UM001 v2.1, pages 27-43).
 
 For noise analysis, the fields TimeStartup and Imu of group 1 are recommended (``FA 01 01 02``, 38 bytes). The fields
-Imu, UncompGyro and UncompAccel contain the measured values. The fields AngularRate and Accel contain the values after
-the on-board filter has subtracted its bias estimate. The subtraction hides bias instability and random walk. If a
-message contains both kinds of fields, ``compensated`` selects one kind. If a message contains only accelerations or
-only angular rates, the other axes are marked as not measured. A message without accelerations and angular rates is
-ignored. The z axis of VectorNav sensors points down and measures -9.8 m/s² at rest.
+Imu, UncompGyro and UncompAccel contain the measured values. The fields AngularRate and Accel contain compensated
+values, from which the on-board filter has subtracted a bias estimate. The subtraction hides bias instability and random
+walk. If a message contains measured and compensated values, the key ``compensated`` selects one of them. If a message
+contains only accelerations or only angular rates, the other axes are marked as not measured. A message without
+accelerations and angular rates is ignored. The z axis of VectorNav sensors points down and measures -9.8 m/s² at rest.
 """
 
 import binascii
@@ -62,7 +62,7 @@ class Settings(SettingsModel):
 
 @lru_cache(maxsize=256)
 def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.void] | None:
-    """Return the layout of the messages with this header.
+    """Return the structured NumPy type of the messages with a given header.
 
     Parameters
     ----------
@@ -74,8 +74,8 @@ def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.
     Returns
     -------
     dtype or None
-        Structured type of a complete message. The fields are time, gyro, accel and temperature, as far as the message
-        contains them. None if the header contains unknown groups or fields.
+        Structured type of a complete message with the fields time, gyro, accel and temperature. Fields that the message
+        does not contain are omitted. None if the header contains unknown groups or fields.
     """
     groups = [g for g in range(1, 9) if header[0] >> (g - 1) & 1]
     masks = struct.unpack(f"<{len(groups)}H", header[1:])
@@ -93,7 +93,7 @@ def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.
 
 
 def _build_layout(offsets: dict[tuple[int, int], int], length: int, prefer_compensated: bool) -> np.dtype[np.void]:
-    """Return the layout of messages of ``length`` bytes. ``offsets`` maps (group, bit) to the offset of the field."""
+    """Return the type of messages of ``length`` bytes. ``offsets`` maps (group, bit) to the offset of a field."""
     order = -1 if prefer_compensated else 1
     gyro = (UNCOMPENSATED_GYRO, COMPENSATED_GYRO)[::order]
     accel = (UNCOMPENSATED_ACCEL, COMPENSATED_ACCEL)[::order]
@@ -114,7 +114,6 @@ def _build_layout(offsets: dict[tuple[int, int], int], length: int, prefer_compe
 
 
 def _header_end(groups: int) -> int:
-    """Return the offset of the payload; 0 for an invalid or unsupported group byte."""
     # bit 7 announces a second group byte, which is not supported
     return 0 if groups == 0 or groups & 0x80 else 2 + 2 * groups.bit_count()
 
@@ -141,7 +140,6 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         return super().recent_problem
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
-        """Return the samples in the messages with angular rates or accelerations."""
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
@@ -165,7 +163,6 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         return blocks
 
     def _match_message(self, buffer: bytes, at: int) -> int:
-        """Return the length of a message (see ``drivers.decoders.base.FrameMatcher``)."""
         if len(buffer) < at + 2:
             return base.NEED_MORE
         header_end = HEADER_END[buffer[at + 1]]
@@ -182,7 +179,8 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         return base.REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return messages with TimeStartup and Imu of group 1. If the block has temperatures, add MagPres."""
+        """Encode samples as messages with the fields TimeStartup and Imu of group 1. If the block has temperatures, add
+        MagPres."""
         has_temperature = bool(np.isfinite(samples.temperature_c).any())
         header = bytes.fromhex("01 01 06" if has_temperature else "01 01 02")
         layout = build_message_dtype(header, prefer_compensated=False)
@@ -198,7 +196,6 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
 
 
 def _as_float64(numbers: NDArray[np.float32]) -> Floats:
-    """Convert numbers to float64."""
     with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
         return numbers.astype(np.float64)
 

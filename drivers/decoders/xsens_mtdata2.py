@@ -1,17 +1,17 @@
 """Xsens / Movella MTi over UART or USB: MTData2 messages of the Xbus protocol.
 
-The format is ``FA FF 36 | LEN | payload | CS``, big-endian. If LEN is 0xFF, the length follows as u16. The low byte of
-the sum of all bytes after 0xFA is 0. The payload is a list of items ``DID u16 | size u8 | data``. The two low bits of
-the data identifier (DID) state the number format: float32, fixed 12.20, fixed 16.32 or float64. The next two bits state
-the coordinate frame and are ignored. In a fixed 16.32 number, the 32-bit fraction precedes the 16-bit integer part, and
-each part is big-endian. Three independent public parsers agree on this order; the manual was not available. Source:
+The format is ``FA FF 36 | LEN | payload | CS``, big-endian. If LEN is 0xFF, the length follows as u16. The sum of all
+bytes after 0xFA is 0 modulo 256. The payload is a list of items ``DID u16 | size u8 | data``. The two low bits of the
+data identifier (DID) state the number format: float32, fixed 12.20, fixed 16.32 or float64. The next two bits state the
+coordinate frame and are ignored. In a fixed 16.32 number, the 32-bit fraction precedes the 16-bit integer part, and
+each part is big-endian. The byte order of fixed 16.32 numbers was taken from three independent public parsers. Source:
 Movella, MT low level communication protocol (MT0101P).
 
-The decoder reads acceleration 0x4020 (or high-rate 0x4040), rate of turn 0x8020 (or high-rate 0x8040), the clock 0x1060
-or 0x1020, and temperature 0x0810. Free acceleration 0x4030 is not used, since the orientation filter has removed
-gravity. If a packet contains only accelerations or only rates, the other axes are marked as not measured (NaN). A
-packet without accelerations and rates is ignored. Temperatures often arrive in separate packets at a lower rate. Each
-sample gets the newest temperature since the link was opened.
+The decoder reads the acceleration 0x4020 or 0x4040 (high-rate), the rate of turn 0x8020 or 0x8040 (high-rate), the
+clock 0x1060 or 0x1020, and the temperature 0x0810. Free acceleration 0x4030 is not used, since the orientation filter
+has removed gravity. If a packet contains only accelerations or only rates, the other axes are marked as not measured
+(NaN). A packet without accelerations and rates is ignored. Temperatures often arrive in separate packets at a lower
+rate. Each sample gets the newest temperature since the link was opened.
 """
 
 import struct
@@ -63,13 +63,13 @@ class Settings(SettingsModel):
 
 @dataclass(frozen=True, slots=True)
 class PacketLayout:
-    """Positions of the items in a packet."""
+    """Positions of the data items in an MTData2 packet."""
 
     items: tuple[tuple[int, int, int], ...]  # DID, offset of the data and size of each item
     header_offsets: tuple[int, ...]  # offsets of the DID and size bytes of all items
 
     def locate_numbers(self, data_id: int, count: int) -> tuple[int, int] | None:
-        """Find the first item with a given DID and number of values.
+        """Find the first item with a given data identifier and number of values.
 
         Parameters
         ----------
@@ -89,7 +89,7 @@ class PacketLayout:
         return None
 
     def locate_integer(self, data_id: int, size: int) -> int:
-        """Return the offset of an item that is an unsigned integer; 0 if there is no such item.
+        """Return the offset of an unsigned integer item; 0 if the packet contains no such item.
 
         Parameters
         ----------
@@ -102,7 +102,7 @@ class PacketLayout:
 
 
 def _parse_layout(frame: bytes) -> PacketLayout | None:
-    """Return the layout of a packet; None if the items do not fill the payload exactly."""
+    """Return the layout of a packet; None if the sizes of the items do not match the payload."""
     at = 6 if frame[3] == 0xFF else 4
     end = len(frame) - 1
     items: list[tuple[int, int, int]] = []
@@ -144,7 +144,7 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         self._temperature_c = np.nan
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
-        """Return the samples in the packets with rates or accelerations. A packet with an invalid layout is bad."""
+        """Return the samples of packets with rates or accelerations. A packet with an invalid layout is bad."""
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
@@ -167,7 +167,6 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         return blocks
 
     def _fill_temperatures(self, temperature_c: Floats) -> Floats:
-        """Replace missing temperatures by the last known temperature."""
         known = np.concatenate([[self._temperature_c], temperature_c])
         last = np.maximum.accumulate(np.where(np.isnan(known), 0, np.arange(known.size)))
         filled: Floats = known[last][1:]
@@ -175,7 +174,8 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         return filled
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return one packet per sample with both clocks and the measured quantities."""
+        """Encode each sample as one packet with the packet counter, the fine sample time and the measured
+        quantities."""
         number_format = FORMATS.index(self._settings.format)
         frames = []
         rows = zip(samples.values, samples.temperature_c.tolist(), samples.ticks.tolist(), strict=True)
@@ -205,7 +205,6 @@ def _group_by_layout(frames: base.Frames) -> Iterator[tuple[PacketLayout | None,
 
 
 def _read_numbers(packets: base.Bytes, at: int, number_format: int, count: int) -> Floats:
-    """Return the ``count`` numbers at the offset ``at`` of each packet as an array [k, count]."""
     data = np.ascontiguousarray(packets[:, at : at + count * SIZES[number_format]])
     if number_format == 0:
         with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
@@ -220,7 +219,6 @@ def _read_numbers(packets: base.Bytes, at: int, number_format: int, count: int) 
 
 
 def _encode_numbers(triple: Floats, number_format: int) -> bytes:
-    """Encode three numbers, clipped to the range of the format."""
     if number_format == 0:
         return triple.astype(">f4").tobytes()
     if number_format == 3:
@@ -241,15 +239,6 @@ def encode_message(payload: bytes) -> bytes:
 
 
 def _match_message(buffer: bytes, at: int) -> int:
-    """Return the length of a message at an offset of the buffer (see ``drivers.decoders.base.FrameMatcher``).
-
-    Parameters
-    ----------
-    buffer
-        Received bytes.
-    at
-        Offset of the sync pattern.
-    """
     have = len(buffer) - at
     if have < 6:
         return base.NEED_MORE

@@ -77,7 +77,6 @@ ID_MASK: Final = 0x1FFF_FFFF
 
 
 def _check_channel(channel: object) -> None:
-    """Raise ConfigError if the channel is neither a string nor a whole number."""
     if not isinstance(channel, str | int) or isinstance(channel, bool):
         raise ConfigError(f"expected text in quotes or a whole number, got {format_value(channel)}")
 
@@ -151,7 +150,6 @@ class CanLink(PolledLink):
             raise LinkUnavailable(f"{self.name}: {_why_not_open(s, error)}") from error
 
     def _bus_arguments(self) -> dict[str, Any]:
-        """Return the keyword arguments of ``can.Bus``."""
         s = self._settings
         keys: dict[str, Any] = {"receive_own_messages": s.receive_own_messages}
         if s.bitrate is not None:
@@ -207,7 +205,6 @@ class CanLink(PolledLink):
             ) from error
 
     def _to_chunk(self, message: "can.Message") -> Chunk:
-        """Return a frame as a chunk."""
         address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
         return Chunk(bytes(message.data), self._arrival_ns(message), address)
 
@@ -266,7 +263,6 @@ def _probe_server(s: Settings) -> None:
 
 
 def _filter_for_address(address: int) -> dict[str, Any]:
-    """Return the python-can filter for an address."""
     extended = bool(address & EXTENDED_ID)
     mask = ID_MASK if extended else 0x7FF
     if address & ANY_SOURCE:
@@ -277,7 +273,6 @@ def _filter_for_address(address: int) -> dict[str, Any]:
 
 
 def _why_not_open(s: Settings, error: Exception) -> str:
-    """Return the reason why a bus cannot be opened, and the remedy."""
     import can
 
     number = getattr(error, "errno", None)

@@ -180,7 +180,6 @@ class _ValidatingBlfReader(can.BLFReader):
                 raise blf.BLFParseError(f"{MAX_OBJECTS_WITHOUT_FRAME_BYTES} bytes hold no CAN frame")
 
     def _read_container(self) -> bytes | None:
-        """Return the uncompressed content of the next container; None at the end of the file."""
         while header := self.file.read(BLF_HEADER_BYTES):
             mark, _, _, size, kind = blf.OBJ_HEADER_BASE_STRUCT.unpack(header)
             if mark != BLF_OBJECT:

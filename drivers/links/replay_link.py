@@ -146,7 +146,6 @@ class ReplayLink(PolledLink):
         return chunks
 
     def _due_s(self, item: TimedChunk) -> float:
-        """Return the due time of an item on the monotonic clock, in s."""
         return self._started_s + item[0] / self._pace
 
     def _fetch_next(self) -> None:
@@ -164,7 +163,6 @@ class ReplayLink(PolledLink):
             items.close()
 
     def _read_items(self) -> Generator[TimedChunk]:
-        """Return the chunks of the file with their due times."""
         if self._kind == "recording":
             recording = load_samples(self._path, self._settings.rate)
             self.notes = recording.notes
@@ -197,7 +195,6 @@ def _read_messages(recording: Recording, rows: int) -> Generator[TimedChunk]:
 
 
 def _relative_times(chunks: Iterator[Chunk]) -> Generator[TimedChunk]:
-    """Yield each chunk with the time since the first chunk in s."""
     start_ns: int | None = None
     for chunk in chunks:
         start_ns = chunk.t_ns if start_ns is None else start_ns
@@ -205,7 +202,6 @@ def _relative_times(chunks: Iterator[Chunk]) -> Generator[TimedChunk]:
 
 
 def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
-    """Yield the data frames of a CAN log."""
     from drivers.links import can_log_reader as can_log
 
     suffix = _plain_suffix(path)
@@ -225,7 +221,6 @@ def _raw_segments(path: Path) -> list[Path]:
 
 
 def _is_raw(path: Path) -> bool:
-    """Return True if the newest segment contains raw data. Return False if the segment cannot be read."""
     found = _raw_segments(path)
     if not found or not segment.NAME.fullmatch(found[-1].name):
         return False
@@ -236,7 +231,6 @@ def _is_raw(path: Path) -> bool:
 
 
 def _raw_carrier(path: Path) -> Carrier:
-    """Return the carrier of the newest segment. Raise ConfigError if the carrier is unknown."""
     carrier = segment.read_metadata(_raw_segments(path)[-1]).carrier
     known: tuple[Carrier, ...] = ("bytes", "frames", "messages")
     for one in known:
@@ -288,7 +282,6 @@ def _detect_kind(path: Path) -> Kind:
 
 
 def _plain_suffix(path: Path) -> str:
-    """Return the last suffix of a path, without a final ".gz"."""
     suffixes = [s.lower() for s in path.suffixes]
     if suffixes and suffixes[-1] == ".gz":
         suffixes.pop()
@@ -296,7 +289,6 @@ def _plain_suffix(path: Path) -> str:
 
 
 def _read_header(path: Path) -> str:
-    """Return the first line of a text file; "" if the file cannot be read."""
     try:
         with _open_text(path) as stream:
             return stream.readline(1000).strip()
@@ -305,7 +297,6 @@ def _read_header(path: Path) -> str:
 
 
 def _open_binary(path: Path) -> IO[bytes]:
-    """Open a binary file for reading. Decompress the content if the name ends in ".gz"."""
     file = file_access.open_regular_file(path)
     if path.suffix.lower() != ".gz":
         return file
@@ -315,7 +306,6 @@ def _open_binary(path: Path) -> IO[bytes]:
 
 
 def _open_text(path: Path) -> IO[str]:
-    """Open a text file for reading. Decompress the content if the name ends in ".gz"."""
     return io.TextIOWrapper(_open_binary(path), "utf-8", newline="")
 
 
@@ -336,7 +326,6 @@ def build(settings: Settings) -> Link:
 
 
 def _check_path(path: Path) -> None:
-    """Raise ConfigError if the path exists but is neither a file nor a folder."""
     if path.is_dir():
         return
     try:

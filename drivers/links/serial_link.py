@@ -42,7 +42,6 @@ SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
 
 
 def _check_port(port: str) -> None:
-    """Raise ConfigError if the port is empty, or is a URL with an unknown scheme."""
     scheme, found, _ = port.partition("://")
     if not port:
         raise ConfigError('empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")')
@@ -53,7 +52,6 @@ def _check_port(port: str) -> None:
 
 
 def _check_stop_bits(number: float) -> None:
-    """Raise ConfigError if no port has this number of stop bits."""
     if number not in STOP_BITS:
         raise ConfigError(f"{number:g}; possible are 1, 1.5, 2")
 
@@ -128,7 +126,6 @@ class SerialLink(PolledLink):
         return [Chunk(data, time.monotonic_ns())] if data else []
 
     def _read_available(self) -> bytes:
-        """Return the bytes that arrive within ``read_timeout``. Raise LinkLost if the device has failed."""
         port = self._port
         assert port is not None
         try:
@@ -165,7 +162,6 @@ def _has_file_number(port: "serial.SerialBase") -> bool:
 
 
 def _why_not_open(port: str, error: Exception) -> str:
-    """Return the reason why a port cannot be opened, and the remedy, in one line."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
         return f"{port}: no such port; {_list_ports()}"
@@ -181,7 +177,6 @@ def _why_not_open(port: str, error: Exception) -> str:
 
 
 def _list_ports() -> str:
-    """Return a text that lists the existing serial ports."""
     from serial.tools import list_ports
 
     found = sorted(info.device for info in list_ports.comports())

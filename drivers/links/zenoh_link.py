@@ -151,7 +151,6 @@ class ZenohLink:
                 self._changed.notify_all()
 
     def _clear_waiting(self) -> None:
-        """Discard the waiting messages."""
         self._waiting.clear()
         self._waiting_bytes = 0
 
@@ -163,7 +162,6 @@ class ZenohLink:
             self._waiting_bytes -= len(self._waiting.popleft().data)
 
     def _close_session(self) -> None:
-        """Close the session and wait for the receiving thread."""
         atexit.unregister(self.close)
         session, self._session = self._session, None
         receiver, self._receiver = self._receiver, None
@@ -177,7 +175,6 @@ class ZenohLink:
             receiver.join()
 
     def _why_not_open(self, error: Exception) -> str:
-        """Return the reason why the session cannot be opened, in one line."""
         config = _configuration(self._settings)
         endpoints = find_connect_endpoints(config)
         shown = mask_secrets(", ".join(endpoints)) or "(connect is empty)"
@@ -188,13 +185,11 @@ class ZenohLink:
 
 
 def _to_chunk(sample: Any, t_ns: int) -> Chunk:
-    """Return a zenoh sample as a chunk."""
     attachment = sample.attachment
     return Chunk(bytes(sample.payload), t_ns, attachment=b"" if attachment is None else bytes(attachment))
 
 
 def _configuration(settings: Settings) -> "zenoh.Config":
-    """Return the configuration of the session."""
     own = {
         "mode": settings.mode,
         "connect/endpoints": settings.connect or None,

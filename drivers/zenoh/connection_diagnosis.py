@@ -81,7 +81,6 @@ def explain_refusal(endpoint: str, config: "zenoh.Config", timeout_s: float = TI
 
 
 def _explain_handshake_failure(plain: socket.socket, host: str, config: "zenoh.Config") -> str:
-    """Perform the TLS handshake and return the reason for its failure."""
     try:
         context = _tls_context(json.loads(config.get_json("transport/link/tls")))
     except (OSError, ssl.SSLError) as error:
@@ -102,7 +101,6 @@ def _explain_handshake_failure(plain: socket.socket, host: str, config: "zenoh.C
 
 
 def _tls_context(tls: dict[str, Any]) -> ssl.SSLContext:
-    """Return the TLS context that zenoh creates from these settings."""
     context = ssl.create_default_context(cafile=tls.get("root_ca_certificate"))
     context.check_hostname = tls.get("verify_name_on_connect") is not False
     certificate, key = tls.get("connect_certificate"), tls.get("connect_private_key")

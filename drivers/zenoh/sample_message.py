@@ -40,8 +40,6 @@ Lost = Annotated[int, msgspec.Meta(ge=0, le=1_000_000_000)]
 
 
 class _Payload(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Keys of the msgpack map."""
-
     schema: str
     axes: list[str]
     data: bytes
@@ -127,7 +125,6 @@ def decode_samples(data: bytes) -> SampleMessage:
 
 
 def _encode_times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
-    """Return the values of the keys ``t``, ``t0`` and ``rate``."""
     n = unix_ns.size
     span_ns = int(unix_ns[-1] - unix_ns[0])
     rate = (n - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
@@ -139,7 +136,6 @@ def _encode_times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | N
 
 
 def _decode_values(payload: _Payload) -> Floats:
-    """Check the sizes, and return the data as an array [rows, columns]."""
     names: Sequence[str] = payload.axes
     if not 0 < len(names) <= MAX_COLUMNS or len(set(names)) != len(names):
         raise DecodeError(f"axes: {len(names)} names, expected 1 to {MAX_COLUMNS} different names")
@@ -152,7 +148,6 @@ def _decode_values(payload: _Payload) -> Floats:
 
 
 def _decode_times_ns(payload: _Payload, n: int) -> Ints:
-    """Return the Unix times [n] of the rows in ns."""
     if isinstance(payload.t, bytes):
         if len(payload.t) != 8 * n:
             raise DecodeError(f"t: {len(payload.t)} bytes for {n} rows, expected one float64 per row")
@@ -173,6 +168,5 @@ def _decode_times_ns(payload: _Payload, n: int) -> Ints:
 
 
 def _check_times(seconds: Floats) -> None:
-    """Raise DecodeError if a time is missing or outside the supported range."""
     if not np.all(np.abs(seconds) < T_LIMIT_S):
         raise DecodeError("t: a time is not a Unix time in seconds")

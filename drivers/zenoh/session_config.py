@@ -124,7 +124,6 @@ def find_secret_files(config: "zenoh.Config") -> tuple[Path, ...]:
 
 
 def _named_files(config: "zenoh.Config", keys: Sequence[str] | None = None) -> tuple[Path, ...]:
-    """Return the files in a configuration under ``keys``, or under all keys of files."""
     found = (json.loads(config.get_json(key)) for key in keys or (*SECRET_FILES, *PUBLIC_FILES))
     return tuple(Path(named) for named in found if named)
 

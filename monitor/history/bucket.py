@@ -101,7 +101,6 @@ def select_columns(row: HistoryRow, names: tuple[str, ...]) -> HistoryRow:
 
 @lru_cache(maxsize=64)
 def _column_indices(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[np.int64]:
-    """Return the index of each wanted name in ``names``; -1 for an unknown name."""
     at = {name: i for i, name in enumerate(names)}
     return np.array([at.get(name, -1) for name in wanted], np.int64)
 

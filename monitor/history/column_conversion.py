@@ -79,7 +79,6 @@ class ColumnConverter:
         return numbers
 
     def _deviations(self, estimate: Estimate) -> Floats:
-        """Return the interpolated deviations, shape [τ, axes]."""
         with np.errstate(divide="ignore"):  # an axis without noise has a deviation of 0
             log = np.log(estimate.curve.avar[:, self._axes])
         below, above = log[self._below], log[self._above]

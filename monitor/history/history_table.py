@@ -219,11 +219,9 @@ def _clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
 
 
 def _bucket(row: HistoryRow, step_s: int) -> tuple[int, int]:
-    """Return the start and width [s] of the bucket that contains a row."""
     width_s = max(row.width_s, step_s)
     return row.start_s // width_s * width_s, width_s
 
 
 def _format_range(held: tuple[float, float]) -> str:
-    """Format the stored time range for a message."""
     return f"{format_utc(held[0])} to {format_utc(held[1])} UTC"

@@ -113,7 +113,6 @@ class MinuteAggregator:
         return full
 
     def _close_row(self) -> HistoryRow:
-        """Close the current row and return it."""
         sources = (self._estimates, self._health, self._temperature)
         parts = [one for one in sources if one is not None and one.count.any()] or [self._health]
         assert self._start_s is not None

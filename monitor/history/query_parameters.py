@@ -114,7 +114,6 @@ def _split(parameters: str) -> Mapping[str, str]:
 
 
 def _parse_list(key: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the words of a comma-separated list, in the order of ``known``."""
     words = [word.strip() for word in text.split(",") if word.strip()]
     for word in words:
         if word not in known:

@@ -125,7 +125,6 @@ class HistoryStore:
             raise
 
     def _prepare(self) -> None:
-        """Create the tables if the file is empty, and set the options of the connection."""
         if not _is_history(self._db, self.path):
             self._db.execute("PRAGMA journal_mode = WAL")
             with self._transaction():
@@ -240,14 +239,12 @@ class HistoryStore:
         self._write(device, row)
 
     def _stored_row(self, device: int, width_s: int, start_s: int) -> HistoryRow | None:
-        """Return the stored row of a bucket; None if there is none."""
         found = self._db.execute(
             f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start = ?", (device, width_s, start_s)
         ).fetchone()
         return None if found is None else self._layouts.parse_row(found)
 
     def _write(self, device: int, row: HistoryRow) -> None:
-        """Insert a row, or replace the stored row of the same bucket."""
         self._db.execute(
             f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
@@ -293,7 +290,6 @@ class HistoryStore:
     # --- internal
 
     def _device_id(self, name: str) -> int:
-        """Return the identifier of a device. A new device gets a new identifier."""
         if name not in self._devices:
             self._devices[name] = _identifier(self._db, "device", "name", name)
         return self._devices[name]
@@ -307,7 +303,6 @@ class HistoryStore:
             self._layouts.clear()
 
     def _committed_by_others(self) -> bool:
-        """Return True if another SQLite connection has changed the file; False if the file has been overwritten."""
         try:
             return self._data_version() != self._version
         except sqlite3.Error:
@@ -319,7 +314,6 @@ class HistoryStore:
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
-        """Run the body in one transaction, which is rolled back after an exception."""
         self._db.execute("BEGIN IMMEDIATE")
         try:
             self._refresh_identifiers()
@@ -395,7 +389,6 @@ class HistoryReader:
         return read_events(self._db, self._id(device), span, max_events)
 
     def _id(self, device: str) -> int:
-        """Return the identifier of a device; -1 if the file does not contain the device."""
         found = self._db.execute("SELECT id FROM device WHERE name = ?", (device,)).fetchone()
         return -1 if found is None else int(found[0])
 
@@ -427,7 +420,6 @@ def open_history(path: Path) -> Iterator[HistoryReader]:
 
 
 def _stored_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | None:
-    """Return the start and end of the rows of a device, each by one index lookup."""
     starts: list[int] = []
     ends: list[int] = []
     for width_s, _ in LEVELS:
@@ -495,7 +487,6 @@ class _LayoutCache:
 
 
 def _identifier(db: sqlite3.Connection, table: str, column: str, text: str) -> int:
-    """Return the identifier of a text in a table. A new text is inserted."""
     db.execute(f"INSERT OR IGNORE INTO {table} ({column}) VALUES (?)", (text,))
     return int(db.execute(f"SELECT id FROM {table} WHERE {column} = ?", (text,)).fetchone()[0])
 
@@ -529,7 +520,6 @@ def _file_states(path: Path) -> tuple[_FileState | None, _FileState | None]:
 
 
 def _check_files(path: Path) -> None:
-    """Raise OSError if the file, or an additional file of the database, is not a regular file."""
     for end in ("", *SQLITE_SUFFIXES):
         with contextlib.suppress(FileNotFoundError):
             check_regular_file(Path(f"{path}{end}"))

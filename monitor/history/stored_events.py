@@ -139,7 +139,6 @@ def _encode_values(what: Mapping[str, Mapping[str, float]]) -> str:
 
 
 def _decode_values(text: str) -> dict[str, dict[str, float]]:
-    """Decode event values from JSON, with NaN for null."""
     found = msgspec.json.decode(text, type=dict[str, dict[str, float | None]])
     return {
         name: {key: math.nan if one is None else one for key, one in sides.items()} for name, sides in found.items()

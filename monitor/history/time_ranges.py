@@ -186,7 +186,6 @@ def _instant(text: str) -> float:
 
 
 def _duration_s(text: str) -> float:
-    """Parse a duration of zero or more, and return the seconds."""
     match = _DURATION.fullmatch(text)
     if match is None or match[2] not in UNITS_S:
         raise ConfigError(f'"{_short(text)}" is not a duration; write 90s, 30m, 1h, 2d, 1w')
@@ -197,6 +196,5 @@ def _duration_s(text: str) -> float:
 
 
 def _short(text: str) -> str:
-    """Return at most 60 printable characters of a text, for an error message."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     return printable if len(printable) <= 60 else f"{printable[:57]}…"

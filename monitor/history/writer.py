@@ -140,7 +140,6 @@ class HistoryWriter:
     # --- methods of the thread
 
     def _run(self) -> None:
-        """Write until the writer is closed."""
         while True:
             closing = self._closing.is_set()
             self._wake.clear()
@@ -158,7 +157,6 @@ class HistoryWriter:
         self._folder.release()
 
     def _write(self) -> bool:
-        """Write the queue and merge old rows; return False after an error."""
         try:
             if holder := self._folder.hold():
                 self._suspend(holder)
@@ -189,7 +187,6 @@ class HistoryWriter:
         return True
 
     def _suspend(self, holder: str) -> None:
-        """Discard the queue, and stop to write while another process holds the lock."""
         self._close_store()
         with self._lock:
             self._excluded = True
@@ -199,7 +196,6 @@ class HistoryWriter:
         )
 
     def _resume(self) -> None:
-        """Continue to write after the process that held the lock has ended."""
         if self._excluded:
             with self._lock:
                 self._excluded, self._resumed_devices = False, set()
@@ -242,24 +238,20 @@ class HistoryWriter:
         return True
 
     def _next_batch(self) -> list[tuple[str, HistoryRow | StoredEvent]]:
-        """Return the next items of the queue without removing them."""
         with self._lock:
             return [self._waiting[i] for i in range(min(BATCH_SIZE, len(self._waiting)))]
 
     def _remove_written(self, n: int) -> None:
-        """Remove ``n`` written items from the queue."""
         with self._lock:
             for _ in range(n):
                 self._waiting.popleft()
         self.written += n
 
     def _set_note(self, note: str) -> None:
-        """Set and log the note about the file."""
         self._note = note
         _log.warning("history", text=note)
 
     def _set_error(self, wrong: str) -> None:
-        """Set the error, and log a changed error."""
         if wrong == self._error:
             return
         self._error = wrong
@@ -269,12 +261,10 @@ class HistoryWriter:
             _log.info("history", text="writing continues")
 
     def _close_store(self) -> None:
-        """Close the store."""
         store, self._store = self._store, None
         if store is not None:
             store.close()
 
 
 def _error_text(error: Exception) -> str:
-    """Return the text of an error, without the number of an OSError."""
     return getattr(error, "strerror", None) or str(error)

@@ -1,18 +1,16 @@
 """Assembly of samples from the frames of several CAN messages, and detection of incomplete samples.
 
-A sample is complete when one frame of every message has arrived. The next sample starts with the first frame of a
-message that the current sample already contains, or with a message that contains only the counter. With
-``join = "counter"``, a frame with another counter value also starts the next sample. A sample that ends before all
-frames have arrived is bad, unless ``partial`` is True. Frames before the first complete sample are ignored, since the
-link may have been opened in the middle of a sample.
+A sample is complete when one frame of every message has arrived. A frame starts the next sample if the current sample
+already contains a frame of the same message, or if the message contains only the counter. With ``join = "counter"``, a
+frame with a new counter value also starts the next sample. An incomplete sample is bad, unless ``partial`` is True.
+Frames before the first complete sample are ignored, since the link may have been opened in the middle of a sample.
 
-A frame may arrive more than ``window`` after the first frame of the current sample. Such a frame is either late, or it
-starts the next sample because earlier frames were lost. If the frames contain counter values, a frame with the counter
-value of the current sample is late. Otherwise the order of the messages decides. The first message of a sample is the
-message with the longest median pause before its frames. A frame of the first message starts the next sample. A frame of
-any other message is late, unless a complete sample period has passed. While the order of the messages is unknown, the
-frame waits. If all frames of a sample have arrived, but some of them late, the sample is dropped. A dropped late sample
-counts as missing, but not as bad.
+A frame that arrives more than ``window`` after the first frame of the current sample is either late or starts the next
+sample. A frame with the counter value of the current sample is late. Without counter values, the order of the messages
+decides. The first message of a sample is the message with the longest median pause before the frame. A frame of the
+first message starts the next sample. A frame of any other message is late, unless a complete sample period has passed.
+A frame is kept in a queue while the order of the messages is unknown. A sample with late frames is dropped and counted
+as missing, but not as bad.
 """
 
 from collections import deque
@@ -37,7 +35,7 @@ MAX_UNDECIDED_PER_MESSAGE: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class MeasuredSignal:
-    """Signal of one axis, with the conversion to SI units."""
+    """Signal of one axis or of the temperature, with the conversion to SI units."""
 
     index: int  # in COLUMNS
     bits: SignalBits
@@ -47,7 +45,7 @@ class MeasuredSignal:
 
 @dataclass(slots=True)
 class CanMessage:
-    """CAN message that contains a part of a sample."""
+    """Definition of a CAN message that contains a part of a sample."""
 
     name: str
     frame_id: int
@@ -71,14 +69,14 @@ class CanMessage:
 
     @property
     def has_only_temperature(self) -> bool:
-        """True if the message contains only the temperature. Such a message may be sent less often than samples."""
+        """True if the message contains only the temperature."""
         indices = {column.index for column in self.columns}
         return indices == {len(AXES)} and self.valid is None and self.counter is None
 
 
 @dataclass(slots=True)
 class SampleFrames:
-    """Frames of one sample by message. A missing frame is None, and a frame that is too short is empty."""
+    """CAN frames of one sample, in the order of the messages. A missing frame is None, and a short frame is b""."""
 
     frames: list[bytes | None]
     t_ns: int  # arrival time of the newest frame
@@ -95,7 +93,7 @@ class SampleFrames:
 
 
 class SampleAssembler:
-    """Assembler of samples from frames in order of arrival.
+    """Assembler that joins CAN frames to samples, in order of arrival.
 
     Parameters
     ----------
@@ -118,7 +116,7 @@ class SampleAssembler:
         self.reset()
 
     def reset(self) -> None:
-        """Discard the current sample, the known order of the messages and the synchronization."""
+        """Discard the current sample and the known order of the messages."""
         self._current: SampleFrames | None = None
         self._synchronized = False
         self._missing = 0
@@ -129,27 +127,26 @@ class SampleAssembler:
         self.temperature: bytes | None = None
 
     def take_missing_samples(self) -> int:
-        """Return the number of bad and late samples since the last good sample, and set the number to 0."""
+        """Return the number of bad and late samples since the last good sample, and reset the number to 0."""
         missing, self._missing = self._missing, 0
         return missing
 
     def take_late_frame_delay_ns(self) -> int:
-        """Return the time from the first frame of a sample to the newest late frame of the sample, in ns.
-
-        The result is 0 if no frame has been late since the last call.
+        """Return the delay of the newest late frame after the first frame of the sample, in ns, and reset the delay to
+        0.
         """
         delay_ns, self._delay_ns = self._delay_ns, 0
         return delay_ns
 
     def add_frame(self, message_index: int, data: bytes, t_ns: int, finished: list[SampleFrames]) -> None:
-        """Add one frame to the sample to which it belongs.
+        """Add one CAN frame to the current or the next sample.
 
         Parameters
         ----------
         message_index
             Index of the message.
         data
-            Bytes of the frame; b"" if it is too short.
+            Bytes of the frame; b"" if the frame is too short.
         t_ns
             Arrival time in ns.
         finished
@@ -196,7 +193,6 @@ class SampleAssembler:
     def _add_late_frame(
         self, sample: SampleFrames, message_index: int, data: bytes, finished: list[SampleFrames]
     ) -> None:
-        """Mark a message of the current sample as late."""
         if data:
             sample.late.add(message_index)
         else:
@@ -206,14 +202,13 @@ class SampleAssembler:
             self._current = None
 
     def _read_count(self, message_index: int, data: bytes) -> int:
-        """Return the counter value in a frame; NO_TICK if the frame contains no counter."""
         bits = self._counters[message_index]
         if bits is None or not data or not self._by_count:
             return NO_TICK
         return int(bits.extract_raw(np.frombuffer(data, np.uint8)[None, :])[0])
 
     def _begins_next(self, sample: SampleFrames, message_index: int, count: int, delay_ns: int) -> bool | None:
-        """Return True if a frame starts the next sample; None if this depends on the unknown order of the messages."""
+        """Return True if a frame starts the next sample; None if the order of the messages must be known first."""
         if (
             sample.frames[message_index] is not None
             or message_index in sample.late
@@ -233,7 +228,7 @@ class SampleAssembler:
         return message_index == first or delay_ns >= sum(pauses)
 
     def _finish(self, sample: SampleFrames, finished: list[SampleFrames]) -> None:
-        """Append a good sample to ``finished``, or count a late or bad sample."""
+        """Append a good sample to ``finished``, or increase the number of late or bad samples."""
         self._count_before = sample.count
         whole = sample.complete and b"" not in sample.frames
         if whole or (self._partial and any(sample.frames)):
