@@ -1,9 +1,9 @@
-"""Driver of one device: reads bytes from a link, decodes the bytes and assigns a time to each sample.
+"""Driver of one device, which reads bytes from a link, decodes samples and assigns a time to each sample.
 
 ``Driver.run_once`` reads, decodes, time-stamps and passes on samples once. ``Driver.run`` repeats ``run_once`` in the
 thread of the device. If a link cannot be opened, is lost or falls silent, the driver closes the link and reports an
-event. The driver then tries to open the link again, with growing pauses, until the driver is stopped or a replay has
-ended. A fault of one device does not affect other devices.
+event. The driver then tries to reopen the link, with growing pauses. A fault of one device does not affect other
+devices.
 """
 
 import threading
@@ -50,7 +50,7 @@ class AxisMap:
     sign: tuple[float, ...] = (1.0,) * 6
 
     def map_axes(self, samples: SampleBlock) -> SampleBlock:
-        """Return the samples with sensor axes mapped to output axes."""
+        """Return a copy of the samples with the sensor axes mapped to output axes."""
         if self == AxisMap():
             return samples
         values = samples.values[:, self.source] * np.array(self.sign)
@@ -59,7 +59,8 @@ class AxisMap:
 
 @dataclass(slots=True)
 class SampleCounts:
-    """Sample counts of one device since the start. received + bad + lost is the number of samples sent."""
+    """Sample counts of one device since the start. The sum of received, bad and lost samples is the number of samples
+    sent."""
 
     received: int = 0
     bad: int = 0
@@ -68,7 +69,7 @@ class SampleCounts:
 
 
 class Driver:
-    """Reader of one device.
+    """Driver that reads the samples of one device.
 
     Parameters
     ----------
@@ -129,20 +130,20 @@ class Driver:
 
     @property
     def late_frames_hint(self) -> str:
-        """Message with the delay of late frames and the remedy; "" if no frame has been late recently."""
+        """Message about the delay of late frames and its remedy; "" if no frame was late recently."""
         return self._counts_late.late_frames_hint if self._counts_late else ""
 
     def take_events(self) -> list[Event]:
-        """Remove all events from the queue and return them, oldest first."""
+        """Remove and return all queued events, oldest first."""
         return [self._events.popleft() for _ in range(len(self._events))]
 
     def stop(self) -> None:
-        """End ``run``, and close the link so that a waiting read ends."""
+        """Stop the method ``run``, and close the link to interrupt a waiting read."""
         self._stop.set()
         self.link.close()
 
     def run(self) -> None:
-        """Read until the driver is stopped or a replay has ended. The thread of the device calls this method."""
+        """Read from the link until the driver is stopped or a replay has ended."""
         try:
             self._run()
         except Exception as error:
@@ -151,7 +152,7 @@ class Driver:
             raise
 
     def _run(self) -> None:
-        """Open the link and read until the driver is stopped or a replay ends. Reopen the link after an error."""
+        """Read until the driver is stopped or a replay ends. After an error, open the link again."""
         pause_s = MIN_RETRY_PAUSE_S
         while not self._stop.is_set():
             received = self.counts.received
@@ -178,7 +179,7 @@ class Driver:
         self.link.close()
 
     def run_once(self) -> None:
-        """Read once, and decode, time-stamp and pass on the samples."""
+        """Read from the link once, decode the samples, assign sample times and call ``push``."""
         self.iterations += 1
         asked_ns = time.monotonic_ns()
         chunks = self.link.poll_chunks(READ_TIMEOUT_S)
@@ -220,7 +221,7 @@ class Driver:
             self.counts.late = self._counts_late.dropped_late_samples
 
     def _count_samples(self, stamped: SampleBlock, dropped: int) -> None:
-        """Count the samples in a block and the lost samples before the block, except samples that were dropped."""
+        """Add the samples of a block, and the lost samples before the block, to the sample counts."""
         if self.first_t_ns is None:
             self.first_t_ns = int(stamped.t_ns[0])
         self.counts.received += len(stamped)
@@ -231,7 +232,7 @@ class Driver:
             self._unreported_gaps += 1
 
     def _report_lost(self) -> None:
-        """Report missing samples at most once per second, so that a bad connection does not hide other events."""
+        """Report missing samples at most once per second, to keep the event queue free for other events."""
         if not self._unreported_samples or time.monotonic() - self._last_report_s < LOSS_REPORT_INTERVAL_S:
             return
         places = "" if self._unreported_gaps == 1 else f" in {self._unreported_gaps} places"
@@ -245,7 +246,7 @@ class Driver:
             raise LinkLost(f"{self.link.name} silent for {silent_s:.1f} s")
 
     def _check_undecoded(self, size: int) -> None:
-        """Report a device that sends bytes from which no samples can be decoded."""
+        """Report a device whose bytes cannot be decoded."""
         self._count_decoder_drops()
         self._undecoded_bytes += size
         mute_s = self._last_data_s - self._last_sample_s
@@ -281,7 +282,7 @@ class Driver:
 
 
 def parse_axis_map(table: dict[str, str]) -> AxisMap:
-    """Return the axis map of the table ``[device.axes]``, for example ``{"gz": "-gy"}``.
+    """Parse the table ``[device.axes]``, for example ``{"gz": "-gy"}``.
 
     Parameters
     ----------
@@ -291,7 +292,7 @@ def parse_axis_map(table: dict[str, str]) -> AxisMap:
     Raises
     ------
     ConfigError
-        If an axis is unknown, or if a gyroscope axis is mapped to an accelerometer axis or the reverse.
+        If an axis is unknown, or if gyroscope and accelerometer axes are mixed.
     """
     source, sign = list(range(6)), [1.0] * 6
     wrong = []

@@ -1,4 +1,4 @@
-"""Check that the optional packages of an installation extra are installed."""
+"""Check that the optional packages of an extra (``pip install imu-monitor[extra]``) are installed."""
 
 import importlib.util
 from collections.abc import Mapping
@@ -31,7 +31,7 @@ def require_extra(extra: str, feature: str) -> None:
     Raises
     ------
     ConfigError
-        If a package is missing. The text says how to install the package.
+        If a package is missing. The error text contains the ``pip`` command.
     """
     if missing := find_missing_packages(extra):
         raise ConfigError(f'{feature} needs {" and ".join(missing)}: pip install "imu-monitor[{extra}]"')

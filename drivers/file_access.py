@@ -1,4 +1,4 @@
-"""Safe opening and reading of files whose names users or folders provide.
+"""Safe opening and reading of files that are named by users or found in folders.
 
 ``open_regular_file`` raises an error, and never blocks, if the path is a FIFO, a socket, a device or a directory.
 ``read_small_file`` reads a complete small file, such as a configuration, a model or a CAN database.
@@ -23,7 +23,7 @@ FILE_KINDS: Final = {
 
 
 def expand_user(name: str) -> Path:
-    """Return a path in which a leading ``~`` or ``~user`` is replaced by the home folder."""
+    """Return a path with a leading ``~`` or ``~user`` replaced by the home folder."""
     return Path(os.path.expanduser(name))
 
 
@@ -53,7 +53,8 @@ def open_regular_file(path: Path) -> IO[bytes]:
     Raises
     ------
     OSError
-        If the file cannot be opened, or is not a regular file. ``strerror`` gives the reason without the path.
+        If the file cannot be opened, or is not a regular file. The attribute ``strerror`` contains the reason without
+        the path.
     """
     check_regular_file(path)  # check before opening, since opening a device may have side effects
     # the file may have been replaced after the check, so open without blocking and check again
@@ -69,12 +70,13 @@ def open_regular_file(path: Path) -> IO[bytes]:
 def check_regular_file(path: Path) -> None:
     """Check that a path is a regular file, before a library opens the file.
 
-    The check does not open the file, since closing a second descriptor would release the locks of SQLite on the file.
+    The check does not open the file, since closing another file descriptor would release the locks of SQLite.
 
     Raises
     ------
     OSError
-        If the file does not exist, or is not a regular file. ``strerror`` gives the reason without the path.
+        If the file does not exist, or is not a regular file. The attribute ``strerror`` contains the reason without the
+        path.
     """
     try:
         mode = os.stat(path).st_mode
@@ -84,7 +86,7 @@ def check_regular_file(path: Path) -> None:
 
 
 def check_folder_or_absent(path: Path) -> None:
-    """Raise OSError if the path exists and is not a folder. ``strerror`` names the type of the file."""
+    """Raise OSError if the path exists and is not a folder."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -102,8 +104,8 @@ def read_small_file(path: Path, *, allow_pipe: bool = False) -> bytes:
     path
         Name of the file.
     allow_pipe
-        True if the path may also be a pipe, such as ``/dev/stdin`` or ``<(command)``. Reading then waits for the
-        program that writes to the pipe.
+        True if the path may also be a pipe, such as ``/dev/stdin`` or ``<(command)``. Reading a pipe waits for the
+        writing program.
 
     Returns
     -------

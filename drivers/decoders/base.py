@@ -241,15 +241,15 @@ NO_OFFSET: Final = -(1 << 62)
 
 
 class FrameBuffer:
-    """Buffer that finds the frames in a byte stream. A chunk may begin or end in the middle of a frame, and bytes may
-    be damaged.
+    """Buffer that finds the frames in a byte stream.
 
-    The payload of a frame may contain the sync pattern. After rejecting a candidate frame, the search therefore
-    continues at the next byte. The number of frames lost between two valid frames is estimated in two ways, and the
-    larger estimate is used. The first estimate is the number of rejected candidate frames at a distance of at least one
-    frame length. The second estimate is the number of complete frames that fit between the two valid frames. Bytes
-    before the first valid frame are ignored, because reading may begin in the middle of a frame. The buffer keeps at
-    most ``longest`` bytes between two calls of ``feed``.
+    A chunk may begin or end in the middle of a frame, and bytes may be damaged. The payload of a frame may contain the
+    sync pattern. After rejecting a candidate frame, the search therefore continues at the next byte. The number of
+    frames lost between two valid frames is estimated in two ways, and the larger estimate is used. The first estimate
+    is the number of rejected candidate frames at a distance of at least one frame length. The second estimate is the
+    number of complete frames that fit between the two valid frames. Bytes before the first valid frame are ignored,
+    because reading may begin in the middle of a frame. The buffer keeps at most ``longest`` bytes between two calls of
+    ``feed``.
 
     Parameters
     ----------

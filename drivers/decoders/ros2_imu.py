@@ -1,8 +1,8 @@
-"""ROS 2 ``sensor_msgs/msg/Imu`` messages over zenoh (rmw_zenoh, zenoh-bridge-ros2dds). Each message contains one
-sample.
+"""Decoder of ROS 2 ``sensor_msgs/msg/Imu`` messages over zenoh (rmw_zenoh, zenoh-bridge-ros2dds).
 
-The payload is XCDR1 (OMG DDSI-RTPS 10.5). The first 4 bytes are the encapsulation: ``00 01`` for little-endian or
-``00 00`` for big-endian, and two bytes of options. The following fields are aligned from byte 4:
+Each message contains one sample. The payload is XCDR1 (OMG DDSI-RTPS 10.5). The first 4 bytes are the encapsulation:
+``00 01`` for little-endian or ``00 00`` for big-endian, and two bytes of options. The following fields are aligned from
+byte 4:
 
 - stamp.sec (i32) and stamp.nanosec (u32), the time of the sample;
 - frame_id (u32 length including the final NUL, then the characters), and padding to 8 bytes;

@@ -10,8 +10,8 @@ geirhovland/stim300, and data sheet TS1524 tables 5-21 to 5-23 as restated by pu
 The datagram contains neither the range of the accelerometer nor the output units, so the range and the units must be
 configured. An "increment" is the change of angle or velocity during one sample. The sample rate converts an increment
 to an angular rate or an acceleration. Integrated outputs are not supported. The decoder assumes that the counter
-advances at the internal sampling rate of 2000 Hz, which is 4 counts per sample at 500 Hz. This counter rate has not
-been tested with a device.
+advances at the internal sampling rate of 2000 Hz, which is 4 counts per sample at 500 Hz. The counter rate has not been
+tested with a device.
 
 The gyroscopes and the accelerometers have a status byte. A sample is bad if a status byte reports a system integrity
 error (bit 7), start-up (bit 6), overload (bit 4) or a channel error (bit 3). Bit 5 reports operation outside the
@@ -139,8 +139,7 @@ class Stim300Decoder(base.FrameStreamDecoder):
         return self._builder.build_plausible_blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
 
     def _read_measurements(self, data: base.Bytes, parts: int) -> tuple[Floats, Floats]:
-        """Return the values [n, 6] and the temperatures [n] in °C. Values are infinite if a status byte reports an
-        error."""
+        """Return the values [n, 6] and the temperatures [n] in °C. Values with a sensor error are infinite."""
         values = np.full((len(data), 6), np.nan)
         values[:, :3] = _read_int24(data, 1) * self._gyro_step
         status = data[:, 10]
@@ -199,8 +198,7 @@ def _temperature_offset(parts: int) -> int:
 
 
 def _read_int24(data: base.Bytes, at: int) -> Ints:
-    """Read three signed 24-bit big-endian integers at the offset ``at`` of each datagram, and return an array [n,
-    3]."""
+    """Return the three signed 24-bit big-endian integers [n, 3] at an offset of each datagram."""
     wide = np.zeros((len(data), 3, 4), np.uint8)
     wide[:, :, :3] = data[:, at : at + 9].reshape(-1, 3, 3)
     raised: Ints = wide.view(">i4")[:, :, 0].astype(np.int64) >> 8

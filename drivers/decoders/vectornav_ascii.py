@@ -63,8 +63,7 @@ class VectornavAsciiDecoder(base.FrameStreamDecoder):
         return super().recent_problem
 
     def reset(self) -> None:
-        """Discard an incomplete sentence. If the setting ``sentence`` is "auto", the next valid sentence determines the
-        type."""
+        """Discard an incomplete sentence. With ``sentence = "auto"``, select the sentence type again."""
         super().reset()
         self._sentence = self._wanted
 
@@ -84,8 +83,7 @@ class VectornavAsciiDecoder(base.FrameStreamDecoder):
         )
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Encode samples as VNYMR sentences if the settings select VNYMR, otherwise as VNIMU sentences. A missing
-        temperature is sent as 0."""
+        """Encode samples as VNYMR or VNIMU sentences. A missing temperature is sent as 0."""
         imu = self._wanted != b"$VNYMR,"
         frames = []
         temperatures = np.nan_to_num(samples.temperature_c).tolist()

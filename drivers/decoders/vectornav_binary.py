@@ -62,7 +62,7 @@ class Settings(SettingsModel):
 
 @lru_cache(maxsize=256)
 def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.void] | None:
-    """Return the structured NumPy type of the messages with a given header.
+    """Return the NumPy structured type of messages with a given header.
 
     Parameters
     ----------
@@ -179,8 +179,7 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         return base.REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Encode samples as messages with the fields TimeStartup and Imu of group 1. If the block has temperatures, add
-        MagPres."""
+        """Encode samples with the fields TimeStartup and Imu of group 1, and MagPres if there are temperatures."""
         has_temperature = bool(np.isfinite(samples.temperature_c).any())
         header = bytes.fromhex("01 01 06" if has_temperature else "01 01 02")
         layout = build_message_dtype(header, prefer_compensated=False)

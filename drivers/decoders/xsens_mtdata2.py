@@ -174,8 +174,7 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         return filled
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Encode each sample as one packet with the packet counter, the fine sample time and the measured
-        quantities."""
+        """Encode each sample as one packet with both clocks and the measured quantities."""
         number_format = FORMATS.index(self._settings.format)
         frames = []
         rows = zip(samples.values, samples.temperature_c.tolist(), samples.ticks.tolist(), strict=True)

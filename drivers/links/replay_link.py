@@ -1,21 +1,20 @@
-"""Replay of a file in place of a device, at the recorded speed or another speed.
+"""Replay of a recorded file as if a device sent the data, at an adjustable speed.
 
-The chunks depend on the kind of file:
+The chunks depend on the type of the file:
 
 - A recording (``drivers.recordings``: CSV, .npz, Parquet, Arrow, or a folder) becomes messages for the decoder
   ``samples``.
 - A CAN log (``drivers.links.can_log_reader``) becomes CAN frames.
 - A file of captured bytes (.bin, .raw or .txt, also with .gz) becomes bytes.
-- Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages, as the
-  original link has received them.
+- Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages, depending on the original link.
 
-The chunks of recordings, logs and raw data have the recorded Unix times. Captured bytes have no times. If
-``bytes_per_second`` is set, each chunk gets the time at which a device with this byte rate would have sent the chunk.
-Otherwise each chunk gets the time of the read.
+The chunks of recordings, logs and raw data have the recorded Unix times. Captured bytes have no times. Each chunk of
+captured bytes gets the time at which a device with the byte rate ``bytes_per_second`` would send the chunk. Without
+``bytes_per_second``, each chunk gets the time of the read.
 
 ``poll_chunks`` raises ``LinkEnded`` after all data have been returned. If a file is truncated, the complete part is
-replayed, and the message at the end mentions the truncation. ``build`` reads the header of a CSV file, since the header
-decides which decoder is needed. ``open`` reads all other content.
+replayed, and the message at the end mentions the truncation. ``build`` reads only the header of a CSV file, which
+determines the decoder.
 """
 
 import binascii
@@ -63,7 +62,7 @@ DAMAGE_ERRORS: Final = (
 """Exceptions, in addition to ValueError, that readers raise if a file is truncated or damaged."""
 
 PACES: Final = {"recorded": 1.0, "max": float("inf")}
-"""Words for the key ``speed`` and the factors that they stand for."""
+"""Values of the key ``speed`` that are words, and the corresponding factors."""
 
 Kind = Literal["recording", "log", "capture", "raw"]
 TimedChunk = tuple[float, Chunk]
@@ -149,7 +148,7 @@ class ReplayLink(PolledLink):
         return self._started_s + item[0] / self._pace
 
     def _fetch_next(self) -> None:
-        """Fetch the next item. If the rest of the file is damaged, end the replay and add a note."""
+        """Fetch the next item. If the file is damaged, end the replay and add a note."""
         assert self._items is not None
         try:
             self._next = next(self._items, None)
@@ -175,7 +174,7 @@ class ReplayLink(PolledLink):
         return _read_capture(self._path, self._settings.bytes_per_second)
 
     def _message_rows(self, recording: Recording) -> int:
-        """Return the number of rows per message: STEP_S of recorded time, or many if the speed is not limited."""
+        """Return the number of samples per message, which is MAX_MESSAGE_ROWS if the speed is not limited."""
         t, n = recording.t_s, len(recording)
         if self._pace == float("inf") or n < 2:
             return MAX_MESSAGE_ROWS
@@ -184,7 +183,7 @@ class ReplayLink(PolledLink):
 
 
 def _read_messages(recording: Recording, rows: int) -> Generator[TimedChunk]:
-    """Yield messages of up to ``rows`` samples. A message is due at the time of the newest sample in the message."""
+    """Yield messages of up to ``rows`` samples. The due time of a message is the time of the newest sample."""
     given = 0
     start_ns: int | None = None
     for samples in iter_blocks(recording, rows):
@@ -216,7 +215,7 @@ def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
 
 
 def _raw_segments(path: Path) -> list[Path]:
-    """Return the segments of a folder, oldest first. If the path is a file, return only the file."""
+    """Return the segment files of a folder, oldest first. For a file, return only the file."""
     return segment.list_segments(path) if path.is_dir() else [path]
 
 
@@ -243,7 +242,7 @@ def _raw_carrier(path: Path) -> Carrier:
 
 
 def _read_capture(path: Path, bytes_per_second: float | None) -> Generator[TimedChunk]:
-    """Yield captured bytes with due times according to the byte rate. Without a rate, every chunk is due at once."""
+    """Yield captured bytes with due times according to the byte rate. Without a byte rate, all due times are 0."""
     start_ns = time.monotonic_ns()
     size = CHUNK_BYTES if bytes_per_second is None else min(max(1, round(bytes_per_second * STEP_S)), CHUNK_BYTES)
     given = 0
@@ -259,7 +258,7 @@ def _read_capture(path: Path, bytes_per_second: float | None) -> Generator[Timed
 
 
 def _detect_kind(path: Path) -> Kind:
-    """Return the kind of a file according to the suffix and the content. Raise ConfigError for any other file."""
+    """Return the type of a file according to the suffix and the content. Raise ConfigError for an unknown type."""
     suffix = _plain_suffix(path)
     if path == Path():
         raise ConfigError("path: empty; it is a recording, a CAN log, captured bytes, or a folder of segments")
@@ -310,7 +309,7 @@ def _open_text(path: Path) -> IO[str]:
 
 
 def build(settings: Settings) -> Link:
-    """Return the link without opening the file for replay.
+    """Return a link for the file, without opening the file.
 
     Raises
     ------

@@ -1,16 +1,12 @@
 """Serial ports, local or networked, by any URL that pyserial supports.
 
-The link returns bytes as they arrive, without regard to frames. A read waits for the first byte, then for the time
-``read_timeout`` (10 ms by default) for more bytes, and returns all bytes that have arrived. A short wait needs a tenth
-of the processor time of a read per frame, and no byte waits longer than ``read_timeout``. If a URL handler has no file
-descriptor, a read returns at every arrival.
+A read waits for the first byte, then for the time ``read_timeout`` (10 ms by default) for more bytes, and returns all
+bytes that have arrived. Waiting for more bytes needs a tenth of the processor time of one read per frame, and delays
+bytes by at most ``read_timeout``. If a URL handler has no file descriptor, a read returns at every arrival.
 
-``close`` ends a waiting read and closes the port after the read has ended. If the file descriptor were closed earlier,
-the system could assign the same descriptor to another file while the read is waiting.
-
-If the port cannot be opened, ``LinkUnavailable`` names the cause and the remedy, such as a missing permission or
-another program that uses the port. If the device is unplugged or the connection is closed, ``poll_chunks`` raises
-``LinkLost``. Nothing is written to the device.
+``close`` closes the port only after a waiting read has ended. Otherwise the system could assign the file descriptor to
+another file during the read. ``LinkUnavailable`` names the reason and a remedy if the port cannot be opened.
+``LinkLost`` is raised if the device is unplugged or the connection is closed. The link never writes to the device.
 """
 
 import contextlib
@@ -89,7 +85,7 @@ class SerialLink(PolledLink):
         self._buffer_filling = False  # True if the last read returned so many bytes that the next read must not wait
 
     def close(self) -> None:
-        """End a waiting ``poll_chunks``, then close the port."""
+        """Interrupt a waiting call of ``poll_chunks``, then close the port."""
         self._closing.set()
         cancel = getattr(self._port, "cancel_read", None)  # some URL handlers lack this method
         if cancel is not None:
@@ -155,7 +151,7 @@ class SerialLink(PolledLink):
 
 
 def _has_file_number(port: "serial.SerialBase") -> bool:
-    """Return True if the port is a POSIX port of pyserial, which can be read through its file descriptor."""
+    """Return True if the port can be read through a file descriptor."""
     import serial
 
     return os.name == "posix" and type(port).read is serial.Serial.read

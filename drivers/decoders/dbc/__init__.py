@@ -133,8 +133,7 @@ class DbcDecoder:
         ]
 
     def _numbered_messages(self) -> list[tuple[int, CanMessage]]:
-        """Return the CAN messages with their indices. The message that contains only the temperature has the index
-        -1."""
+        """Return the CAN messages and indices. A message that contains only the temperature has the index -1."""
         slow = [(-1, self._slow)] if self._slow is not None else []
         return [*slow, *enumerate(self._messages)]
 

@@ -181,8 +181,7 @@ class Database:
 
 
 def _locate(file: str) -> Path:
-    """Return the path of a DBC file. A name without a folder may refer to a DBC file that is shipped with the
-    program."""
+    """Return the path of a DBC file. A name without a folder may refer to a shipped DBC file."""
     path = file_access.expand_user(file)
     name = file.removeprefix(SHIPPED_PREFIX)
     if name == file and (file_access.is_file(path) or len(path.parts) != 1):

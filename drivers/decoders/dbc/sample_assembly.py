@@ -9,8 +9,8 @@ A frame that arrives more than ``window`` after the first frame of the current s
 sample. A frame with the counter value of the current sample is late. Without counter values, the order of the messages
 decides. The first message of a sample is the message with the longest median pause before the frame. A frame of the
 first message starts the next sample. A frame of any other message is late, unless a complete sample period has passed.
-A frame is kept in a queue while the order of the messages is unknown. A sample with late frames is dropped and counted
-as missing, but not as bad.
+A frame is kept in a queue while the order of the messages is unknown. If all frames of a sample have arrived but some
+were late, the sample is dropped and counted as missing, but not as bad.
 """
 
 from collections import deque
@@ -132,8 +132,8 @@ class SampleAssembler:
         return missing
 
     def take_late_frame_delay_ns(self) -> int:
-        """Return the delay of the newest late frame after the first frame of the sample, in ns, and reset the delay to
-        0.
+        """Return the delay of the newest late frame relative to the first frame of the sample in ns, and reset the
+        delay.
         """
         delay_ns, self._delay_ns = self._delay_ns, 0
         return delay_ns
