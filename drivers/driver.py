@@ -50,7 +50,7 @@ class AxisMap:
     sign: tuple[float, ...] = (1.0,) * 6
 
     def map_axes(self, samples: SampleBlock) -> SampleBlock:
-        """Return a copy of the samples with the sensor axes mapped to output axes."""
+        """Return the samples with the sensor axes mapped to output axes."""
         if self == AxisMap():
             return samples
         values = samples.values[:, self.source] * np.array(self.sign)
@@ -59,8 +59,7 @@ class AxisMap:
 
 @dataclass(slots=True)
 class SampleCounts:
-    """Sample counts of one device since the start. The sum of received, bad and lost samples is the number of samples
-    sent."""
+    """Sample counts of one device since the start."""
 
     received: int = 0
     bad: int = 0
@@ -221,7 +220,7 @@ class Driver:
             self.counts.late = self._counts_late.dropped_late_samples
 
     def _count_samples(self, stamped: SampleBlock, dropped: int) -> None:
-        """Add the samples of a block, and the lost samples before the block, to the sample counts."""
+        """Add the samples of a block and the preceding lost samples to the counts, without the ``dropped`` samples."""
         if self.first_t_ns is None:
             self.first_t_ns = int(stamped.t_ns[0])
         self.counts.received += len(stamped)

@@ -1,4 +1,4 @@
-"""Discovery of the modules in a package, and suggestions for misspelled names."""
+"""Search for the modules of a package, and suggestions for misspelled names."""
 
 import importlib
 import pkgutil
@@ -17,7 +17,7 @@ def list_modules(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
     package
         Package that holds the modules.
     suffix
-        End of the module names, such as "_link". It is removed from the returned names.
+        End of the module names, such as "_link". The suffix is removed from the returned names.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
     Raises
     ------
     ConfigError
-        If there is no such module. The text lists all names, beginning with the most similar name.
+        If the module does not exist. The error text lists all names, beginning with the most similar name.
     """
     known = list_modules(package, suffix)
     if name not in known:
@@ -52,9 +52,8 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
 
 
 def format_suggestion(word: str, known: Sequence[str]) -> str:
-    """Return a suggestion to append to an error message about an unknown word.
-
-    The text suggests the most similar known word, or lists all known words if none is similar.
+    """Return the most similar known word as the end of an error message. If no word is similar, the text lists all
+    known words.
 
     Parameters
     ----------
@@ -71,7 +70,7 @@ def format_suggestion(word: str, known: Sequence[str]) -> str:
 
 
 def format_choices_by_similarity(word: str, known: Sequence[str]) -> str:
-    """Return the known words to append to an error message about an unknown word, the most similar word first.
+    """Return all known words as the end of an error message, beginning with the most similar word.
 
     Parameters
     ----------

@@ -1,8 +1,8 @@
 """Base class of the settings in a configuration file, and validation of one table of the file.
 
-Each field of a model describes one key by a type with the supported range, a default and a description. A field without
-a default, or with a default that turns a function off, also has an example. ``check_table`` finds all mistakes in a
-table at once, and describes each mistake without names of Python types.
+Each field of a settings model describes one key by the type with the supported range, a default and a description. A
+field also has an example if there is no default, or if the default turns a function off. ``check_table`` finds all
+mistakes in a table.
 """
 
 import contextlib
@@ -61,7 +61,7 @@ class Conflict(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _ReadContext:
-    """Context of a validation by ``check_table``. Settings that Python code creates are validated without a context."""
+    """Context of a validation by ``check_table``. Settings created by Python code are validated without a context."""
 
     folder: Path | None  # folder of the configuration file; None if the existence of files is not checked
 
@@ -72,7 +72,7 @@ class SettingsModel(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", validate_by_name=True)
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield the mistakes that concern a combination of keys."""
+        """Yield the mistakes in combinations of keys."""
         return iter(())
 
     @model_validator(mode="after")
@@ -89,7 +89,7 @@ class Problem(NamedTuple):
     text: str
 
     def nest_under(self, table_path: str) -> "Problem":
-        """Return the problem with ``table_path`` put before the path of the key."""
+        """Return the problem with ``table_path`` prepended to the key path."""
         dot = "." if table_path and self.key_path and not self.key_path.startswith("[") else ""
         return Problem(f"{table_path}{dot}{self.key_path}", self.text)
 
@@ -98,7 +98,7 @@ class Problem(NamedTuple):
 
 
 class TableError(ConfigError):
-    """Mistakes in the table of a field whose value is not a settings model.
+    """Mistakes in a table that is not converted to a settings model.
 
     Parameters
     ----------
@@ -123,16 +123,16 @@ class TableCheckResult(Generic[Model]):
     partial: dict[str, object] = field(default_factory=dict)  # ``TableError.partial`` by path of the table
 
     def has_no_problem(self, *key_paths: str) -> bool:
-        """Return True if no problem was found in these keys, their parent tables or their subkeys."""
+        """Return True if the given keys, including parent tables and subkeys, have no problem."""
         return not any(_nested(key_path, wrong.key_path) for key_path in key_paths for wrong in self.problems)
 
     def add_problem(self, key_path: str, text: str) -> None:
-        """Add a problem, unless a problem with the same key has been found before.
+        """Add a problem, unless the key already has a problem.
 
         Parameters
         ----------
         key_path
-            Path of the key that the message names.
+            Path of the key in the configuration file.
         text
             Message.
         """
@@ -141,9 +141,9 @@ class TableCheckResult(Generic[Model]):
 
 
 def check_table(model: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> TableCheckResult[Model]:
-    """Convert a table to settings, and find all mistakes in the table.
+    """Convert a configuration table to settings, and find all mistakes in the table.
 
-    Wrong values are replaced by defaults or examples, so that one mistake does not hide another mistake.
+    Wrong values are replaced by defaults or examples, so that the remaining values can be checked.
 
     Parameters
     ----------
@@ -172,7 +172,7 @@ def check_table(model: type[Model], table: Mapping[str, Any], folder: Path | Non
 
 
 def fields_by_key(model: type[SettingsModel]) -> dict[str, FieldInfo]:
-    """Return the fields of a model by their keys in the file."""
+    """Return the fields of a settings model by the key in the configuration file."""
     return {found.alias or name: found for name, found in model.model_fields.items()}
 
 
@@ -237,7 +237,7 @@ def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
 
 
 def _field_at(kind: type[SettingsModel], location: Sequence[str | int]) -> tuple[type[SettingsModel], FieldInfo | None]:
-    """Return the innermost model on a path of keys, and the field of the last key; None for an unknown key."""
+    """Return the settings model that contains the last key of a path, and the field; None for an unknown key."""
     found = None
     for part in location:
         if found is not None:
@@ -258,7 +258,7 @@ def _format_location(location: Sequence[str | int]) -> str:
 
 
 def _nested(one: str, other: str) -> bool:
-    """Return True if two paths are equal, or if one path leads to a part of the other path's value."""
+    """Return True if two key paths are equal, or if one key is inside the table or list of the other key."""
     short, long = sorted((one, other), key=len)
     return short == long or (bool(short) and long.startswith(short) and long[len(short)] in ".[")
 
@@ -271,15 +271,15 @@ ListOf = Annotated[tuple[T, ...], Strict(False)]
 
 
 class ConvertedFrom:
-    """Annotation of a field whose value has different types in the file and in the model.
+    """Annotation of a field that is converted from another type in the configuration file.
 
     Parameters
     ----------
     kind
         Type of the value in the file.
     convert
-        Function that converts a value from the file. The arguments are the value and the folder of the file, or None if
-        there is no file. The function raises ConfigError if the value cannot be converted.
+        Function that converts a value. The arguments are the value and the folder of the configuration file, or None if
+        there is no file. The function raises ConfigError if the value is not valid.
     """
 
     def __init__(self, kind: Any, convert: Callable[[Any, Path | None], Any]) -> None:
@@ -287,7 +287,7 @@ class ConvertedFrom:
         self._convert = convert
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return a schema that validates the value in the file and then converts the value."""
+        """Return a pydantic schema that validates and converts a value."""
         converted = get_origin(source) or source
 
         def convert_value(value: Any, validate: Callable[[Any], Any], info: ValidationInfo) -> Any:
@@ -299,7 +299,7 @@ class ConvertedFrom:
 
 
 class KeywordOrType:
-    """Annotation of a field that accepts certain words in addition to the values of a type.
+    """Annotation of a field that accepts keywords, such as "auto", in addition to the values of a type.
 
     Parameters
     ----------
@@ -314,7 +314,7 @@ class KeywordOrType:
         self._kind = kind
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return a schema that replaces a word by its value and validates any other value."""
+        """Return a pydantic schema that replaces keywords and validates all other values."""
 
         def replace_keyword(value: Any, validate: Callable[[Any], Any], info: ValidationInfo) -> Any:
             if isinstance(value, str) and value in self._words:
@@ -342,7 +342,7 @@ class KeywordOrType:
 
 
 def one_of(words: Sequence[str]) -> AfterValidator:
-    """Return a validator that accepts only certain words."""
+    """Return a pydantic validator that accepts only the given words."""
 
     def check_word(value: str) -> str:
         if value not in words:
@@ -353,7 +353,7 @@ def one_of(words: Sequence[str]) -> AfterValidator:
 
 
 def checked_by(check: Callable[[T], object]) -> AfterValidator:
-    """Return a validator that calls ``check`` and returns the value unchanged. ``check`` may raise ConfigError."""
+    """Return a pydantic validator that calls ``check`` and does not change the value."""
 
     def validate(value: T) -> T:
         check(value)
@@ -370,13 +370,13 @@ def _existing_file(value: str, info: ValidationInfo) -> str:
 
 
 def _file_or_name(value: str, info: ValidationInfo) -> str:
-    """Return the path of a file if the file exists, otherwise the unchanged text."""
+    """Return the path of an existing file; otherwise the unchanged text."""
     path = _beside(value, info)
     return value if path is None or not os.path.exists(path) else str(path)
 
 
 def _beside(value: str, info: ValidationInfo) -> Path | None:
-    """Return the path in the folder of the configuration file; None if the value is empty or there is no folder."""
+    """Return the path relative to the configuration file; None for an empty value or without a configuration file."""
     folder = info.context.folder if info.context else None
     return folder / file_access.expand_user(value) if folder and value else None
 

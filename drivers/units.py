@@ -1,8 +1,7 @@
-"""Conversion factors from unit names to SI, for units in settings and CAN databases.
+"""Conversion factors to SI for the unit names in settings and CAN databases.
 
-Each table maps unit names to the factor that converts a number to rad/s, m/s² or s. A temperature unit also has an
-offset. The tables contain the names in data sheets, DBC files and plots. Names are case-sensitive, and blanks around a
-name are ignored. An unknown name raises a ``ConfigError`` that lists all known names, the most similar name first.
+Each table maps a unit name to the factor that converts a number to rad/s, m/s² or s. A temperature unit also has an
+offset. Unit names are case-sensitive. An unknown unit raises ``ConfigError``.
 """
 
 import math
@@ -101,7 +100,7 @@ def acceleration_factor(unit: str) -> float:
 def temperature_factor_and_offset(unit: str) -> tuple[float, float]:
     """Return the factor and the offset that convert a unit of temperature to °C.
 
-    The temperature in °C is factor · number + offset. The function raises ConfigError if the unit is unknown.
+    The temperature in °C is factor · number + offset. ConfigError is raised if the unit is unknown.
 
     >>> temperature_factor_and_offset("K")
     (1.0, -273.15)
@@ -115,7 +114,7 @@ def time_factor(unit: str) -> float:
 
 
 def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
-    # Unicode has two characters for the prefix micro, and both are in use
+    # Unicode has two characters for the prefix micro
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     if name not in table:
         raise ConfigError(f'"{unit}" is not a unit of {quantity}{format_choices_by_similarity(name, tuple(table))}')

@@ -5,9 +5,8 @@ The hardware, the kernel or python-can filters the frames by the identifiers tha
 ``Chunk.t_ns`` is the arrival time on the monotonic clock of the host. A delayed read would give late times to the
 frames that wait in the queue. The interfaces in ``HOST_STAMPED_INTERFACES`` stamp each frame on arrival with the system
 clock of the host. For these interfaces, the age of a frame is subtracted from the time of the read. An age outside the
-range 0 to 1 s is ignored, since the system clock may have been set. Other interfaces stamp frames with a clock that
-drifts relative to the clock of the host. For other interfaces, ``Chunk.t_ns`` is the time of the read, and the sample
-clock removes the jitter by regression.
+range 0 to 1 s is ignored. Other interfaces stamp frames with a clock that drifts relative to the clock of the host. For
+other interfaces, ``Chunk.t_ns`` is the time of the read, and the sample clock removes the jitter by regression.
 
 ``LinkLost`` is raised if the bus is off, the interface is down or the adapter is unplugged. Other error frames are
 counted and ignored. Remote frames are ignored. The link sends only commands that configure an adapter.

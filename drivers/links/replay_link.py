@@ -6,15 +6,15 @@ The chunks depend on the type of the file:
   ``samples``.
 - A CAN log (``drivers.links.can_log_reader``) becomes CAN frames.
 - A file of captured bytes (.bin, .raw or .txt, also with .gz) becomes bytes.
-- Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages, depending on the original link.
+- Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages,
+  depending on the original link.
 
 The chunks of recordings, logs and raw data have the recorded Unix times. Captured bytes have no times. Each chunk of
 captured bytes gets the time at which a device with the byte rate ``bytes_per_second`` would send the chunk. Without
 ``bytes_per_second``, each chunk gets the time of the read.
 
 ``poll_chunks`` raises ``LinkEnded`` after all data have been returned. If a file is truncated, the complete part is
-replayed, and the message at the end mentions the truncation. ``build`` reads only the header of a CSV file, which
-determines the decoder.
+replayed, and the final message mentions the truncation. ``build`` reads the header of a CSV file to choose the decoder.
 """
 
 import binascii

@@ -1,12 +1,12 @@
 """Conversion between ``SampleBlock`` and the msgpack map that is published under ``<prefix>/<device>/samples``.
 
-The daemon publishes messages of this format, the decoder ``samples`` reads them, and a replayed recording is converted
-to them. ``docs/samples-format.md`` documents the format.
+``docs/samples-format.md`` documents the format. The daemon and the replay of a recording write the messages, and the
+decoder ``samples`` reads the messages.
 
-If the samples are evenly spaced to within half a microsecond, ``t`` is the Unix time of the newest sample in seconds,
-``t0`` the Unix time of the first sample, and ``rate`` the sample rate in Hz. Otherwise ``t`` contains the Unix time of
-each sample in seconds as little-endian float64, with a resolution of 0.24 µs. Unknown keys and columns are ignored. If
-sizes are inconsistent or exceed a limit, a ``DecodeError`` is raised.
+If the samples are evenly spaced to within half a microsecond, ``t`` and ``t0`` are the Unix times of the newest and the
+first sample in seconds, and ``rate`` is the sample rate in Hz. Otherwise ``t`` contains the Unix time of each sample in
+seconds as little-endian float64, with a resolution of 0.24 µs. Unknown keys and columns are ignored. A message with
+inconsistent or too large sizes raises ``DecodeError``.
 """
 
 from collections.abc import Sequence
@@ -76,7 +76,8 @@ def encode_samples(
     total_samples
         Number of samples of the device since the start, including the samples of the message.
     block
-        Samples to encode. Axes without a value are omitted. If all values are NaN, all six axes are kept.
+        Samples to encode. The message omits axes without a value. If all values are NaN, the message contains all six
+        axes.
     unix_offset_ns
         Offset from ``t_ns`` to Unix time in ns.
     schema

@@ -1,13 +1,12 @@
 """Rows of the history: statistics of the results of a device within one time bucket, and merging of rows.
 
-A row has columns such as ``gz.N``, ``gz.sigma.0.1`` and ``temperature`` (see ``columns``). For each column, the row has
-the count, minimum, maximum and last value. Any number of merges preserves the minimum and the maximum exactly. Counters
-(samples received, lost, bad, overflowed) are increments and are added. Values are rounded to float32 (seven digits)
-before they are compared. Rounding preserves the order, so merging adds no error. The module does no I/O.
+A history row has columns such as ``gz.N``, ``gz.sigma.0.1`` and ``temperature`` (see ``column_conversion``). For each
+column, the row contains the count, minimum, maximum and last value. Merging preserves the minimum and the maximum
+exactly, because values are rounded to float32 before the comparison. The counts of samples (received, lost, bad,
+overflowed) are increments, which are added.
 
-In the packed form, the bits of the maximum and of the last value are stored as differences (XOR) from the minimum.
-Bytes of equal significance are grouped and compressed. Values within a minute differ little, so most of these bytes
-are zero.
+In a packed row, the maximum and the last value are stored as bitwise differences (XOR) from the minimum. The bytes are
+grouped by significance and compressed. Most bytes are zero, because values within a minute differ little.
 """
 
 import zlib
@@ -34,7 +33,7 @@ _MAX_N: Final = 2**32 - 1
 
 @dataclass(frozen=True, slots=True)
 class HistoryRow:
-    """Statistics of k columns in the bucket from ``start_s`` to ``start_s + width_s``."""
+    """Statistics of k columns in the time bucket from ``start_s`` to ``start_s + width_s``."""
 
     start_s: int  # Unix time, a multiple of width_s
     width_s: int
@@ -49,12 +48,12 @@ class HistoryRow:
 
     @property
     def end_s(self) -> int:
-        """Unix time at which the bucket ends [s]."""
+        """Unix time of the end of the time bucket [s]."""
         return self.start_s + self.width_s
 
 
 class RunningStatistics:
-    """Running count, minimum, maximum and last value of k columns.
+    """Running count, minimum, maximum and last value of each column.
 
     >>> seen = RunningStatistics(("a", "b"))
     >>> for numbers in ([1.0, 5.0], [3.0, np.nan], [2.0, 4.0]):
@@ -71,7 +70,7 @@ class RunningStatistics:
         self.last: Singles = self.minimum.copy()
 
     def add_values(self, values: Floats) -> None:
-        """Update the statistics with one value per column ([k], SI); NaN marks a missing value."""
+        """Add one value per column ([k], SI) to the statistics. NaN is a missing value."""
         with np.errstate(over="ignore"):
             single = values.astype(np.float32)
         there = ~np.isnan(single)

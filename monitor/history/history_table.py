@@ -1,8 +1,7 @@
 """Reading of the stored results of a time range as a table with a limited number of buckets.
 
 ``read_history`` merges the rows of each bucket while reading, so the memory depends on the number of requested points
-and not on the length of the time range. A bucket is at least as wide as the stored rows in the bucket. Merging (see
-``bucket``) preserves minima and maxima.
+and not on the length of the time range. A bucket is at least as wide as the stored rows.
 """
 
 import math
@@ -34,7 +33,7 @@ BUCKET_WIDTHS_S: Final = (
 
 @dataclass(frozen=True, slots=True)
 class HistoryTable:
-    """History of one device: k columns in p buckets, ordered by time."""
+    """History of one device with k columns in p time buckets."""
 
     device: str
     span: TimeRange  # requested time range, clipped to the stored time range
@@ -56,11 +55,11 @@ class HistoryTable:
 
     @property
     def end_s(self) -> Ints:
-        """Unix time at which each bucket ends [s], shape [p]."""
+        """Unix time of the end of each bucket [s], shape [p]."""
         return self.start_s + self.width_s
 
     def select_column(self, name: str) -> "ColumnStatistics":
-        """Return one column over time; all values are missing if the table has no column of this name."""
+        """Return the statistics of one column. All values of an unknown column are missing."""
         if name not in self.names:
             nothing: Floats = np.full(len(self), np.nan)
             return ColumnStatistics(np.zeros(len(self), np.int64), nothing, nothing, nothing)
@@ -74,7 +73,7 @@ class HistoryTable:
         return tuple(found)
 
     def list_tau_labels(self) -> tuple[str, ...]:
-        """Return the averaging times of the deviations [s] as written in the column names, in ascending order."""
+        """Return the averaging times in the column names of Allan deviations [s], in ascending order."""
         found = {name.split(".sigma.")[1] for name in self.names if ".sigma." in name}
         return tuple(sorted(found, key=float))
 
@@ -108,7 +107,7 @@ def read_history(
     span
         Time range; None for the last stored day.
     wants_column
-        Returns True for the name of a column that is wanted.
+        Function that returns True for the name of a column to read.
     step_s
         Minimum bucket width [s]; None for the width that follows from ``points``.
     points
@@ -189,7 +188,7 @@ def build_table(
 
 
 def choose_bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
-    """Return the smallest permitted bucket width [s] for a number of points, at least ``step_s``.
+    """Return the smallest permitted bucket width [s] for about ``points`` buckets, at least ``step_s``.
 
     >>> choose_bucket_width_s(TimeRange(0.0, 86_400.0)), choose_bucket_width_s(TimeRange(0.0, 5 * 31_536_000.0))
     (300, 172800)
@@ -213,7 +212,7 @@ def choose_bucket_width_s(span: TimeRange, step_s: int | None = None, points: in
 
 
 def _clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
-    """Clip a time range to the stored time range plus one day, because events may be outside the stored rows."""
+    """Clip a time range to the stored rows plus one day, because events may precede or follow the rows."""
     start_s, end_s = max(span.start_s, held[0] - DAY_S), min(span.end_s, held[1] + DAY_S)
     return replace(span, start_s=min(start_s, end_s), end_s=max(start_s, end_s))
 

@@ -1,8 +1,8 @@
 """Query of a device's history, parsed from the parameters of a zenoh selector.
 
 Parameters are ``_time=[…]`` (default: the last day), ``step=15min``, ``what=coefficients,deviations,status,events``,
-``axis=gz,gx`` and ``letter=N,B``. Other parameters that begin with ``_`` are parameters of zenoh and are ignored. Any
-other parameter raises a ConfigError. The module does no I/O.
+``axis=gz,gx`` and ``letter=N,B``. Other parameters that begin with ``_`` belong to zenoh and are ignored. Any other
+parameter raises ConfigError.
 """
 
 import re
@@ -32,7 +32,7 @@ _PART: Final = re.compile(r"([^=;]+)(?:=((?:[\[\]][^\[\]]*[\[\]])|[^;]*))?(?:;|$
 
 @dataclass(frozen=True, slots=True)
 class HistoryQuery:
-    """Query with time range, bucket width, and the requested parts, axes and coefficients."""
+    """Query of a history by time range, bucket width, parts, axes and coefficients."""
 
     span: TimeRange | None = None  # None: the last day of the stored history
     step_s: int | None = None  # None: chosen by the reader
@@ -41,7 +41,7 @@ class HistoryQuery:
     symbols: tuple[str, ...] = SYMBOLS
 
     def selects_column(self, name: str) -> bool:
-        """Return True if the query requests the column ``name`` (see ``columns``).
+        """Return True if the query requests the column ``name``.
 
         >>> query = HistoryQuery(axes=("gz",))
         >>> query.selects_column("gz.N.lo"), query.selects_column("gx.N"), HistoryQuery().selects_column("rate")

@@ -1,7 +1,7 @@
 """Events of a history file: insertion, reading and thinning.
 
 If a device has more than MAX_EVENTS events, only the first, the last and the most significant event of each kind, axis
-and day are kept. If too many events remain, only three per month, and then only three per year, are kept in this way.
+and day are kept. If more than half of MAX_EVENTS remain, the same is done for each month, and then for each year.
 ``represented_events`` of the last event includes the number of deleted events.
 """
 
@@ -33,7 +33,7 @@ class StoredEvent:
     text: str
     axis: str | None = None
     what: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    since_s: float | None = None  # Unix time at which the reported condition began
+    since_s: float | None = None  # Unix time of the beginning of the reported condition
     sigma: float | None = None
     represented_events: int = 1  # this event, and deleted earlier events of the same kind
 
@@ -58,7 +58,7 @@ def insert_event(db: sqlite3.Connection, device_id: int, event: StoredEvent) -> 
 def read_events(
     db: sqlite3.Connection, device_id: int, span: TimeRange, max_events: int
 ) -> tuple[list[StoredEvent], int]:
-    """Return the newest events in a time range, in order of time, and the number of all events in this range.
+    """Return the newest events in a time range in order of time, and the total number of events in the range.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ def count_events(db: sqlite3.Connection, device_id: int) -> int:
 
 
 def thin_events(db: sqlite3.Connection, device_id: int, interval_s: int) -> None:
-    """Keep only the first, last and most significant event of each kind, axis and time range.
+    """Delete all events except the first, last and most significant event of each kind, axis and time range.
 
     Parameters
     ----------
@@ -128,12 +128,12 @@ def thin_events(db: sqlite3.Connection, device_id: int, interval_s: int) -> None
 
 
 def clamp_to_sqlite_range(t_s: float) -> float:
-    """Clamp a time to the range that SQLite can compare."""
+    """Clamp a time to ±1e18 s for comparisons in SQLite."""
     return max(min(t_s, 1e18), -1e18)
 
 
 def _encode_values(what: Mapping[str, Mapping[str, float]]) -> str:
-    """Encode event values as JSON, with null for NaN. If the JSON is too long, return ``{}``."""
+    """Encode event values as JSON, with null for NaN. Values that are too long are replaced by ``{}``."""
     text = msgspec.json.encode(what).decode()
     return text if len(text) <= MAX_TEXT_LENGTH else "{}"
 
