@@ -8,7 +8,8 @@ import re
 from typing import Final
 
 MASK: Final = "***"
-# The pattern matches at most the last character of the scheme. A pattern for the whole scheme takes quadratic time.
+# a pattern for the whole URL scheme would take quadratic time
+
 _URL_PASSWORD: Final = re.compile(r"([a-z0-9+.-]:?//?[^/\s:@\"']*):[^/\s@\"']+@", re.IGNORECASE)
 _NAMED_SECRET: Final = re.compile(
     r"""(["']?\b\w*(?:password|passwd|passphrase|secret|token|private_key_base64)["']?\s*[:=]\s*)"""

@@ -1,7 +1,7 @@
 """Data types that modules exchange: ``Chunk`` (received bytes), ``SampleBlock`` (decoded samples) and ``Event``.
 
-All values are in SI units: rad/s and m/s². Temperatures are in °C. ``t_ns`` is a time in nanoseconds on the monotonic
-clock of the host. If the source provides Unix times, ``t_ns`` is Unix time instead. ``ticks`` are the values of the
+Angular rates are in rad/s, accelerations in m/s² and temperatures in °C. ``t_ns`` is a time in nanoseconds on the
+monotonic clock of the host. ``t_ns`` is a Unix time if the source provides Unix times. ``ticks`` are the values of the
 device counter.
 """
 
@@ -34,7 +34,7 @@ ANY_SOURCE: Final = 1 << 30
 
 @dataclass(frozen=True, slots=True)
 class Chunk:
-    """Bytes that a link has received, with their arrival time."""
+    """Bytes received by a link, and the arrival time of the bytes."""
 
     data: bytes
     t_ns: int  # arrival time on the monotonic clock of the host, or recorded Unix time if the link replays a file
@@ -158,7 +158,7 @@ class Event:
 
 
 def concatenate_blocks(blocks: Sequence[SampleBlock]) -> SampleBlock:
-    """Concatenate blocks into one block, whose ``lost`` is the sum over all blocks."""
+    """Concatenate blocks into one block. The field ``lost`` of the result is the sum over all blocks."""
     return make_block(
         np.concatenate([b.t_ns for b in blocks]),
         np.concatenate([b.values for b in blocks]),
@@ -169,7 +169,7 @@ def concatenate_blocks(blocks: Sequence[SampleBlock]) -> SampleBlock:
 
 
 def merge_contiguous_blocks(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
-    """Concatenate consecutive blocks, so that a new block begins only where samples are missing."""
+    """Concatenate consecutive blocks between which no samples are missing."""
     edges = [*(i for i, one in enumerate(blocks) if i == 0 or one.lost), len(blocks)]
     return [blocks[a] if b - a == 1 else concatenate_blocks(blocks[a:b]) for a, b in pairwise(edges)]
 
@@ -177,8 +177,7 @@ def merge_contiguous_blocks(blocks: Sequence[SampleBlock]) -> list[SampleBlock]:
 def seconds_to_ns(seconds: Floats) -> Ints:
     """Convert seconds [n] to whole nanoseconds [n].
 
-    Integer part and fraction are converted separately, so that the conversion adds no rounding error. Unix seconds in
-    float64 have a resolution of 0.24 µs.
+    The integer part and the fraction of the seconds are converted separately to avoid rounding errors.
     """
     whole = np.floor(seconds)
     fraction = np.rint((seconds - whole) * 1e9)

@@ -1,9 +1,9 @@
-"""Driver of one device: reads bytes from a link, decodes the bytes and assigns a time to each sample.
+"""Driver of one device, which reads bytes from a link, decodes samples and assigns a time to each sample.
 
-``Driver.step`` reads, decodes, time-stamps and passes on samples once. ``Driver.run`` repeats ``step`` in the thread of
-the device. If a link cannot be opened, is lost or falls silent, the driver closes the link and reports an event. The
-driver then tries to open the link again, with growing pauses, until the driver is stopped or a replay has ended. A
-fault of one device does not affect other devices.
+``Driver.run_once`` reads, decodes, time-stamps and passes on samples once. ``Driver.run`` repeats ``run_once`` in the
+thread of the device. If a link cannot be opened, is lost or falls silent, the driver closes the link and reports an
+event. The driver then tries to reopen the link, with growing pauses. A fault of one device does not affect other
+devices.
 """
 
 import threading
@@ -50,7 +50,7 @@ class AxisMap:
     sign: tuple[float, ...] = (1.0,) * 6
 
     def map_axes(self, samples: SampleBlock) -> SampleBlock:
-        """Return the samples with sensor axes mapped to output axes."""
+        """Return the samples with the sensor axes mapped to output axes."""
         if self == AxisMap():
             return samples
         values = samples.values[:, self.source] * np.array(self.sign)
@@ -58,8 +58,8 @@ class AxisMap:
 
 
 @dataclass(slots=True)
-class Counts:
-    """Sample counts of one device since the start. received + bad + lost is the number of samples sent."""
+class SampleCounts:
+    """Sample counts of one device since the start."""
 
     received: int = 0
     bad: int = 0
@@ -68,7 +68,7 @@ class Counts:
 
 
 class Driver:
-    """Reader of one device.
+    """Driver that reads the samples of one device.
 
     Parameters
     ----------
@@ -105,7 +105,7 @@ class Driver:
         self.link = link
         self.decoder = decoder
         self.clock = clock
-        self.counts = Counts()
+        self.counts = SampleCounts()
         self.state: State = "waiting"
         self.text = f"waiting for {link.name}"
         self.iterations = 0  # number of reads and attempts to open the link; constant while the driver is blocked
@@ -129,20 +129,20 @@ class Driver:
 
     @property
     def late_frames_hint(self) -> str:
-        """Message with the delay of late frames and the remedy; "" if no frame has been late recently."""
+        """Message about the delay of late frames and its remedy; "" if no frame was late recently."""
         return self._counts_late.late_frames_hint if self._counts_late else ""
 
     def take_events(self) -> list[Event]:
-        """Remove all events from the queue and return them, oldest first."""
+        """Remove and return all queued events, oldest first."""
         return [self._events.popleft() for _ in range(len(self._events))]
 
     def stop(self) -> None:
-        """End ``run``, and close the link so that a waiting read ends."""
+        """Stop the method ``run``, and close the link to interrupt a waiting read."""
         self._stop.set()
         self.link.close()
 
     def run(self) -> None:
-        """Read until the driver is stopped or a replay has ended. The thread of the device calls this method."""
+        """Read from the link until the driver is stopped or a replay has ended."""
         try:
             self._run()
         except Exception as error:
@@ -151,7 +151,7 @@ class Driver:
             raise
 
     def _run(self) -> None:
-        """Open the link and read until the driver is stopped or a replay ends. Reopen the link after an error."""
+        """Read until the driver is stopped or a replay ends. After an error, open the link again."""
         pause_s = MIN_RETRY_PAUSE_S
         while not self._stop.is_set():
             received = self.counts.received
@@ -163,7 +163,7 @@ class Driver:
                     self.clock.note_no_unread_data(opening_ns)
                 self._last_data_s = time.monotonic()
                 while not self._stop.is_set():
-                    self.step()
+                    self.run_once()
             except LinkEnded as error:
                 self.state, self.text = "ended", str(error)
                 self.link.close()
@@ -177,8 +177,8 @@ class Driver:
             pause_s = min(2.0 * pause_s, MAX_RETRY_PAUSE_S)
         self.link.close()
 
-    def step(self) -> None:
-        """Read once, and decode, time-stamp and pass on the samples."""
+    def run_once(self) -> None:
+        """Read from the link once, decode the samples, assign sample times and call ``push``."""
         self.iterations += 1
         asked_ns = time.monotonic_ns()
         chunks = self.link.poll_chunks(READ_TIMEOUT_S)
@@ -211,18 +211,16 @@ class Driver:
             self._handle_recovery()
 
     def _decoder_drops(self) -> int:
-        """Return the number of samples that the decoder has dropped because they were bad or late."""
         return self.decoder.bad + (self._counts_late.dropped_late_samples if self._counts_late else 0)
 
     def _count_decoder_drops(self) -> None:
-        """Update the counts of bad and late samples."""
         self.counts.bad = self.decoder.bad
         if self._counts_late:
             self.counts.lost += self._counts_late.dropped_late_samples - self.counts.late
             self.counts.late = self._counts_late.dropped_late_samples
 
     def _count_samples(self, stamped: SampleBlock, dropped: int) -> None:
-        """Count the samples in a block and the lost samples before the block, except samples that were dropped."""
+        """Add the samples of a block and the preceding lost samples to the counts, without the ``dropped`` samples."""
         if self.first_t_ns is None:
             self.first_t_ns = int(stamped.t_ns[0])
         self.counts.received += len(stamped)
@@ -233,7 +231,7 @@ class Driver:
             self._unreported_gaps += 1
 
     def _report_lost(self) -> None:
-        """Report missing samples at most once per second, so that a bad connection does not hide other events."""
+        """Report missing samples at most once per second, to keep the event queue free for other events."""
         if not self._unreported_samples or time.monotonic() - self._last_report_s < LOSS_REPORT_INTERVAL_S:
             return
         places = "" if self._unreported_gaps == 1 else f" in {self._unreported_gaps} places"
@@ -242,13 +240,12 @@ class Driver:
         self._last_report_s = time.monotonic()
 
     def _check_silence(self) -> None:
-        """Raise LinkLost if the link has been silent for longer than the limit."""
         silent_s = time.monotonic() - self._last_data_s
         if self._silence_s and silent_s > self._silence_s:
             raise LinkLost(f"{self.link.name} silent for {silent_s:.1f} s")
 
     def _check_undecoded(self, size: int) -> None:
-        """Report a device that sends bytes from which no samples can be decoded."""
+        """Report a device whose bytes cannot be decoded."""
         self._count_decoder_drops()
         self._undecoded_bytes += size
         mute_s = self._last_data_s - self._last_sample_s
@@ -263,13 +260,11 @@ class Driver:
             self.clock.note_link_closed()
 
     def _handle_recovery(self) -> None:
-        """Report that samples arrive again."""
         if self.state == "lost":
             self._event("link_back", f"{self.link.name} is back")
         self.state, self.text = "running", ""
 
     def _handle_link_error(self, error: LinkError) -> None:
-        """Report a lost link, close the link and reset the decoder."""
         if self.state == "running":
             self._event("link_lost", str(error))
             self.state = "lost"
@@ -280,14 +275,13 @@ class Driver:
         self.clock.note_link_closed()
 
     def _event(self, kind: str, text: str) -> None:
-        """Queue an event."""
         # the present time, on the clock of the sample times
         t_ns = self._newest_t_ns if self.times_are_unix else time.monotonic_ns()
         self._events.append(Event(kind, t_ns, text))
 
 
 def parse_axis_map(table: dict[str, str]) -> AxisMap:
-    """Return the axis map of the table ``[device.axes]``, for example ``{"gz": "-gy"}``.
+    """Parse the table ``[device.axes]``, for example ``{"gz": "-gy"}``.
 
     Parameters
     ----------
@@ -297,7 +291,7 @@ def parse_axis_map(table: dict[str, str]) -> AxisMap:
     Raises
     ------
     ConfigError
-        If an axis is unknown, or if a gyroscope axis is mapped to an accelerometer axis or the reverse.
+        If an axis is unknown, or if gyroscope and accelerometer axes are mixed.
     """
     source, sign = list(range(6)), [1.0] * 6
     wrong = []

@@ -10,8 +10,8 @@
       RecordingError(ValueError)     the file is not a recording, or the file is empty
       NotReady                       too few samples for a result
 
-Links convert the exceptions of vendor libraries to these classes and keep the original exception as the cause. If a
-module without I/O raises any other exception, the program has a bug.
+Links convert the exceptions of vendor libraries to these classes and keep the original exception as the cause. Any
+other exception in a module without I/O is a bug.
 """
 
 from typing import Final
@@ -21,16 +21,16 @@ MAX_TEXT_CHARACTERS: Final = 2000
 
 
 class ImuError(Exception):
-    """Base class of the exceptions of this project. The error text is one line without control characters."""
+    """Base class of the exceptions of this project. The error text is a single line without control characters."""
 
     def __str__(self) -> str:
-        return format_one_line(super().__str__())
+        return sanitize_error_text(super().__str__())
 
 
-def format_one_line(text: str) -> str:
+def sanitize_error_text(text: str) -> str:
     """Replace control characters by blanks, and shorten the text to MAX_TEXT_CHARACTERS characters.
 
-    >>> format_one_line("no key \\x1b[2J\\nhere")
+    >>> sanitize_error_text("no key \\x1b[2J\\nhere")
     'no key  [2J here'
     """
     text = "".join(c if c.isprintable() else " " for c in text[: MAX_TEXT_CHARACTERS + 1].strip())
@@ -38,12 +38,12 @@ def format_one_line(text: str) -> str:
 
 
 def describe_error(error: Exception) -> str:
-    """Return the text of an exception in one line. For an OSError, the text is the reason without the path."""
+    """Return the text of an exception in one line. The text of an OSError does not include the path."""
     return " ".join(str(getattr(error, "strerror", None) or error).split())
 
 
 class ConfigError(ImuError, ValueError):
-    """Invalid setting or option. The text names the file, the key or the line, and the valid values.
+    """Invalid setting or option. The error text contains the location of the mistake and the valid values.
 
     Parameters
     ----------
@@ -56,11 +56,11 @@ class ConfigError(ImuError, ValueError):
 
     @property
     def lines(self) -> tuple[str, ...]:
-        """Lines of the message, one for each mistake."""
-        return tuple(format_one_line(str(line)) for line in self.args)
+        """Lines of the error text, one for each mistake."""
+        return tuple(sanitize_error_text(str(line)) for line in self.args)
 
     def __str__(self) -> str:
-        return format_one_line("; ".join(self.lines))
+        return sanitize_error_text("; ".join(self.lines))
 
 
 class LinkError(ImuError, OSError):
@@ -68,7 +68,7 @@ class LinkError(ImuError, OSError):
 
 
 class LinkUnavailable(LinkError):
-    """A link cannot be opened. The driver tries again later."""
+    """A link cannot be opened. The driver repeats the attempt later."""
 
 
 class LinkLost(LinkError):
@@ -76,7 +76,7 @@ class LinkLost(LinkError):
 
 
 class LinkEnded(LinkError):
-    """The end of a replayed source has been reached."""
+    """A replayed file has ended."""
 
 
 class DecodeError(ImuError, ValueError):

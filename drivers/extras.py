@@ -1,4 +1,4 @@
-"""Check that the optional packages of an installation extra are installed."""
+"""Check that the optional packages of an extra (``pip install imu-monitor[extra]``) are installed."""
 
 import importlib.util
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ def find_missing_packages(extra: str) -> tuple[str, ...]:
     return tuple(package for module, package in EXTRAS[extra].items() if importlib.util.find_spec(module) is None)
 
 
-def check_extra(extra: str, feature: str) -> None:
+def require_extra(extra: str, feature: str) -> None:
     """Check that all packages of an extra are installed.
 
     Parameters
@@ -31,7 +31,7 @@ def check_extra(extra: str, feature: str) -> None:
     Raises
     ------
     ConfigError
-        If a package is missing. The text says how to install the package.
+        If a package is missing. The error text contains the ``pip`` command.
     """
     if missing := find_missing_packages(extra):
         raise ConfigError(f'{feature} needs {" and ".join(missing)}: pip install "imu-monitor[{extra}]"')

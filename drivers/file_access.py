@@ -1,8 +1,7 @@
-"""Safe opening and reading of files whose names users or folders provide.
+"""Safe opening and reading of files that are named by users or found in folders.
 
-``open_regular`` opens regular files only. If the path is a FIFO, a socket, a device or a directory, the function raises
-an error and never blocks. ``read_small_file`` reads a complete small file, such as a configuration, a model or a CAN
-database.
+``open_regular_file`` raises an error, and never blocks, if the path is a FIFO, a socket, a device or a directory.
+``read_small_file`` reads a complete small file, such as a configuration, a model or a CAN database.
 """
 
 import errno
@@ -24,7 +23,7 @@ FILE_KINDS: Final = {
 
 
 def expand_user(name: str) -> Path:
-    """Return a path in which a leading ``~`` or ``~user`` is replaced by the home folder."""
+    """Return a path with a leading ``~`` or ``~user`` replaced by the home folder."""
     return Path(os.path.expanduser(name))
 
 
@@ -38,7 +37,7 @@ def is_file(path: Path) -> bool:
     return os.path.isfile(path)
 
 
-def open_regular(path: Path) -> IO[bytes]:
+def open_regular_file(path: Path) -> IO[bytes]:
     """Open a regular file for reading. Symbolic links are followed.
 
     Parameters
@@ -54,9 +53,10 @@ def open_regular(path: Path) -> IO[bytes]:
     Raises
     ------
     OSError
-        If the file cannot be opened, or is not a regular file. ``strerror`` gives the reason without the path.
+        If the file cannot be opened, or is not a regular file. The attribute ``strerror`` contains the reason without
+        the path.
     """
-    check_regular(path)  # check before opening, since opening a device may have side effects
+    check_regular_file(path)  # check before opening, since opening a device may have side effects
     # the file may have been replaced after the check, so open without blocking and check again
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
     try:
@@ -67,15 +67,16 @@ def open_regular(path: Path) -> IO[bytes]:
         raise
 
 
-def check_regular(path: Path) -> None:
+def check_regular_file(path: Path) -> None:
     """Check that a path is a regular file, before a library opens the file.
 
-    The check does not open the file, since closing a second descriptor would release the locks of SQLite on the file.
+    The check does not open the file, since closing another file descriptor would release the locks of SQLite.
 
     Raises
     ------
     OSError
-        If the file does not exist, or is not a regular file. ``strerror`` gives the reason without the path.
+        If the file does not exist, or is not a regular file. The attribute ``strerror`` contains the reason without the
+        path.
     """
     try:
         mode = os.stat(path).st_mode
@@ -85,7 +86,7 @@ def check_regular(path: Path) -> None:
 
 
 def check_folder_or_absent(path: Path) -> None:
-    """Raise OSError if the path exists and is not a folder. ``strerror`` names the type of the file."""
+    """Raise OSError if the path exists and is not a folder."""
     try:
         mode = os.stat(path).st_mode
     except FileNotFoundError:
@@ -95,16 +96,16 @@ def check_folder_or_absent(path: Path) -> None:
         raise OSError(errno.ENOTDIR, f"is {kind}, not a folder", str(path))
 
 
-def read_small_file(path: Path, *, pipe: bool = False) -> bytes:
+def read_small_file(path: Path, *, allow_pipe: bool = False) -> bytes:
     """Read a whole small file.
 
     Parameters
     ----------
     path
         Name of the file.
-    pipe
-        True if the path may also be a pipe, such as ``/dev/stdin`` or ``<(command)``. Reading then waits for the
-        program that writes to the pipe.
+    allow_pipe
+        True if the path may also be a pipe, such as ``/dev/stdin`` or ``<(command)``. Reading a pipe waits for the
+        writing program.
 
     Returns
     -------
@@ -116,7 +117,7 @@ def read_small_file(path: Path, *, pipe: bool = False) -> bytes:
     OSError
         If the file cannot be read, is not a regular file, or is larger than MAX_BYTES.
     """
-    with path.open("rb") if pipe and _is_fifo(path) else open_regular(path) as file:
+    with path.open("rb") if allow_pipe and _is_fifo(path) else open_regular_file(path) as file:
         data = file.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
         raise OSError(errno.EFBIG, f"more than {MAX_BYTES // 1_000_000} MB", str(path))
@@ -124,7 +125,6 @@ def read_small_file(path: Path, *, pipe: bool = False) -> bytes:
 
 
 def _is_fifo(path: Path) -> bool:
-    """Return True if the path is a FIFO."""
     try:
         return stat.S_ISFIFO(os.stat(path).st_mode)
     except (OSError, ValueError):  # reading the file reports the error
@@ -132,7 +132,6 @@ def _is_fifo(path: Path) -> bool:
 
 
 def _check_mode(path: Path, mode: int) -> None:
-    """Raise OSError if the mode does not belong to a regular file."""
     if not stat.S_ISREG(mode):
         kind = FILE_KINDS.get(stat.S_IFMT(mode), "something else")
         number = errno.EISDIR if stat.S_ISDIR(mode) else errno.EINVAL

@@ -1,4 +1,4 @@
-"""Discovery of the modules in a package, and suggestions for misspelled names."""
+"""Search for the modules of a package, and suggestions for misspelled names."""
 
 import importlib
 import pkgutil
@@ -17,7 +17,7 @@ def list_modules(package: ModuleType, suffix: str = "") -> tuple[str, ...]:
     package
         Package that holds the modules.
     suffix
-        End of the module names, such as "_link". It is removed from the returned names.
+        End of the module names, such as "_link". The suffix is removed from the returned names.
 
     Returns
     -------
@@ -43,18 +43,17 @@ def import_module(package: ModuleType, name: str, suffix: str = "") -> ModuleTyp
     Raises
     ------
     ConfigError
-        If there is no such module. The text lists all names, beginning with the most similar name.
+        If the module does not exist. The error text lists all names, beginning with the most similar name.
     """
     known = list_modules(package, suffix)
     if name not in known:
-        raise ConfigError(f'unknown name "{name}"{format_choices(name, known)}')
+        raise ConfigError(f'unknown name "{name}"{format_choices_by_similarity(name, known)}')
     return importlib.import_module(f"{package.__name__}.{name}{suffix}")
 
 
 def format_suggestion(word: str, known: Sequence[str]) -> str:
-    """Return a suggestion to append to an error message about an unknown word.
-
-    The text suggests the most similar known word, or lists all known words if none is similar.
+    """Return the most similar known word as the end of an error message. If no word is similar, the text lists all
+    known words.
 
     Parameters
     ----------
@@ -70,8 +69,8 @@ def format_suggestion(word: str, known: Sequence[str]) -> str:
     return f'; did you mean "{close[0]}"?' if close else f"; known are {', '.join(known)}"
 
 
-def format_choices(word: str, known: Sequence[str]) -> str:
-    """Return the known words to append to an error message about an unknown word, the most similar word first.
+def format_choices_by_similarity(word: str, known: Sequence[str]) -> str:
+    """Return all known words as the end of an error message, beginning with the most similar word.
 
     Parameters
     ----------
@@ -80,7 +79,7 @@ def format_choices(word: str, known: Sequence[str]) -> str:
     known
         All known words.
 
-    >>> format_choices("serail", ("can", "serial"))
+    >>> format_choices_by_similarity("serail", ("can", "serial"))
     '; possible are serial, can'
     """
     near = {one: SequenceMatcher(None, word.lower(), one.lower()).ratio() for one in known}

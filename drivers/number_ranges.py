@@ -1,12 +1,11 @@
-"""Units and supported ranges of the numbers that users and files provide.
+"""Units and supported ranges of numbers in options, configuration files, model files and recordings.
 
-Numbers enter the program through command-line options, keys of configuration and model files, and recordings. The
-program checks each number against one of the ranges below, so that no later computation overflows, divides by zero or
-exceeds the memory. The ranges are wider than the values of any known sensor or application. Products, squares and
-quotients of numbers within the ranges are finite.
+Each number is checked against one of the ranges below, so that no computation overflows, divides by zero or exceeds the
+memory. The ranges are wider than the values of any known sensor or application. Products, squares and quotients of
+numbers within the ranges are finite.
 
-The type of a field in a settings model names the range: ``Annotated[float, RATE_HZ]``. pydantic then checks the number
-with ``NumberRange.check``.
+The type of a field in a settings model contains the range, for example ``Annotated[float, RATE_HZ]``. pydantic then
+calls ``NumberRange.check``.
 """
 
 from collections.abc import Callable
@@ -50,7 +49,7 @@ class NumberRange:
     unit: str  # "" for a number without a unit
     low: float
     high: float
-    zero: bool = False  # True if 0 is supported as well and has a special meaning
+    zero: bool = False  # True if 0 is also supported, with a special meaning
     signed: bool = False  # True if the range applies to the absolute value
 
     def check(self, value: Number) -> Number:
@@ -59,7 +58,7 @@ class NumberRange:
         Raises
         ------
         ConfigError
-            If the value is NaN or outside the supported range. The text states the value and the range.
+            If the value is NaN or outside the supported range. The error text contains the value and the range.
         """
         if self.supports(value):
             return value
@@ -71,7 +70,7 @@ class NumberRange:
         return self.low <= size <= self.high or (self.zero and value == 0)
 
     def format_range(self) -> str:
-        """Return the supported range and the unit as text.
+        """Return the supported range and the unit as text for messages.
 
         >>> DURATION_S.format_range(), SILENCE_S.format_range()
         ('1 µs to 36525 d', '1 ms to 36525 d, or 0')
@@ -88,14 +87,14 @@ class NumberRange:
 
         kind = "a whole number" if source is int else "a number"
 
-        def check(value: Any, convert: Callable[[Any], Any]) -> Any:
+        def convert_and_check(value: Any, convert: Callable[[Any], Any]) -> Any:
             try:
                 number = convert(value)
             except ValidationError:
                 raise ConfigError(f"expected {kind} from {self.format_range()}, got {format_value(value)}") from None
             return self.check(number)
 
-        return core_schema.no_info_wrap_validator_function(check, handler(source))
+        return core_schema.no_info_wrap_validator_function(convert_and_check, handler(source))
 
 
 # --- time and rates
@@ -174,7 +173,7 @@ TEMPERATURE_C: Final = NumberRange("°C", -273.15, 2_000.0)
 
 
 def format_value(value: object) -> str:
-    """Return a value in TOML syntax. Long text is shortened, and a list or a table is replaced by a description.
+    """Return a value in TOML syntax. Long text is shortened. A list or a table is replaced by "a list" or "a table".
 
     >>> format_value(True), format_value("x"), format_value([1, 2])
     ('true', '"x"', 'a list')
@@ -192,7 +191,7 @@ def format_value(value: object) -> str:
 
 
 def _number_text(value: float, unit: str) -> str:
-    """Return a number and its unit as text.
+    """Return a number with a unit as text.
 
     >>> _number_text(2e6, "Hz"), _number_text(0.25, "s"), _number_text(172_800.0, "s"), _number_text(10**400, "")
     ('2 MHz', '250 ms', '2 d', 'an integer of more than 64 bits')

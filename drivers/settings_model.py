@@ -1,8 +1,8 @@
 """Base class of the settings in a configuration file, and validation of one table of the file.
 
-Each field of a model describes one key by a type with the supported range, a default and a description. A field without
-a default, or with a default that turns a function off, also has an example. ``check_table`` finds all mistakes in a
-table at once, and describes each mistake without names of Python types.
+Each field of a settings model describes one key by the type with the supported range, a default and a description. A
+field also has an example if there is no default, or if the default turns a function off. ``check_table`` finds all
+mistakes in a table.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ from pydantic_core import CoreSchema, ErrorDetails, core_schema
 
 from drivers import file_access
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices, format_suggestion
+from drivers.module_lookup import format_choices_by_similarity, format_suggestion
 from drivers.number_ranges import format_value
 
 MAX_PASSES: Final = 4
@@ -61,7 +61,7 @@ class Conflict(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _ReadContext:
-    """Context of a validation by ``check_table``. Settings that Python code creates are validated without a context."""
+    """Context of a validation by ``check_table``. Settings created by Python code are validated without a context."""
 
     folder: Path | None  # folder of the configuration file; None if the existence of files is not checked
 
@@ -72,7 +72,7 @@ class SettingsModel(BaseModel):
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", validate_by_name=True)
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield the mistakes that concern a combination of keys."""
+        """Yield the mistakes in combinations of keys."""
         return iter(())
 
     @model_validator(mode="after")
@@ -85,20 +85,20 @@ class SettingsModel(BaseModel):
 class Problem(NamedTuple):
     """Mistake in a table."""
 
-    place: str  # path of the key, such as "signals.gx" or "tau[1]"; "" for the whole table
+    key_path: str  # path of the key, such as "signals.gx" or "tau[1]"; "" for the whole table
     text: str
 
-    def nest_under(self, place: str) -> "Problem":
-        """Return the problem with the path ``place`` of the table put before the path of the key."""
-        dot = "." if place and self.place and not self.place.startswith("[") else ""
-        return Problem(f"{place}{dot}{self.place}", self.text)
+    def nest_under(self, table_path: str) -> "Problem":
+        """Return the problem with ``table_path`` prepended to the key path."""
+        dot = "." if table_path and self.key_path and not self.key_path.startswith("[") else ""
+        return Problem(f"{table_path}{dot}{self.key_path}", self.text)
 
     def __str__(self) -> str:
-        return f"{self.place}: {self.text}" if self.place else self.text
+        return f"{self.key_path}: {self.text}" if self.key_path else self.text
 
 
 class TableError(ConfigError):
-    """Mistakes in the table of a field whose value is not a settings model.
+    """Mistakes in a table that is not converted to a settings model.
 
     Parameters
     ----------
@@ -122,32 +122,32 @@ class TableCheckResult(Generic[Model]):
     problems: list[Problem] = field(default_factory=list)
     partial: dict[str, object] = field(default_factory=dict)  # ``TableError.partial`` by path of the table
 
-    def is_sound(self, *places: str) -> bool:
-        """Return True if no problem was found in these keys, their parent tables or their subkeys."""
-        return not any(_nested(place, wrong.place) for place in places for wrong in self.problems)
+    def has_no_problem(self, *key_paths: str) -> bool:
+        """Return True if the given keys, including parent tables and subkeys, have no problem."""
+        return not any(_nested(key_path, wrong.key_path) for key_path in key_paths for wrong in self.problems)
 
-    def add_problem(self, place: str, text: str) -> None:
-        """Add a problem, unless a problem with the same key has been found before.
+    def add_problem(self, key_path: str, text: str) -> None:
+        """Add a problem, unless the key already has a problem.
 
         Parameters
         ----------
-        place
-            Path of the key that the message names.
+        key_path
+            Path of the key in the configuration file.
         text
             Message.
         """
-        if self.is_sound(place):
-            self.problems.append(Problem(place, text))
+        if self.has_no_problem(key_path):
+            self.problems.append(Problem(key_path, text))
 
 
-def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> TableCheckResult[Model]:
-    """Convert a table to settings, and find all mistakes in the table.
+def check_table(model: type[Model], table: Mapping[str, Any], folder: Path | None = None) -> TableCheckResult[Model]:
+    """Convert a configuration table to settings, and find all mistakes in the table.
 
-    Wrong values are replaced by defaults or examples, so that one mistake does not hide another mistake.
+    Wrong values are replaced by defaults or examples, so that the remaining values can be checked.
 
     Parameters
     ----------
-    kind
+    model
         Settings model of the table.
     table
         Keys and values from a TOML file.
@@ -158,75 +158,71 @@ def check_table(kind: type[Model], table: Mapping[str, Any], folder: Path | None
     repaired = copy.deepcopy(dict(table))
     for _ in range(MAX_PASSES):
         try:
-            checked.value = kind.model_validate(repaired, context=_ReadContext(folder), by_alias=True, by_name=False)
+            checked.value = model.model_validate(repaired, context=_ReadContext(folder), by_alias=True, by_name=False)
         except ValidationError as error:
             details = error.errors(include_url=False)
-            found = [problem for one in details for problem in _problems(kind, one, checked)]
-            checked.problems += [one for one in found if checked.is_sound(one.place)]
+            found = [problem for one in details for problem in _problems(model, one, checked)]
+            checked.problems += [one for one in found if checked.has_no_problem(one.key_path)]
             for one in reversed(details):
-                _repair(kind, repaired, one)
+                _repair(model, repaired, one)
         else:
             _add_conflicts(checked, checked.value, "")
             break
     return checked
 
 
-def fields_by_key(kind: type[SettingsModel]) -> dict[str, FieldInfo]:
-    """Return the fields of a model by their keys in the file."""
-    return {found.alias or name: found for name, found in kind.model_fields.items()}
+def fields_by_key(model: type[SettingsModel]) -> dict[str, FieldInfo]:
+    """Return the fields of a settings model by the key in the configuration file."""
+    return {found.alias or name: found for name, found in model.model_fields.items()}
 
 
-def find_model(annotation: Any) -> type[SettingsModel] | None:
+def find_settings_model(annotation: Any) -> type[SettingsModel] | None:
     """Return the settings model that a type annotation contains; None if the annotation contains no model."""
     if isinstance(annotation, type) and issubclass(annotation, SettingsModel):
         return annotation
-    return next((found for one in get_args(annotation) if (found := find_model(one))), None)
+    return next((found for one in get_args(annotation) if (found := find_settings_model(one))), None)
 
 
 def _problems(kind: type[SettingsModel], error: ErrorDetails, checked: TableCheckResult[Any]) -> Iterator[Problem]:
-    """Convert one pydantic error to problems."""
-    place = _format_place(error["loc"])
+    key_path = _format_location(error["loc"])
     cause = error.get("ctx", {}).get("error")
     if isinstance(cause, TableError):
-        checked.partial[place] = cause.partial
-        yield from (problem.nest_under(place) for problem in cause.problems)
+        checked.partial[key_path] = cause.partial
+        yield from (problem.nest_under(key_path) for problem in cause.problems)
     elif isinstance(cause, ConfigError):
-        yield from (Problem(place, line) for line in cause.lines)
+        yield from (Problem(key_path, line) for line in cause.lines)
     elif error["type"] == "extra_forbidden":
         model = _field_at(kind, error["loc"])[0]
-        yield Problem(place, f"unknown key{format_suggestion(str(error['loc'][-1]), tuple(fields_by_key(model)))}")
+        yield Problem(key_path, f"unknown key{format_suggestion(str(error['loc'][-1]), tuple(fields_by_key(model)))}")
     else:
-        yield Problem(place, _describe(error))
+        yield Problem(key_path, _describe(error))
 
 
 def _describe(error: ErrorDetails) -> str:
-    """Describe a wrong value without the names of Python types."""
     value = error["input"]
     if error["type"] == "missing":
         return "missing"
     if error["type"] == "literal_error":
         words = [word or number for word, number in re.findall(r"'([^']*)'|(\d+)", error["ctx"]["expected"])]
-        return f"{format_value(value)}{format_choices(str(value), words)}"
+        return f"{format_value(value)}{format_choices_by_similarity(str(value), words)}"
     return f"expected {EXPECTED.get(error['type'], 'another value')}, got {format_value(value)}"
 
 
-def _add_conflicts(checked: TableCheckResult[Any], value: object, place: str) -> None:
-    """Add the conflicts of a model and of all models that the fields contain."""
+def _add_conflicts(checked: TableCheckResult[Any], value: object, key_path: str) -> None:
     if isinstance(value, SettingsModel):
         for one in value.find_conflicts():
-            problem = Problem(one.key, one.text).nest_under(place)
+            problem = Problem(one.key, one.text).nest_under(key_path)
             keys = (*one.others, one.key) if one.key else one.others
-            if checked.is_sound(*(Problem(key, "").nest_under(place).place for key in keys)):
+            if checked.has_no_problem(*(Problem(key, "").nest_under(key_path).key_path for key in keys)):
                 checked.problems.append(problem)
         for key, info in zip(fields_by_key(type(value)), type(value).model_fields, strict=True):
-            _add_conflicts(checked, getattr(value, info), Problem(key, "").nest_under(place).place)
+            _add_conflicts(checked, getattr(value, info), Problem(key, "").nest_under(key_path).key_path)
     elif isinstance(value, tuple):
         for i, one in enumerate(value):
-            _add_conflicts(checked, one, f"{place}[{i}]")
+            _add_conflicts(checked, one, f"{key_path}[{i}]")
 
 
 def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
-    """Replace a wrong or missing value by a default or an example."""
     *path, last = [part for part in error["loc"] if part != "[key]"]
     found = _field_at(kind, error["loc"])[1]
     with contextlib.suppress(LookupError):  # an earlier repair may have removed the value
@@ -240,29 +236,29 @@ def _repair(kind: type[SettingsModel], table: Any, error: ErrorDetails) -> None:
             del table[last]
 
 
-def _field_at(kind: type[SettingsModel], place: Sequence[str | int]) -> tuple[type[SettingsModel], FieldInfo | None]:
-    """Return the innermost model on a path of keys, and the field of the last key; None for an unknown key."""
+def _field_at(kind: type[SettingsModel], location: Sequence[str | int]) -> tuple[type[SettingsModel], FieldInfo | None]:
+    """Return the settings model that contains the last key of a path, and the field; None for an unknown key."""
     found = None
-    for part in place:
+    for part in location:
         if found is not None:
-            kind = find_model(found.annotation) or kind
+            kind = find_settings_model(found.annotation) or kind
         if isinstance(part, str):
             found = fields_by_key(kind).get(part)
     return kind, found
 
 
-def _format_place(place: Sequence[str | int]) -> str:
+def _format_location(location: Sequence[str | int]) -> str:
     """Format the location of a pydantic error as a path of keys.
 
-    >>> _format_place(("device", 0, "tau", 1)), _format_place(("scale", "gw", "[key]"))
+    >>> _format_location(("device", 0, "tau", 1)), _format_location(("scale", "gw", "[key]"))
     ('device[0].tau[1]', 'scale.gw')
     """
-    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in place if part != "[key]")
+    parts = (f"[{part}]" if isinstance(part, int) else f".{part}" for part in location if part != "[key]")
     return "".join(parts).removeprefix(".")
 
 
 def _nested(one: str, other: str) -> bool:
-    """Return True if two paths are equal, or if one path leads to a part of the other path's value."""
+    """Return True if two key paths are equal, or if one key is inside the table or list of the other key."""
     short, long = sorted((one, other), key=len)
     return short == long or (bool(short) and long.startswith(short) and long[len(short)] in ".[")
 
@@ -274,16 +270,16 @@ ListOf = Annotated[tuple[T, ...], Strict(False)]
 """List in the file that becomes a tuple in the model. The items are not converted to other types."""
 
 
-class ReadAs:
-    """Annotation of a field whose value has different types in the file and in the model.
+class ConvertedFrom:
+    """Annotation of a field that is converted from another type in the configuration file.
 
     Parameters
     ----------
     kind
         Type of the value in the file.
     convert
-        Function that converts a value from the file. The arguments are the value and the folder of the file, or None if
-        there is no file. The function raises ConfigError if the value cannot be converted.
+        Function that converts a value. The arguments are the value and the folder of the configuration file, or None if
+        there is no file. The function raises ConfigError if the value is not valid.
     """
 
     def __init__(self, kind: Any, convert: Callable[[Any, Path | None], Any]) -> None:
@@ -291,19 +287,19 @@ class ReadAs:
         self._convert = convert
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return a schema that validates the value in the file and then converts the value."""
+        """Return a pydantic schema that validates and converts a value."""
         converted = get_origin(source) or source
 
-        def read(value: Any, inner: Callable[[Any], Any], info: ValidationInfo) -> Any:
+        def convert_value(value: Any, validate: Callable[[Any], Any], info: ValidationInfo) -> Any:
             if info.context is None and isinstance(value, converted):
                 return value
-            return self._convert(inner(value), info.context.folder if info.context else None)
+            return self._convert(validate(value), info.context.folder if info.context else None)
 
-        return core_schema.with_info_wrap_validator_function(read, handler.generate_schema(self._kind))
+        return core_schema.with_info_wrap_validator_function(convert_value, handler.generate_schema(self._kind))
 
 
-class WordOr:
-    """Annotation of a field that accepts certain words in addition to the values of a type.
+class KeywordOrType:
+    """Annotation of a field that accepts keywords, such as "auto", in addition to the values of a type.
 
     Parameters
     ----------
@@ -318,28 +314,27 @@ class WordOr:
         self._kind = kind
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Return a schema that replaces a word by its value and validates any other value."""
+        """Return a pydantic schema that replaces keywords and validates all other values."""
 
-        def read(value: Any, inner: Callable[[Any], Any], info: ValidationInfo) -> Any:
+        def replace_keyword(value: Any, validate: Callable[[Any], Any], info: ValidationInfo) -> Any:
             if isinstance(value, str) and value in self._words:
                 return self._words[value]
             if info.context is None and value in self._words.values():
                 return value
             try:
-                return inner(value)
+                return validate(value)
             except ValidationError as error:
                 (first, *_) = error.errors(include_url=False)
                 if first["loc"]:  # an item of a list is wrong, and the error describes the item
                     raise
                 raise ConfigError(self._describe(value, first)) from None
 
-        return core_schema.with_info_wrap_validator_function(read, handler.generate_schema(self._kind))
+        return core_schema.with_info_wrap_validator_function(replace_keyword, handler.generate_schema(self._kind))
 
     def _describe(self, value: object, error: ErrorDetails) -> str:
-        """Describe a value that is neither one of the words nor valid for the type."""
         cause = error.get("ctx", {}).get("error")
         text = str(cause) if isinstance(cause, ConfigError) else _describe(error)
-        near = format_choices(str(value), tuple(self._words)).partition("are ")[2].split(", ")
+        near = format_choices_by_similarity(str(value), tuple(self._words)).partition("are ")[2].split(", ")
         words = ", ".join(f'"{word}"' for word in near)
         if text.startswith("expected "):
             return f"expected {words} or {text.removeprefix('expected ')}"
@@ -347,18 +342,18 @@ class WordOr:
 
 
 def one_of(words: Sequence[str]) -> AfterValidator:
-    """Return a validator that accepts only certain words."""
+    """Return a pydantic validator that accepts only the given words."""
 
-    def check(value: str) -> str:
+    def check_word(value: str) -> str:
         if value not in words:
-            raise ConfigError(f'"{value}"{format_choices(value, words)}')
+            raise ConfigError(f'"{value}"{format_choices_by_similarity(value, words)}')
         return value
 
-    return AfterValidator(check)
+    return AfterValidator(check_word)
 
 
 def checked_by(check: Callable[[T], object]) -> AfterValidator:
-    """Return a validator that calls ``check`` and returns the value unchanged. ``check`` may raise ConfigError."""
+    """Return a pydantic validator that calls ``check`` and does not change the value."""
 
     def validate(value: T) -> T:
         check(value)
@@ -368,7 +363,6 @@ def checked_by(check: Callable[[T], object]) -> AfterValidator:
 
 
 def _existing_file(value: str, info: ValidationInfo) -> str:
-    """Return the path of a file. Raise ConfigError if the file does not exist."""
     path = _beside(value, info)
     if path is not None and not os.path.exists(path):  # unlike Path.exists, accepts an invalid name
         raise ConfigError(f"{path}: no such file")
@@ -376,13 +370,13 @@ def _existing_file(value: str, info: ValidationInfo) -> str:
 
 
 def _file_or_name(value: str, info: ValidationInfo) -> str:
-    """Return the path of a file if the file exists, otherwise the unchanged text."""
+    """Return the path of an existing file; otherwise the unchanged text."""
     path = _beside(value, info)
     return value if path is None or not os.path.exists(path) else str(path)
 
 
 def _beside(value: str, info: ValidationInfo) -> Path | None:
-    """Return the path in the folder of the configuration file; None if the value is empty or there is no folder."""
+    """Return the path relative to the configuration file; None for an empty value or without a configuration file."""
     folder = info.context.folder if info.context else None
     return folder / file_access.expand_user(value) if folder and value else None
 

@@ -1,8 +1,7 @@
-"""Conversion factors from unit names to SI, for units in settings and CAN databases.
+"""Conversion factors to SI for the unit names in settings and CAN databases.
 
-Each table maps unit names to the factor that converts a number to rad/s, m/s² or s. A temperature unit also has an
-offset. The tables contain the names in data sheets, DBC files and plots. Names are case-sensitive, and blanks around a
-name are ignored. An unknown name raises a ``ConfigError`` that lists all known names, the most similar name first.
+Each table maps a unit name to the factor that converts a number to rad/s, m/s² or s. A temperature unit also has an
+offset. Unit names are case-sensitive. An unknown unit raises ``ConfigError``.
 """
 
 import math
@@ -10,7 +9,7 @@ from collections.abc import Mapping
 from typing import Final, TypeVar
 
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import HOUR_S
 
 G0: Final = 9.80665
@@ -80,10 +79,10 @@ TIME: Final[Mapping[str, float]] = {
 T = TypeVar("T")
 
 
-def rate_factor(unit: str) -> float:
+def angular_rate_factor(unit: str) -> float:
     """Return the factor that converts a unit of angular rate to rad/s. Raise ConfigError if the unit is unknown.
 
-    >>> round(rate_factor("deg/s"), 6)
+    >>> round(angular_rate_factor("deg/s"), 6)
     0.017453
     """
     return _look_up(RATE, unit, "angular rate")
@@ -98,12 +97,12 @@ def acceleration_factor(unit: str) -> float:
     return _look_up(ACCELERATION, unit, "acceleration")
 
 
-def temperature_scale(unit: str) -> tuple[float, float]:
+def temperature_factor_and_offset(unit: str) -> tuple[float, float]:
     """Return the factor and the offset that convert a unit of temperature to °C.
 
-    The temperature in °C is factor · number + offset. The function raises ConfigError if the unit is unknown.
+    The temperature in °C is factor · number + offset. ConfigError is raised if the unit is unknown.
 
-    >>> temperature_scale("K")
+    >>> temperature_factor_and_offset("K")
     (1.0, -273.15)
     """
     return _look_up(TEMPERATURE, unit, "temperature")
@@ -115,9 +114,8 @@ def time_factor(unit: str) -> float:
 
 
 def _look_up(table: Mapping[str, T], unit: str, quantity: str) -> T:
-    """Return the entry of a unit. Raise ConfigError if the table does not contain the unit."""
-    # Unicode has two characters for the prefix micro, and both are in use
+    # Unicode has two characters for the prefix micro
     name = unit.strip().replace("\N{GREEK SMALL LETTER MU}", "\N{MICRO SIGN}")
     if name not in table:
-        raise ConfigError(f'"{unit}" is not a unit of {quantity}{format_choices(name, tuple(table))}')
+        raise ConfigError(f'"{unit}" is not a unit of {quantity}{format_choices_by_similarity(name, tuple(table))}')
     return table[name]

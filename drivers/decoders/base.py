@@ -1,12 +1,12 @@
-"""Interface of a decoder, and the functions that decoders share. Decoders convert bytes to samples and do no I/O.
+"""Interface of a decoder, and functions shared by the decoders. Decoders convert bytes to samples and do no I/O.
 
 A decoder module ``drivers/decoders/<protocol>.py`` defines ``Settings`` and ``build(settings) -> Decoder``.
 ``Settings`` is a pydantic model with the keys of ``[device.driver.decoder_options]``. ``build`` raises one
-``ConfigError`` with a line for each mistake that the model does not find. The line begins with the key:
-"signals.gx: ...".
+``ConfigError`` with a line for each mistake that the model does not find. Each line of the ``ConfigError`` begins with
+the configuration key, for example "signals.gx: ...".
 
-``feed`` never raises an exception for bad bytes. A frame that fails its check is dropped and counted in ``bad``. The
-field ``lost`` of the next block includes the dropped frames, so that the sample clock leaves a gap for them.
+``feed`` never raises an exception for bad bytes. A frame with a wrong checksum or format is dropped and counted in
+``Decoder.bad``. The field ``lost`` of the next sample block includes the number of dropped frames.
 """
 
 from abc import ABC, abstractmethod
@@ -39,7 +39,7 @@ class Decoder(Protocol):
 
     @property
     def timing(self) -> Timing:
-        """Source of the sample times in this wire format. The source does not change."""
+        """Source of the sample times, such as arrival times or a device counter."""
 
     @property
     def bad(self) -> int:
@@ -47,7 +47,7 @@ class Decoder(Protocol):
 
     @property
     def recent_problem(self) -> str:
-        """Description of a recent problem for the status, such as rejected frames; "" if there was no problem."""
+        """Description of a recent decoding problem, such as rejected frames; "" if there was no problem."""
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
         """Return the samples that these chunks complete.
@@ -56,14 +56,14 @@ class Decoder(Protocol):
         """
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return the samples in the wire format, as a device would send them. Device counters are set to ``ticks``."""
+        """Encode samples in the wire format of the device. Device counters are set to ``ticks``."""
 
     def reset(self) -> None:
-        """Discard an incomplete frame, because the link was opened again."""
+        """Discard an incomplete frame after the link was opened again."""
 
 
 @runtime_checkable
-class AddressFilter(Protocol):
+class AddressFilteringDecoder(Protocol):
     """Interface of a decoder that accepts only chunks with certain addresses."""
 
     @property
@@ -77,11 +77,11 @@ class LateFrameCountingDecoder(Protocol):
 
     @property
     def dropped_late_samples(self) -> int:
-        """Number of samples dropped because some of their frames arrived too late. ``bad`` does not include them."""
+        """Number of samples dropped because of late frames. ``bad`` does not include late samples."""
 
     @property
     def late_frames_hint(self) -> str:
-        """Message with the delay of late frames and the remedy; "" if no frame has been late recently."""
+        """Message about the delay of late frames and its remedy; "" if no frame was late recently."""
 
 
 HINT_FRAMES: Final = 1000
@@ -89,7 +89,7 @@ HINT_FRAMES: Final = 1000
 
 
 class RecentRejection:
-    """Reason for the last rejected frame. The reason is kept until HINT_FRAMES good frames have followed."""
+    """Reason for the last rejected frame. The reason is discarded after HINT_FRAMES good frames."""
 
     def __init__(self) -> None:
         self._reason = ""
@@ -104,20 +104,20 @@ class RecentRejection:
         """Store the reason for a rejected frame."""
         self._reason, self._good_frames = reason, 0
 
-    def count_good_frames(self, frames: int = 1) -> None:
-        """Add frames to the number of good frames since the last rejected frame."""
-        self._good_frames += frames
+    def add_good_frames(self, count: int = 1) -> None:
+        """Add ``count`` to the number of good frames since the last rejected frame."""
+        self._good_frames += count
 
 
 class BlockBuilder:
-    """Builder of blocks from decoded samples. A new block begins where frames were rejected."""
+    """Builder of sample blocks from decoded samples. A rejected frame ends the current sample block."""
 
     def __init__(self) -> None:
         self.bad = 0  # rejected frames and implausible samples so far
         self._missing = 0  # samples missing before the next block
 
     def forget_rejected_frames(self) -> None:
-        """Set the number of samples missing before the next block to 0."""
+        """Reset the number of samples missing before the next sample block."""
         self._missing = 0
 
     def build_plausible_blocks(
@@ -187,7 +187,6 @@ def _find_plausible(values: Floats) -> NDArray[np.bool_]:
 
 
 def _valid_temperatures(temperature_c: Floats) -> Floats:
-    """Replace implausible temperatures by NaN."""
     low, high = TEMPERATURE_LIMITS_C
     return np.where((temperature_c >= low) & (temperature_c <= high), temperature_c, np.nan)
 
@@ -202,25 +201,25 @@ class Frames:
     adjacent: NDArray[np.bool_]  # [n] True if the frame follows the previous one without other bytes
     bad_after: int = 0  # number of frames rejected after the last frame
 
-    def select_frames(self, rows: Sequence[int]) -> "Frames":
+    def select_frames(self, indices: Sequence[int]) -> "Frames":
         """Return the frames with these indices.
 
         The rejected frames before an omitted frame are added to ``bad_before`` of the next selected frame, or to
         ``bad_after``.
         """
-        if len(rows) == len(self.data):
+        if len(indices) == len(self.data):
             return self
-        at = list(rows)
+        at = list(indices)
         rejected = np.cumsum(self.bad_before)
         rejected_at = rejected[at]
         after = int(rejected[-1] if rejected.size else 0) - int(rejected_at[-1] if rejected_at.size else 0)
         bad_before = np.diff(rejected_at, prepend=0)
         return Frames([self.data[i] for i in at], self.t_ns[at], bad_before, self.adjacent[at], after)
 
-    def stack_bytes(self, rows: Ints) -> Bytes:
+    def stack_frames(self, indices: Ints) -> Bytes:
         """Return the bytes of frames of equal length as an array [n, length] of uint8."""
-        data = self.data if rows.size == len(self.data) else [self.data[i] for i in rows.tolist()]
-        return np.frombuffer(b"".join(data), np.uint8).reshape(rows.size, -1)
+        data = self.data if indices.size == len(self.data) else [self.data[i] for i in indices.tolist()]
+        return np.frombuffer(b"".join(data), np.uint8).reshape(indices.size, -1)
 
 
 NEED_MORE: Final = 0
@@ -242,20 +241,22 @@ NO_OFFSET: Final = -(1 << 62)
 
 
 class FrameBuffer:
-    """Buffer that finds the frames in a byte stream. Chunks may begin and end anywhere, and bytes may be damaged.
+    """Buffer that finds the frames in a byte stream.
 
-    A sync pattern may also occur inside a payload. After a rejected candidate, the search therefore continues one byte
-    later. The number of frames lost between two valid frames is estimated in two ways, and the larger estimate is used.
-    The first estimate is the number of rejected candidates that are at least one frame length apart. The second
-    estimate is the number of complete frames that fit between the two valid frames. Bytes before the first frame are
-    ignored, because reading may begin inside a frame. At most ``longest`` bytes are kept between calls of ``feed``.
+    A chunk may begin or end in the middle of a frame, and bytes may be damaged. The payload of a frame may contain the
+    sync pattern. After rejecting a candidate frame, the search therefore continues at the next byte. The number of
+    frames lost between two valid frames is estimated in two ways, and the larger estimate is used. The first estimate
+    is the number of rejected candidate frames at a distance of at least one frame length. The second estimate is the
+    number of complete frames that fit between the two valid frames. Bytes before the first valid frame are ignored,
+    because reading may begin in the middle of a frame. The buffer keeps at most ``longest`` bytes between two calls of
+    ``feed``.
 
     Parameters
     ----------
     sync
         Fixed start of a frame; empty if a frame can start with any byte. ``match`` may set the attribute ``sync`` to
-        the first byte of a valid frame, so that only frames with this first byte are searched. The initial pattern is
-        restored after MAX_BYTES_WITHOUT_FRAME bytes without a valid frame.
+        the first byte of a valid frame, so that only frames with this first byte are searched. The initial sync pattern
+        is restored after MAX_BYTES_WITHOUT_FRAME bytes without a valid frame.
     match
         Function that checks one candidate.
     longest
@@ -272,7 +273,7 @@ class FrameBuffer:
         self.reset()
 
     def reset(self) -> None:
-        """Discard the buffered bytes and the synchronization, and restore the initial ``sync``."""
+        """Discard the buffered bytes and restore the initial sync pattern."""
         self.sync = self._initial_sync
         self._buffer_offset += len(self._buffer)
         self._buffer = b""
@@ -320,11 +321,11 @@ class FrameBuffer:
         self._buffer_offset += at
         while len(self._arrivals) > 1 and self._arrivals[0][0] <= self._buffer_offset:
             self._arrivals.popleft()
-        self._rejection.count_good_frames(len(found))
+        self._rejection.add_good_frames(len(found))
         return frames
 
     def _examine_candidate(self, buffer: bytes, at: int) -> tuple[int, int]:
-        """Return the offset of the next candidate and the length of its frame, NEED_MORE or REJECT."""
+        """Return the offset of the next candidate frame, and the result of ``FrameMatcher`` for the candidate."""
         start = buffer.find(self.sync, at)
         if self.sync != self._initial_sync:
             widen_at = at + MAX_BYTES_WITHOUT_FRAME - self._skipped_bytes
@@ -344,7 +345,6 @@ class FrameBuffer:
         return start, length
 
     def _append_chunks(self, chunks: Sequence[Chunk]) -> bytes:
-        """Return the buffered bytes followed by the data of these chunks, and store the arrival times of the chunks."""
         end = self._buffer_offset + len(self._buffer)
         for chunk in chunks:
             if chunk.data:
@@ -353,14 +353,14 @@ class FrameBuffer:
         return b"".join((self._buffer, *[chunk.data for chunk in chunks]))
 
     def _count_rejected(self, at: int) -> None:
-        """Count a rejected candidate unless the previous rejected candidate is less than one frame length before it."""
+        """Count a rejected candidate frame. Candidates closer than one frame length are counted once."""
         offset = self._buffer_offset + at
         if offset - self._last_rejected >= max(self._frame_length, 1):
             self._rejected += 1
             self._last_rejected = offset
 
     def _take_lost_frames(self) -> int:
-        """Return the number of frames lost since the last valid frame, and start counting again."""
+        """Return the number of frames lost since the last valid frame, and reset the number to 0."""
         fitting = round(self._skipped_bytes / self._frame_length) if self._frame_length else 0
         count = max(self._rejected, fitting) if self._synchronized else 0
         self._skipped_bytes = self._rejected = 0
@@ -370,7 +370,6 @@ class FrameBuffer:
         return count
 
     def _arrival_times(self, ends: list[int]) -> Ints:
-        """Return the arrival times [n] of the chunks that contain the last byte of each frame."""
         if not ends:
             return np.empty(0, np.int64)
         offsets, t_ns = np.array(self._arrivals, np.int64).T
@@ -426,7 +425,6 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
     def _build_measured_blocks(
         self, frames: Frames, values: Floats, temperature_c: Floats, ticks: Ints
     ) -> tuple[list[SampleBlock], int | None]:
-        """Return the samples with at least one measured axis, and the index of the frame with the last sample."""
         rows = np.flatnonzero(~np.isnan(values).all(axis=1))
         if rows.size < len(values):
             frames = frames.select_frames(rows.tolist())
@@ -438,14 +436,14 @@ class FrameStreamDecoder(RejectingDecoder, ABC):
 
     @abstractmethod
     def _decode(self, frames: Frames) -> list[SampleBlock]:
-        """Return the samples in one or more frames."""
+        """Return the samples that the frames contain."""
 
 
 Key = TypeVar("Key", bound=Hashable)
 
 
 def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, Ints]]:
-    """Yield each distinct key together with the indices [k] at which the key occurs.
+    """Yield each distinct key and the indices [k] at which the key occurs.
 
     >>> list(group_indices("aba"))
     [('a', array([0, 2])), ('b', array([1]))]
@@ -460,7 +458,7 @@ def group_indices(keys: Sequence[Key]) -> Iterator[tuple[Key, Ints]]:
 
 
 def nan_to_infinity(values: Floats) -> Floats:
-    """Replace NaN by infinity, so that ``BlockBuilder`` rejects a NaN that a device sends."""
+    """Replace NaN by infinity, because ``BlockBuilder`` rejects infinite values but accepts NaN as not measured."""
     return np.where(np.isnan(values), np.inf, values)
 
 
@@ -480,8 +478,8 @@ def quantize(values: Floats, step: float, bits: int) -> Ints:
     return np.clip(np.rint(np.nan_to_num(values / step, nan=0.0)), -top, top - 1).astype(np.int64)
 
 
-def chunk_per_sample(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
-    """Return a chunk for each sample, with the encoded sample and the time ``t_ns`` [n]."""
+def make_chunks(frames: Sequence[bytes], t_ns: Ints) -> list[Chunk]:
+    """Return one chunk per frame, with the corresponding time in ``t_ns`` [n]."""
     return [Chunk(data, t) for data, t in zip(frames, t_ns.tolist(), strict=True)]
 
 

@@ -1,7 +1,8 @@
-"""ROS 2 ``sensor_msgs/msg/Imu`` over zenoh (rmw_zenoh, zenoh-bridge-ros2dds), one message per sample.
+"""Decoder of ROS 2 ``sensor_msgs/msg/Imu`` messages over zenoh (rmw_zenoh, zenoh-bridge-ros2dds).
 
-The payload is XCDR1 (OMG DDSI-RTPS 10.5). The first 4 bytes are the encapsulation: ``00 01`` for little-endian or
-``00 00`` for big-endian, and two bytes of options. The following fields are aligned from byte 4:
+Each message contains one sample. The payload is XCDR1 (OMG DDSI-RTPS 10.5). The first 4 bytes are the encapsulation:
+``00 01`` for little-endian or ``00 00`` for big-endian, and two bytes of options. The following fields are aligned from
+byte 4:
 
 - stamp.sec (i32) and stamp.nanosec (u32), the time of the sample;
 - frame_id (u32 length including the final NUL, then the characters), and padding to 8 bytes;
@@ -50,13 +51,11 @@ BYTE_ORDERS: Final = {b"\x00\x00": ">", b"\x00\x01": "<"}
 
 
 class Settings(SettingsModel):
-    """Settings of the decoder, which has no options."""
+    """Settings of the decoder. There are no options."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Message:
-    """Time, numbers and byte order of one message."""
-
     t_ns: int
     body: bytes  # 37 float64
     little: bool
@@ -78,11 +77,11 @@ class Ros2ImuDecoder(RejectingDecoder):
 
     @property
     def bad(self) -> int:
-        """Number of rejected messages and of implausible samples."""
+        """Number of rejected messages and implausible samples."""
         return self._builder.bad - self._lost_in_builder
 
     def reset(self) -> None:
-        """Forget the last sequence number, so that the next message reveals no loss."""
+        """Discard the last sequence number, so that no loss is reported for the next message."""
         self._sequence = None
         self._lost = 0
         self._builder.forget_rejected_frames()
@@ -101,7 +100,7 @@ class Ros2ImuDecoder(RejectingDecoder):
                 self._rejection.note_rejection(str(error))
                 rejected += 1
                 continue
-            self._rejection.count_good_frames()
+            self._rejection.add_good_frames()
             ticks.append(sequence)
             missing.append(self._lost + rejected)
             self._lost_in_builder += self._lost
@@ -124,7 +123,7 @@ class Ros2ImuDecoder(RejectingDecoder):
         return chunks
 
     def _read_sequence(self, attachment: bytes) -> int:
-        """Return the sequence number of a message, and count the messages that were lost before this message."""
+        """Return the sequence number of a message, and add the lost messages before the message to ``_lost``."""
         at = SEQUENCE_OFFSETS.get(len(attachment))
         if at is None:
             return NO_TICK
@@ -138,7 +137,7 @@ class Ros2ImuDecoder(RejectingDecoder):
 
 
 def _parse_message(data: bytes) -> _Message:
-    """Parse a payload. Raise ``DecodeError`` if the payload is not an Imu message."""
+    """Parse the payload of a message. Raise ``DecodeError`` if the payload is not an Imu message."""
     end = BYTE_ORDERS.get(data[:2])
     if end is None:
         raise DecodeError("no XCDR1 message: the encapsulation is not 00 00 or 00 01")
@@ -154,7 +153,7 @@ def _parse_message(data: bytes) -> _Message:
 
 
 def _read_values(messages: Sequence[_Message]) -> Floats:
-    """Return values [n, 6] in rad/s and m/s²; NaN for a quantity that the message does not provide."""
+    """Return the values [n, 6] in rad/s and m/s²; NaN for a quantity that a message does not provide."""
     raw = np.frombuffer(b"".join(m.body for m in messages), "<f8").reshape(-1, DOUBLES).astype(np.float64)
     big = np.array([not m.little for m in messages], bool)
     raw[big] = raw[big].byteswap()
@@ -165,7 +164,6 @@ def _read_values(messages: Sequence[_Message]) -> Floats:
 
 
 def _encode_payload(t_ns: int, values: Floats) -> bytes:
-    """Return a payload with the time and the values [6] of one sample."""
     body = np.zeros(DOUBLES)
     body[3] = 1.0  # orientation w
     body[4] = NOT_PROVIDED

@@ -1,9 +1,9 @@
-"""Decoder of the sample messages that imu-monitor, or another program with the same format, publishes.
+"""Decoder of the sample messages that imu-monitor publishes.
 
 ``drivers.zenoh.sample_message`` defines the format. A message contains samples with Unix times, and the total number of
-samples that the publisher has received since its start. If the total increases by more than the number of samples in
-the message, earlier messages were lost. The field ``lost`` of the next block counts the samples of the lost messages.
-If the total decreases, the publisher was restarted, and no samples are counted as lost.
+samples that the publisher has received since its start. Messages were lost if the total increases by more than the
+number of samples in the message. The field ``lost`` of the next sample block includes the samples of lost messages. If
+the total decreases, the publisher was restarted, and no samples are counted as lost.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ MAX_GAP_SAMPLES: Final = 1_000_000_000
 
 
 class Settings(SettingsModel):
-    """Settings of the decoder, which has no options."""
+    """Settings of the decoder. There are no options."""
 
 
 class SamplesDecoder(RejectingDecoder):
@@ -39,11 +39,11 @@ class SamplesDecoder(RejectingDecoder):
 
     @property
     def bad(self) -> int:
-        """Number of rejected messages and of implausible samples."""
+        """Number of rejected messages and implausible samples."""
         return self._rejected + self._builder.bad
 
     def reset(self) -> None:
-        """Forget the total number of samples, so that the next message reveals no loss."""
+        """Discard the total number of samples, so that no loss is reported for the next message."""
         self._received = None
         self._lost = 0
         self._builder.forget_rejected_frames()
@@ -54,7 +54,7 @@ class SamplesDecoder(RejectingDecoder):
         for chunk in chunks:
             try:
                 found += self._decode_message(chunk.data)
-                self._rejection.count_good_frames()
+                self._rejection.add_good_frames()
             except DecodeError as error:
                 self._rejected += 1
                 self._rejection.note_rejection(str(error))
@@ -69,7 +69,9 @@ class SamplesDecoder(RejectingDecoder):
         """Return the samples of one message. ``lost`` of the first block counts the samples lost before the message."""
         message = decode_samples(data)
         rows = message.block
-        self._lost = min(self._lost + rows.lost + self._count_skipped(message.samples, len(rows)), MAX_GAP_SAMPLES)
+        self._lost = min(
+            self._lost + rows.lost + self._count_skipped(message.total_samples, len(rows)), MAX_GAP_SAMPLES
+        )
         blocks = self._builder.build_plausible_blocks(rows.t_ns, rows.values, rows.temperature_c, rows.ticks)
         if blocks and self._lost:
             blocks[0] = replace(blocks[0], lost=blocks[0].lost + self._lost)
@@ -77,7 +79,6 @@ class SamplesDecoder(RejectingDecoder):
         return blocks
 
     def _count_skipped(self, received: int, rows: int) -> int:
-        """Return the number of samples in lost messages."""
         before, self._received = self._received, received
         missing = 0 if before is None else received - rows - before
         return missing if 0 <= missing <= MAX_GAP_SAMPLES else 0

@@ -3,21 +3,21 @@
 The format is big-endian without a sync word: ``id | gyro 3 x i24, status | [acceleration 3 x i24, status] |
 [inclinometer ...] | [temperature 3 x i16, status of each included sensor] | [aux or PPS i24, status] | counter u8 |
 latency u16 | CRC u32``, then CR LF if that is enabled. The identifier states which parts follow. The CRC-32 has the
-polynomial 0x04C11DB7 and the initial value 0xFFFFFFFF, and is not reflected. It covers all bytes before it, padded with
-zeros to a multiple of four bytes. Sources: vortexntnu/stim300-driver, the frame published in geirhovland/stim300, and
-data sheet TS1524 tables 5-21 to 5-23 as restated by public drivers.
+polynomial 0x04C11DB7 and the initial value 0xFFFFFFFF, and is not reflected. The CRC is computed over all preceding
+bytes, padded with zeros to a multiple of four bytes. Sources: vortexntnu/stim300-driver, the frame published in
+geirhovland/stim300, and data sheet TS1524 tables 5-21 to 5-23 as restated by public drivers.
 
-The datagram contains neither the range of the accelerometer nor the output units, so both must be configured. An
-"increment" is the change of angle or velocity during one sample. The sample rate converts an increment to an angular
-rate or an acceleration. Integrated outputs are not supported. The decoder assumes that the counter advances at the
-internal sampling rate of 2000 Hz, so that the counter advances by 4 per sample at 500 Hz. The assumption has not been
+The datagram contains neither the range of the accelerometer nor the output units, so the range and the units must be
+configured. An "increment" is the change of angle or velocity during one sample. The sample rate converts an increment
+to an angular rate or an acceleration. Integrated outputs are not supported. The decoder assumes that the counter
+advances at the internal sampling rate of 2000 Hz, which is 4 counts per sample at 500 Hz. The counter rate has not been
 tested with a device.
 
 The gyroscopes and the accelerometers have a status byte. A sample is bad if a status byte reports a system integrity
 error (bit 7), start-up (bit 6), overload (bit 4) or a channel error (bit 3). Bit 5 reports operation outside the
-specified conditions, for example in a climate chamber. The sensor still measures under such conditions, so the sample
-is accepted. The temperature is the mean of the three temperature sensors of the gyroscopes. The temperature is marked
-as not measured if the status byte of these sensors reports an error.
+specified conditions, for example in a climate chamber. A sample with only bit 5 set is accepted, because the sensor
+still measures. The temperature is the mean of the three temperature sensors of the gyroscopes. The temperature is
+marked as not measured if the status byte of the temperature sensors reports an error.
 """
 
 import zlib
@@ -31,7 +31,7 @@ from drivers.data_types import Chunk, CounterTimedFormat, Floats, Ints, SampleBl
 from drivers.decoders import base
 from drivers.errors import ConfigError
 from drivers.number_ranges import RATE_HZ
-from drivers.settings_model import Conflict, SettingsModel, WordOr, checked_by
+from drivers.settings_model import Conflict, KeywordOrType, SettingsModel, checked_by
 from drivers.units import DEGREE, G0
 
 ACCEL_PART, INCL_PART, TEMPERATURE_PART, AUX_PART = 1, 2, 4, 8
@@ -47,7 +47,7 @@ IDENTIFIERS: Final = {
 
 
 def _datagram_size(parts: int) -> int:
-    """Return the length of a datagram with these parts in bytes, with CRC but without CR LF."""
+    """Return the length in bytes of a datagram with these parts, including the CRC but not CR LF."""
     sensors = 1 + (parts & (ACCEL_PART | INCL_PART)).bit_count()
     temperatures = sensors if parts & TEMPERATURE_PART else 0
     return 1 + 10 * sensors + 7 * temperatures + (4 if parts & AUX_PART else 0) + 1 + 2 + 4
@@ -72,7 +72,6 @@ BIT_REVERSAL: Final = np.packbits(_BITS, axis=1).tobytes()
 
 
 def _check_identifier(identifier: int) -> None:
-    """Raise ConfigError if no datagram begins with this byte."""
     if identifier not in IDENTIFIERS:
         known = ", ".join(f"0x{one:02X}" for one in sorted(IDENTIFIERS))
         raise ConfigError(f"{identifier}; possible are {known}")
@@ -94,12 +93,12 @@ class Settings(SettingsModel):
         None, examples=[500.0], description="sample rate in Hz, which is needed if an output is an increment"
     )
     identifier: Annotated[
-        int | Literal["auto"], WordOr({"auto": "auto"}, Annotated[int, checked_by(_check_identifier)])
+        int | Literal["auto"], KeywordOrType({"auto": "auto"}, Annotated[int, checked_by(_check_identifier)])
     ] = Field("auto", description="first byte of the datagrams, such as 0x93; auto takes it from the first datagram")
     crlf: bool = Field(False, description="true: a simulated sensor ends datagrams with CR LF; both can be read")
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict if an increment cannot be converted to a rate."""
+        """Yield a conflict if an output is an increment and the sample rate is missing."""
         if "increment" in (self.gyro_output, self.accelerometer_output) and self.rate is None:
             yield Conflict("rate", 'missing; an output of "increment" needs the sample rate in Hz')
 
@@ -121,7 +120,7 @@ class Stim300Decoder(base.FrameStreamDecoder):
 
     @property
     def recent_problem(self) -> str:
-        """Error that the sensor reports, or reason for rejected datagrams; "" if there is no problem."""
+        """Error reported by the sensor, or reason for rejected datagrams; "" if there is no problem."""
         if self._status & START_UP:
             return "the sensor is starting up"
         if self._status:
@@ -129,19 +128,18 @@ class Stim300Decoder(base.FrameStreamDecoder):
         return super().recent_problem
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
-        """Return the samples of these datagrams, whose identifiers may differ."""
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
         ticks = np.empty(n, np.int64)
         for identifier, rows in base.group_indices([frame[0] for frame in frames.data]):
-            data = frames.stack_bytes(rows)
+            data = frames.stack_frames(rows)
             values[rows], temperature_c[rows] = self._read_measurements(data, IDENTIFIERS[identifier])
             ticks[rows] = data[:, -7]
         return self._builder.build_plausible_blocks(frames.t_ns, values, temperature_c, ticks, frames.bad_before)
 
     def _read_measurements(self, data: base.Bytes, parts: int) -> tuple[Floats, Floats]:
-        """Return values [n, 6] and temperatures [n] in °C. Values are infinite if a status byte reports an error."""
+        """Return the values [n, 6] and the temperatures [n] in °C. Values with a sensor error are infinite."""
         values = np.full((len(data), 6), np.nan)
         values[:, :3] = _read_int24(data, 1) * self._gyro_step
         status = data[:, 10]
@@ -158,7 +156,6 @@ class Stim300Decoder(base.FrameStreamDecoder):
         return values, temperature_c
 
     def _match_datagram(self, buffer: bytes, at: int) -> int:
-        """Return the length of a datagram (see ``drivers.decoders.base.FrameMatcher``)."""
         if at >= len(buffer):
             return base.NEED_MORE
         length = SIZES.get(buffer[at])
@@ -174,8 +171,8 @@ class Stim300Decoder(base.FrameStreamDecoder):
     def encode(self, samples: SampleBlock) -> list[Chunk]:
         """Return datagrams with the configured identifier.
 
-        If the identifier is "auto", the datagrams contain accelerations, and temperatures if the block has any. The
-        status byte reports a channel error if an axis is not measured.
+        If the identifier is "auto", the datagrams contain accelerations, and also temperatures if ``samples`` has any.
+        The status byte reports a channel error if an axis is not measured.
         """
         identifier = self._settings.identifier
         if identifier == "auto":
@@ -193,16 +190,15 @@ class Stim300Decoder(base.FrameStreamDecoder):
             data[:, at + 6] = np.where(np.isnan(samples.temperature_c), CHANNEL_ERROR, 0)
         data[:, -3] = samples.ticks & 0xFF
         tail = b"\r\n" if self._settings.crlf else b""
-        return base.chunk_per_sample([row + datagram_crc(row) + tail for row in map(bytes, data)], samples.t_ns)
+        return base.make_chunks([row + datagram_crc(row) + tail for row in map(bytes, data)], samples.t_ns)
 
 
 def _temperature_offset(parts: int) -> int:
-    """Return the offset of the gyroscope temperatures in a datagram."""
     return 1 + 10 * (1 + (parts & (ACCEL_PART | INCL_PART)).bit_count())
 
 
 def _read_int24(data: base.Bytes, at: int) -> Ints:
-    """Return the three signed 24-bit big-endian integers [n, 3] at the offset ``at`` of each datagram."""
+    """Return the three signed 24-bit big-endian integers [n, 3] at an offset of each datagram."""
     wide = np.zeros((len(data), 3, 4), np.uint8)
     wide[:, :, :3] = data[:, at : at + 9].reshape(-1, 3, 3)
     raised: Ints = wide.view(">i4")[:, :, 0].astype(np.int64) >> 8
@@ -228,7 +224,7 @@ def has_valid_crc(frame: bytes) -> bool:
 
 
 def _reflected_crc(mirrored: bytes) -> int:
-    """Return the reflected CRC of a datagram after the bits of each byte have been reversed."""
+    """Return the reflected CRC of a datagram whose bytes have been bit-reversed."""
     # the padding consists of zeros, which the reversal does not change
     return zlib.crc32(bytes(-len(mirrored) % 4), zlib.crc32(mirrored)) ^ 0xFFFFFFFF
 

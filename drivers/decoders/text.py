@@ -2,16 +2,16 @@
 
 The format has no standard. ``columns`` names the content of each column, and the numbers are converted from the
 configured units to SI. A line ends in LF, CR or CR LF. With ``delimiter = "auto"``, fields are separated by commas,
-semicolons or tabs. If a line contains none of these characters, fields are separated by blanks. An empty field or
+semicolons or tabs. In a line without commas, semicolons and tabs, fields are separated by blanks. An empty field or
 ``nan`` means that the value was not measured. Empty lines and lines that begin with the comment prefix are skipped. A
-line is rejected if it has the wrong number of columns, or if a field is not a number. With ``nmea = true`` a line is
-``$fields*CC``, where the checksum CC is the exclusive or of the characters between ``$`` and ``*`` in two hexadecimal
+line is rejected if it has the wrong number of columns, or if a field is not a number. With ``nmea = true``, a line is
+``$fields*CC``. The checksum CC is the exclusive or of the characters between ``$`` and ``*``, in two hexadecimal
 digits. A line with a wrong checksum is rejected.
 
-The first line that arrives after the link was opened is often incomplete. If the first characters of ``-0.012`` are
-missing, the field reads as ``12``. The first line is therefore skipped without being counted as bad. A first line with
-a correct checksum is used, and ``first_line = "keep"`` keeps any first line. ``encode`` puts a line end before the
-first line of a block, so that only an empty line is skipped.
+The first line that arrives after the link was opened is often incomplete. For example, ``-0.012`` without the first
+characters is read as ``12``. The first line is therefore skipped and not counted as bad. A first line with a correct
+checksum is not skipped, and ``first_line = "keep"`` keeps every first line. ``encode`` puts a line end before the first
+line of a block, so that only an empty line is skipped.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,7 +24,7 @@ from drivers import units
 from drivers.data_types import AXES, ArrivalTimedFormat, Chunk, CounterTimedFormat, Floats, Ints, SampleBlock, Timing
 from drivers.decoders import base
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import COUNTER_MODULUS, HEADER_LINES, SCALE
 from drivers.settings_model import ListOf, SettingsModel, checked_by, one_of
 
@@ -44,9 +44,10 @@ UNWRAPPED_TICKS: Final = 1 << 62
 
 
 def _check_columns(columns: tuple[str, ...]) -> None:
-    """Raise ConfigError if the columns contain mistakes. The error has one line for each mistake."""
     given = [name for name in columns if name != SKIP]
-    wrong = [f'unknown column "{name}"{format_choices(name, COLUMNS)}' for name in given if name not in COLUMNS]
+    wrong = [
+        f'unknown column "{name}"{format_choices_by_similarity(name, COLUMNS)}' for name in given if name not in COLUMNS
+    ]
     if len(given) != len(set(given)):
         wrong.append("a name is given twice")
     if not set(given) & set(AXES):
@@ -58,20 +59,19 @@ def _check_columns(columns: tuple[str, ...]) -> None:
 
 
 def _unit(look_up: Callable[[str], object], axis: str) -> AfterValidator:
-    """Return a validator for a unit. The error message also explains how raw counts are converted."""
+    """Return a validator for a unit. The error message also explains the conversion of raw counts."""
 
-    def check(unit: str) -> None:
+    def check_unit(unit: str) -> None:
         try:
             look_up(unit)
         except ConfigError as error:
             counts = f"name one of these units, and the size of a count: scale = {{ {axis} = 0.0305 }}"
             raise ConfigError(f"{error}; for raw counts {counts}") from error
 
-    return checked_by(check)
+    return checked_by(check_unit)
 
 
 def _check_delimiter(delimiter: str) -> None:
-    """Raise ConfigError if the text cannot separate the fields of a line."""
     if not delimiter or not delimiter.isascii() or set(delimiter) & set("\r\n"):
         raise ConfigError(f"{delimiter!r}; it is auto, or ASCII text within a line")
 
@@ -87,13 +87,13 @@ class Settings(SettingsModel):
         "auto",
         description='text between two fields, " " = any number of blanks; auto: comma, semicolon, tab or blanks',
     )
-    gyro_unit: Annotated[str, _unit(units.rate_factor, "gx")] = Field(
+    gyro_unit: Annotated[str, _unit(units.angular_rate_factor, "gx")] = Field(
         "rad/s", description="unit of gx gy gz: rad/s, mrad/s, deg/s, dps, deg/h, ..."
     )
     accel_unit: Annotated[str, _unit(units.acceleration_factor, "ax")] = Field(
         "m/s²", description="unit of ax ay az: m/s², g, mg, ..."
     )
-    temperature_unit: Annotated[str, _unit(units.temperature_scale, "temperature")] = Field(
+    temperature_unit: Annotated[str, _unit(units.temperature_factor_and_offset, "temperature")] = Field(
         "°C", description="unit of the temperature: °C, K, °F"
     )
     scale: dict[Annotated[str, one_of(COLUMNS)], Annotated[float, SCALE]] = Field(
@@ -131,7 +131,7 @@ class TextDecoder(base.RejectingDecoder):
         self.reset()
 
     def reset(self) -> None:
-        """Discard an incomplete line. The next line may be incomplete, as after opening the link."""
+        """Discard an incomplete line, and treat the next line as the first line after opening the link."""
         self._rest = b""
         self._overlong = False
         self._first_line_ended = False  # True if the end of the first line has arrived
@@ -152,7 +152,7 @@ class TextDecoder(base.RejectingDecoder):
         return self._build_blocks(table, np.array(t_ns, np.int64)[counted])
 
     def _split_lines(self, data: bytes) -> list[bytes]:
-        """Return the lines that these bytes complete, without line ends and surrounding blanks. Omit empty lines."""
+        """Return the completed lines without line ends and surrounding blanks. Empty lines are omitted."""
         *lines, rest = (self._rest + data).replace(b"\r", b"\n").split(b"\n")
         if lines and self._overlong:
             lines[0], self._overlong = OVERLONG_LINE, False
@@ -167,7 +167,7 @@ class TextDecoder(base.RejectingDecoder):
         return [line for line in lines if line]
 
     def _first_is_whole(self, line: bytes) -> bool:
-        """Return True if the first line after opening the link is known to be complete or is kept by the settings."""
+        """Return True if the first line is complete, or if the settings keep every first line."""
         if self._settings.header:
             return True  # the first line belongs to the header, which is skipped later
         if self._settings.nmea:
@@ -175,7 +175,7 @@ class TextDecoder(base.RejectingDecoder):
         return self._settings.first_line == "keep" and self._parse_line(line)[0] is not None
 
     def _parse_data_lines(self, lines: list[bytes]) -> tuple[Floats, list[int]]:
-        """Return the numbers [n, columns] of all lines that are not skipped, and the indices of these lines.
+        """Return the numbers [n, columns] of all data lines, and the indices of the data lines.
 
         The numbers of a rejected line are infinite.
         """
@@ -193,10 +193,10 @@ class TextDecoder(base.RejectingDecoder):
         return self._parse_lines(bodies), counted
 
     def _parse_lines(self, bodies: list[bytes | None]) -> Floats:
-        """Return the numbers [n, columns]. All lines are parsed together if they are regular, otherwise one by one."""
+        """Return the numbers [n, columns]. Lines are parsed one by one only if parsing all lines together fails."""
         table = self._parse_regular_lines(bodies)
         if table is not None:
-            self._rejection.count_good_frames(len(bodies))
+            self._rejection.add_good_frames(len(bodies))
             return table
         rows = []
         for body in bodies:
@@ -205,11 +205,11 @@ class TextDecoder(base.RejectingDecoder):
             if error:
                 self._rejection.note_rejection(error)
             else:
-                self._rejection.count_good_frames()
+                self._rejection.add_good_frames()
         return np.array(rows).reshape(-1, self._width)
 
     def _parse_regular_lines(self, bodies: list[bytes | None]) -> Floats | None:
-        """Return the numbers [n, columns], or None if a line has missing fields or a field is not a number."""
+        """Return the numbers [n, columns]; None if a field is missing or is not a number."""
         separated = [self._comma_separated(body) for body in bodies if body is not None]
         joined = b",".join(separated)
         regular = all(body.count(b",") == self._width - 1 for body in separated)
@@ -225,7 +225,6 @@ class TextDecoder(base.RejectingDecoder):
         return table
 
     def _comma_separated(self, body: bytes) -> bytes:
-        """Return the line with a comma between two fields."""
         if self._delimiter == b"auto":
             body = body.replace(b";", b",").replace(b"\t", b",")
             return body if b"," in body else b",".join(body.split())
@@ -234,7 +233,7 @@ class TextDecoder(base.RejectingDecoder):
         return body.replace(b",", b"?").replace(self._delimiter, b",") if self._delimiter != b"," else body
 
     def _parse_line(self, body: bytes) -> tuple[list[float] | None, str]:
-        """Return the numbers of one line and an empty text, or None and the reason for rejecting the line."""
+        """Return the numbers of one line and ""; None and the reason if the line is rejected."""
         if body == OVERLONG_LINE:
             return None, OVERLONG_HINT
         fields = self._comma_separated(body).split(b",")
@@ -246,7 +245,6 @@ class TextDecoder(base.RejectingDecoder):
             return None, f"a field is not a number: {body[:60]!r}"
 
     def _build_blocks(self, table: Floats, t_ns: Ints) -> list[SampleBlock]:
-        """Convert the numbers [n, columns] to blocks of samples in SI units."""
         n = len(table)
         bad = np.isinf(table).any(axis=1)
         with np.errstate(over="ignore", invalid="ignore"):  # an overflow gives an implausible value
@@ -265,7 +263,7 @@ class TextDecoder(base.RejectingDecoder):
         return self._builder.build_plausible_blocks(t_ns, values, temperature_c, ticks)
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return one line per sample in the configured columns and units, with full precision."""
+        """Encode each sample as one line with the configured columns and units, in full precision."""
         n = len(samples)
         table = np.zeros((n, self._width))
         for name, at in self._column.items():
@@ -285,7 +283,7 @@ class TextDecoder(base.RejectingDecoder):
         if self._settings.nmea:
             bodies = [b"$%b*%02X" % (body, base.xor_checksum(body)) for body in bodies]
         lines = [body + b"\r\n" for body in bodies]
-        return base.chunk_per_sample([b"\r\n" + lines[0], *lines[1:]], samples.t_ns)
+        return base.make_chunks([b"\r\n" + lines[0], *lines[1:]], samples.t_ns)
 
 
 def _parse_number(field: bytes) -> float:
@@ -297,7 +295,7 @@ def _parse_number(field: bytes) -> float:
 
 
 def _nmea_body(line: bytes) -> bytes | None:
-    """Return the text between $ and * if the checksum is correct, otherwise None."""
+    """Return the text between ``$`` and ``*``; None if the checksum is wrong."""
     start, star = line.rfind(b"$") + 1, line.rfind(b"*")
     body, stated = line[start:star], line[star + 1 :]
     try:
@@ -307,16 +305,16 @@ def _nmea_body(line: bytes) -> bytes | None:
 
 
 def _scales(settings: Settings) -> tuple[Floats, Floats]:
-    """Return the factor and the offset that convert each column to SI units, or the column ``t`` to ticks."""
+    """Return the factors and offsets that convert columns to SI units. The column ``t`` is converted to ticks."""
     factors, offsets = np.ones(len(settings.columns)), np.zeros(len(settings.columns))
     for i, name in enumerate(settings.columns):
         factor, offset = 1.0, 0.0
         if name in AXES[:3]:
-            factor = units.rate_factor(settings.gyro_unit)
+            factor = units.angular_rate_factor(settings.gyro_unit)
         elif name in AXES[3:]:
             factor = units.acceleration_factor(settings.accel_unit)
         elif name == "temperature":
-            factor, offset = units.temperature_scale(settings.temperature_unit)
+            factor, offset = units.temperature_factor_and_offset(settings.temperature_unit)
         elif name == "t":
             factor = round(units.time_factor(settings.time_unit) / TICK_S)
         factors[i], offsets[i] = factor * settings.scale.get(name, 1.0), offset
@@ -324,7 +322,6 @@ def _scales(settings: Settings) -> tuple[Floats, Floats]:
 
 
 def _timing(settings: Settings) -> Timing:
-    """Return the source of the sample times according to the columns."""
     if "t" in settings.columns:
         unit_ticks = round(units.time_factor(settings.time_unit) / TICK_S)
         wraps = settings.time_unit in ("ms", "us")

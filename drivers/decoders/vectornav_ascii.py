@@ -8,8 +8,8 @@ sentence may end in LF alone. Other sentences with a correct checksum are ignore
 
 ``$VNIMU`` contains the measured magnetic field [Gauss], acceleration [m/s²], angular rate [rad/s], temperature [°C] and
 pressure [kPa]. ``$VNYMR`` contains yaw, pitch, roll [°], and the magnetic field, acceleration and angular rate after
-compensation by the on-board filter. The bias instability and random walk of ``$VNYMR`` are residuals of this filter and
-do not describe the sensor. A synchronization count or time at the end of a sentence is ignored. The printed resolution
+compensation by the on-board filter. The bias instability and random walk of ``$VNYMR`` values describe the on-board
+filter and not the sensor. A synchronization count or time at the end of a sentence is ignored. The printed resolution
 is 0.001 m/s² and 1e-6 rad/s, so the Allan deviation shows quantization noise. Binary messages have a finer resolution.
 """
 
@@ -63,12 +63,11 @@ class VectornavAsciiDecoder(base.FrameStreamDecoder):
         return super().recent_problem
 
     def reset(self) -> None:
-        """Discard an incomplete sentence. If the setting ``sentence`` is "auto", select the sentence again."""
+        """Discard an incomplete sentence. With ``sentence = "auto"``, select the sentence type again."""
         super().reset()
         self._sentence = self._wanted
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
-        """Return the samples in the sentences of the selected kind."""
         if not self._sentence:
             self._sentence = next((f[:7] for f in frames.data if f[:7] in COLUMNS), b"")
         wanted = self._sentence or b"none yet"
@@ -84,7 +83,7 @@ class VectornavAsciiDecoder(base.FrameStreamDecoder):
         )
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return VNYMR sentences if the settings name them, otherwise VNIMU. A missing temperature is sent as 0."""
+        """Encode samples as VNYMR or VNIMU sentences. A missing temperature is sent as 0."""
         imu = self._wanted != b"$VNYMR,"
         frames = []
         temperatures = np.nan_to_num(samples.temperature_c).tolist()
@@ -97,11 +96,11 @@ class VectornavAsciiDecoder(base.FrameStreamDecoder):
                 parts = ["VNYMR", *["+000.000"] * 3, *magnetic, *parts]
             body = ",".join(parts).encode()
             frames.append(b"$%b*%02X\r\n" % (body, base.xor_checksum(body)))
-        return base.chunk_per_sample(frames, samples.t_ns)
+        return base.make_chunks(frames, samples.t_ns)
 
 
 def _parse_numbers(bodies: list[bytes], width: int) -> Floats:
-    """Return the first ``width`` numbers of each sentence; infinities for a sentence with other text."""
+    """Return the first ``width`` numbers of each sentence; infinity if the sentence is not numeric."""
     split = [body.split(b",", width)[:width] for body in bodies]
     try:
         return np.array([[float(field) for field in fields] for fields in split]).reshape(len(bodies), width)
@@ -110,7 +109,7 @@ def _parse_numbers(bodies: list[bytes], width: int) -> Floats:
 
 
 def _parse_fields(fields: list[bytes], width: int) -> list[float]:
-    """Return the numbers of one sentence; infinities if a field is missing or not a number."""
+    """Return the numbers of one sentence; infinity if a field is missing or is not a number."""
     try:
         row = [float(field) for field in fields]
     except ValueError:
@@ -119,7 +118,6 @@ def _parse_fields(fields: list[bytes], width: int) -> list[float]:
 
 
 def _match_sentence(buffer: bytes, at: int) -> int:
-    """Return the length of a sentence (see ``drivers.decoders.base.FrameMatcher``)."""
     end = buffer.find(b"\n", at, at + LONGEST) + 1
     if not end:
         return base.NEED_MORE

@@ -1,17 +1,17 @@
 """VectorNav VN-100/200/300 binary messages.
 
-The format is ``FA | groups u8 | a field mask u16le for each group | payload little-endian | CRC u16be``. The masks
-state which fields follow, in the order of groups and bits. Messages of groups 1, 2, 3 and 5 are decoded. Messages of
-other groups are rejected, since the decoder does not know the sizes of their fields. The CRC-16 has the polynomial
-0x1021 and the initial value 0, and covers all bytes after 0xFA. The CRC of a valid message, including the CRC field, is
-0 (VN-100 user manual UM001 v2.1, pages 27-43).
+The format is ``FA | groups u8 | a field mask u16le for each group | payload little-endian | CRC u16be``. The field
+masks specify the fields of the payload, in the order of groups and bits. Messages of groups 1, 2, 3 and 5 are decoded.
+Messages of other groups are rejected, since the decoder does not know the sizes of their fields. The CRC-16 has the
+polynomial 0x1021 and the initial value 0, and covers all bytes after 0xFA. The CRC of a valid message, including the
+CRC field, is 0 (VN-100 user manual UM001 v2.1, pages 27-43).
 
 For noise analysis, the fields TimeStartup and Imu of group 1 are recommended (``FA 01 01 02``, 38 bytes). The fields
-Imu, UncompGyro and UncompAccel contain the measured values. The fields AngularRate and Accel contain the values after
-the on-board filter has subtracted its bias estimate. The subtraction hides bias instability and random walk. If a
-message contains both kinds of fields, ``compensated`` selects one kind. If a message contains only accelerations or
-only angular rates, the other axes are marked as not measured. A message without accelerations and angular rates is
-ignored. The z axis of VectorNav sensors points down and measures -9.8 m/s² at rest.
+Imu, UncompGyro and UncompAccel contain the measured values. The fields AngularRate and Accel contain compensated
+values, from which the on-board filter has subtracted a bias estimate. The subtraction hides bias instability and random
+walk. If a message contains measured and compensated values, the key ``compensated`` selects one of them. If a message
+contains only accelerations or only angular rates, the other axes are marked as not measured. A message without
+accelerations and angular rates is ignored. The z axis of VectorNav sensors points down and measures -9.8 m/s² at rest.
 """
 
 import binascii
@@ -61,21 +61,21 @@ class Settings(SettingsModel):
 
 
 @lru_cache(maxsize=256)
-def find_layout(header: bytes, compensated: bool) -> np.dtype[np.void] | None:
-    """Return the layout of the messages with this header.
+def build_message_dtype(header: bytes, prefer_compensated: bool) -> np.dtype[np.void] | None:
+    """Return the NumPy structured type of messages with a given header.
 
     Parameters
     ----------
     header
         Group byte and field masks.
-    compensated
+    prefer_compensated
         True if compensated fields are preferred.
 
     Returns
     -------
     dtype or None
-        Structured type of a complete message. The fields are time, gyro, accel and temperature, as far as the message
-        contains them. None if the header contains unknown groups or fields.
+        Structured type of a complete message with the fields time, gyro, accel and temperature. Fields that the message
+        does not contain are omitted. None if the header contains unknown groups or fields.
     """
     groups = [g for g in range(1, 9) if header[0] >> (g - 1) & 1]
     masks = struct.unpack(f"<{len(groups)}H", header[1:])
@@ -89,12 +89,12 @@ def find_layout(header: bytes, compensated: bool) -> np.dtype[np.void] | None:
             if mask >> bit & 1:
                 offsets[group, bit] = end
                 end += size
-    return _build_layout(offsets, end + 2, compensated)
+    return _build_layout(offsets, end + 2, prefer_compensated)
 
 
-def _build_layout(offsets: dict[tuple[int, int], int], length: int, compensated: bool) -> np.dtype[np.void]:
-    """Return the layout of messages of ``length`` bytes. ``offsets`` maps (group, bit) to the offset of the field."""
-    order = -1 if compensated else 1
+def _build_layout(offsets: dict[tuple[int, int], int], length: int, prefer_compensated: bool) -> np.dtype[np.void]:
+    """Return the type of messages of ``length`` bytes. ``offsets`` maps (group, bit) to the offset of a field."""
+    order = -1 if prefer_compensated else 1
     gyro = (UNCOMPENSATED_GYRO, COMPENSATED_GYRO)[::order]
     accel = (UNCOMPENSATED_ACCEL, COMPENSATED_ACCEL)[::order]
     sources = (
@@ -114,7 +114,6 @@ def _build_layout(offsets: dict[tuple[int, int], int], length: int, compensated:
 
 
 def _header_end(groups: int) -> int:
-    """Return the offset of the payload; 0 for an invalid or unsupported group byte."""
     # bit 7 announces a second group byte, which is not supported
     return 0 if groups == 0 or groups & 0x80 else 2 + 2 * groups.bit_count()
 
@@ -141,15 +140,14 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         return super().recent_problem
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
-        """Return the samples in the messages with angular rates or accelerations."""
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
         for header, rows in base.group_indices([f[1 : HEADER_END[f[1]]] for f in frames.data]):
-            layout = find_layout(header, self._compensated)
+            layout = build_message_dtype(header, self._compensated)
             assert layout is not None, "the buffer accepts only messages with a known layout"
-            messages = frames.stack_bytes(rows).view(layout)[:, 0]
+            messages = frames.stack_frames(rows).view(layout)[:, 0]
             fields = layout.names or ()
             if "gyro" in fields:
                 values[rows, :3] = base.nan_to_infinity(_as_float64(messages["gyro"]))
@@ -165,7 +163,6 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         return blocks
 
     def _match_message(self, buffer: bytes, at: int) -> int:
-        """Return the length of a message (see ``drivers.decoders.base.FrameMatcher``)."""
         if len(buffer) < at + 2:
             return base.NEED_MORE
         header_end = HEADER_END[buffer[at + 1]]
@@ -173,7 +170,7 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
             return base.REJECT
         if len(buffer) < at + header_end:
             return base.NEED_MORE
-        layout = find_layout(buffer[at + 1 : at + header_end], self._compensated)
+        layout = build_message_dtype(buffer[at + 1 : at + header_end], self._compensated)
         if layout is None:
             return base.REJECT
         length = layout.itemsize
@@ -182,10 +179,10 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
         return base.REJECT if binascii.crc_hqx(buffer[at + 1 : at + length], 0) else length
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return messages with TimeStartup and Imu of group 1. If the block has temperatures, add MagPres."""
+        """Encode samples with the fields TimeStartup and Imu of group 1, and MagPres if there are temperatures."""
         has_temperature = bool(np.isfinite(samples.temperature_c).any())
         header = bytes.fromhex("01 01 06" if has_temperature else "01 01 02")
-        layout = find_layout(header, compensated=False)
+        layout = build_message_dtype(header, prefer_compensated=False)
         assert layout is not None, "this header is in the tables"
         rows = np.zeros(len(samples), layout)
         rows["time"] = samples.ticks & (TICKS - 1)
@@ -194,11 +191,10 @@ class VectornavBinaryDecoder(base.FrameStreamDecoder):
             rows["temperature"] = samples.temperature_c
         inner = [header + row.tobytes()[1 + len(header) : -2] for row in rows]
         frames = [b"\xfa" + part + binascii.crc_hqx(part, 0).to_bytes(2, "big") for part in inner]
-        return base.chunk_per_sample(frames, samples.t_ns)
+        return base.make_chunks(frames, samples.t_ns)
 
 
 def _as_float64(numbers: NDArray[np.float32]) -> Floats:
-    """Convert numbers to float64."""
     with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
         return numbers.astype(np.float64)
 

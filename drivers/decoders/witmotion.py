@@ -1,17 +1,17 @@
-"""WitMotion WT901, JY61 and BWT61 over UART, and the combined packet of the Bluetooth models.
+"""Decoder of the packets of WitMotion WT901, JY61 and BWT61 (UART) and of the Bluetooth models.
 
 UART packets have 11 bytes: ``55 | type | 8 bytes | SUM``. SUM is the low byte of the sum of the ten bytes before it.
 Type 0x51 contains the accelerations xyz and the temperature, type 0x52 the angular rates xyz. The numbers are i16
 little-endian with a full scale of 32768. One sample is a 0x51 packet directly followed by a 0x52 packet. A 0x51 or 0x52
-packet without its partner is dropped. There is no counter. The temperature is taken from 0x51, since the fourth word of
-0x52 is not a temperature on every model (WT901 data sheet v20-0702, section 5.1). The decoder uses g = 9.80665 m/s²,
-while the manual uses 9.8 m/s².
+packet without the other packet of the pair is dropped. The packets contain no counter. The temperature is taken from
+0x51, since the fourth word of 0x52 is not a temperature on every model (WT901 data sheet v20-0702, section 5.1). The
+decoder uses g = 9.80665 m/s², while the manual uses 9.8 m/s².
 
-If a packet of another type (angles, magnetic field) is damaged, no sample is lost. The number of lost samples in a gap
-is therefore derived from the number of packets between two samples.
+Damage to a packet of another type (angles, magnetic field) loses no sample. The number of lost samples is therefore
+computed from the number of packets between two samples.
 
-Bluetooth packets have 20 bytes without a checksum: ``55 61 | a xyz | w xyz | angles``. A packet is accepted only if it
-is followed by the header of the next packet. Samples are therefore delayed by one packet.
+Bluetooth packets have 20 bytes without a checksum: ``55 61 | a xyz | w xyz | angles``. A Bluetooth packet is accepted
+only if the header of another packet follows. Samples are therefore delayed by one packet.
 """
 
 from typing import Annotated, Final, Literal
@@ -73,11 +73,11 @@ class WitmotionDecoder(base.FrameStreamDecoder):
         self._gyro_step = settings.gyro_range * DEGREE / 2**15
         self._temperature_step, self._temperature_offset = TEMPERATURE[settings.temperature]
         self._harmless_rejects = 0  # number of rejected packets that did not belong to a lost sample
-        self._pairs = PairFinder()
+        self._pairs = PacketPairFinder()
 
     @property
     def bad(self) -> int:
-        """Number of packets that failed their check, and of implausible samples."""
+        """Number of packets with a wrong checksum, and of implausible samples."""
         return super().bad + self._harmless_rejects
 
     @property
@@ -90,21 +90,18 @@ class WitmotionDecoder(base.FrameStreamDecoder):
     def reset(self) -> None:
         """Discard an incomplete packet or pair."""
         super().reset()
-        self._pairs = PairFinder()
+        self._pairs = PacketPairFinder()
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
-        """Return the samples in these packets."""
         return self._decode_bluetooth(frames) if self._bluetooth else self._decode_uart(frames)
 
     def _decode_bluetooth(self, frames: base.Frames) -> list[SampleBlock]:
-        """Return the samples in Bluetooth packets."""
         kept = frames.select_frames([i for i, f in enumerate(frames.data) if f[1] == HEADERS[0][1]])
         words = np.frombuffer(b"".join(kept.data), "<i2").reshape(-1, BLUETOOTH_LENGTH // 2)
         values = self._to_si(words[:, 4:7], words[:, 1:4])
         return self._builder.build_plausible_blocks(kept.t_ns, values, None, None, kept.bad_before, kept.bad_after)
 
     def _decode_uart(self, frames: base.Frames) -> list[SampleBlock]:
-        """Return the samples in pairs of UART packets."""
         at, packets, missing, harmless = self._pairs.find_pairs(frames)
         self._harmless_rejects += harmless
         words = np.ascontiguousarray(packets[:, :, 2:10]).view("<i2")  # [n, 0x51 and 0x52, 4]
@@ -113,17 +110,16 @@ class WitmotionDecoder(base.FrameStreamDecoder):
         return self._builder.build_plausible_blocks(frames.t_ns[at], values, temperature_c, None, missing)
 
     def _to_si(self, gyro: Ints, accel: Ints) -> Floats:
-        """Convert raw words to rad/s and m/s² [n, 6]."""
         return np.hstack([gyro * self._gyro_step, accel * self._accel_step])
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return one chunk per sample. The format cannot mark missing values, so a missing value is sent as 0."""
+        """Encode each sample as one chunk. NaN is sent as 0, since the format cannot mark missing values."""
         n = len(samples)
         gyro = base.quantize(samples.values[:, :3], self._gyro_step, 16)
         accel = base.quantize(samples.values[:, 3:], self._accel_step, 16)
         if self._bluetooth:
             words = np.hstack([accel, gyro, np.zeros((n, 3), np.int64)]).astype("<i2")
-            return base.chunk_per_sample([HEADERS[0] + row.tobytes() for row in words], samples.t_ns)
+            return base.make_chunks([HEADERS[0] + row.tobytes() for row in words], samples.t_ns)
         excess = samples.temperature_c - self._temperature_offset
         temperature = base.quantize(excess, self._temperature_step, 16)[:, None]
         frames = [
@@ -134,11 +130,11 @@ class WitmotionDecoder(base.FrameStreamDecoder):
                 strict=True,
             )
         ]
-        return base.chunk_per_sample(frames, samples.t_ns)
+        return base.make_chunks(frames, samples.t_ns)
 
 
-class PairFinder:
-    """Finder of pairs of 0x51 and 0x52 packets. The finder also counts the samples lost in each gap."""
+class PacketPairFinder:
+    """Finder of pairs of 0x51 and 0x52 packets. The finder also counts the samples lost between two pairs."""
 
     def __init__(self) -> None:
         self.unpaired = 0  # number of packets since the last pair
@@ -181,9 +177,7 @@ class PairFinder:
 
     def _count_missing(self, steps: Ints, holes: Ints) -> tuple[Ints, int]:
         """Return the number of samples missing before each pair [n], and the number of harmless rejected packets.
-
-        ``steps`` [n] is the number of packets since the previous pair, ``holes`` [n] the number of rejected packets
-        since the previous pair.
+        ``steps`` [n] and ``holes`` [n] are the numbers of all packets and of rejected packets since the previous pair.
         """
         if not steps.size:
             return steps, 0
@@ -201,22 +195,21 @@ class PairFinder:
         return missing, int(np.maximum(holes - missing, 0).sum())
 
 
-def encode_packet(kind: int, data: bytes) -> bytes:
+def encode_packet(packet_type: int, data: bytes) -> bytes:
     """Return an 11-byte packet.
 
     Parameters
     ----------
-    kind
+    packet_type
         Type of the packet, such as 0x51.
     data
         Content of 8 bytes.
     """
-    body = bytes([0x55, kind]) + data
+    body = bytes([0x55, packet_type]) + data
     return body + bytes([sum(body) & 0xFF])
 
 
 def _match_uart(buffer: bytes, at: int) -> int:
-    """Return the length of a UART packet (see ``drivers.decoders.base.FrameMatcher``)."""
     if len(buffer) < at + UART_LENGTH:
         return base.NEED_MORE
     if buffer[at + 1] not in TYPES or sum(buffer[at : at + 10]) & 0xFF != buffer[at + 10]:
@@ -225,7 +218,7 @@ def _match_uart(buffer: bytes, at: int) -> int:
 
 
 def _match_bluetooth(buffer: bytes, at: int) -> int:
-    """Return the length of a Bluetooth packet that is followed by another header."""
+    """Return the length of a Bluetooth packet if the header of another packet follows."""
     if len(buffer) < at + BLUETOOTH_LENGTH + 2:
         return base.NEED_MORE
     following = buffer[at + BLUETOOTH_LENGTH : at + BLUETOOTH_LENGTH + 2]

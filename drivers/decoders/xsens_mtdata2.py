@@ -1,17 +1,17 @@
 """Xsens / Movella MTi over UART or USB: MTData2 messages of the Xbus protocol.
 
-The format is ``FA FF 36 | LEN | payload | CS``, big-endian. If LEN is 0xFF, the length follows as u16. The low byte of
-the sum of all bytes after 0xFA is 0. The payload is a list of items ``DID u16 | size u8 | data``. The two low bits of
-the data identifier (DID) state the number format: float32, fixed 12.20, fixed 16.32 or float64. The next two bits state
-the coordinate frame and are ignored. In a fixed 16.32 number, the 32-bit fraction precedes the 16-bit integer part, and
-each part is big-endian. Three independent public parsers agree on this order; the manual was not available. Source:
+The format is ``FA FF 36 | LEN | payload | CS``, big-endian. If LEN is 0xFF, the length follows as u16. The sum of all
+bytes after 0xFA is 0 modulo 256. The payload is a list of items ``DID u16 | size u8 | data``. The two low bits of the
+data identifier (DID) state the number format: float32, fixed 12.20, fixed 16.32 or float64. The next two bits state the
+coordinate frame and are ignored. In a fixed 16.32 number, the 32-bit fraction precedes the 16-bit integer part, and
+each part is big-endian. The byte order of fixed 16.32 numbers was taken from three independent public parsers. Source:
 Movella, MT low level communication protocol (MT0101P).
 
-The decoder reads acceleration 0x4020 (or high-rate 0x4040), rate of turn 0x8020 (or high-rate 0x8040), the clock 0x1060
-or 0x1020, and temperature 0x0810. Free acceleration 0x4030 is not used, since the orientation filter has removed
-gravity. If a packet contains only accelerations or only rates, the other axes are marked as not measured (NaN). A
-packet without accelerations and rates is ignored. Temperatures often arrive in separate packets at a lower rate. Each
-sample gets the newest temperature since the link was opened.
+The decoder reads the acceleration 0x4020 or 0x4040 (high-rate), the rate of turn 0x8020 or 0x8040 (high-rate), the
+clock 0x1060 or 0x1020, and the temperature 0x0810. Free acceleration 0x4030 is not used, since the orientation filter
+has removed gravity. If a packet contains only accelerations or only rates, the other axes are marked as not measured
+(NaN). A packet without accelerations and rates is ignored. Temperatures often arrive in separate packets at a lower
+rate. Each sample gets the newest temperature since the link was opened.
 """
 
 import struct
@@ -62,18 +62,18 @@ class Settings(SettingsModel):
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """Positions of the items in a packet."""
+class PacketLayout:
+    """Positions of the data items in an MTData2 packet."""
 
     items: tuple[tuple[int, int, int], ...]  # DID, offset of the data and size of each item
     header_offsets: tuple[int, ...]  # offsets of the DID and size bytes of all items
 
-    def find_numbers(self, did: int, count: int) -> tuple[int, int] | None:
-        """Find the first item with a given DID and number of values.
+    def locate_numbers(self, data_id: int, count: int) -> tuple[int, int] | None:
+        """Find the first item with a given data identifier and number of values.
 
         Parameters
         ----------
-        did
+        data_id
             DID without its low nibble.
         count
             Number of values in the item.
@@ -84,25 +84,25 @@ class Layout:
             Offset of the data, and index of the number format in FORMATS.
         """
         for found, at, size in self.items:
-            if found & 0xFFF0 == did and size == count * SIZES[found & 3]:
+            if found & 0xFFF0 == data_id and size == count * SIZES[found & 3]:
                 return at, found & 3
         return None
 
-    def find_integer(self, did: int, size: int) -> int:
-        """Return the offset of an item that is an unsigned integer; 0 if there is no such item.
+    def locate_integer(self, data_id: int, size: int) -> int:
+        """Return the offset of an unsigned integer item; 0 if the packet contains no such item.
 
         Parameters
         ----------
-        did
+        data_id
             DID without its low nibble.
         size
             Size of the integer in bytes.
         """
-        return next((at for found, at, n in self.items if found & 0xFFF0 == did and n == size), 0)
+        return next((at for found, at, n in self.items if found & 0xFFF0 == data_id and n == size), 0)
 
 
-def _parse_layout(frame: bytes) -> Layout | None:
-    """Return the layout of a packet; None if the items do not fill the payload exactly."""
+def _parse_layout(frame: bytes) -> PacketLayout | None:
+    """Return the layout of a packet; None if the sizes of the items do not match the payload."""
     at = 6 if frame[3] == 0xFF else 4
     end = len(frame) - 1
     items: list[tuple[int, int, int]] = []
@@ -111,14 +111,14 @@ def _parse_layout(frame: bytes) -> Layout | None:
         items.append((frame[at] << 8 | frame[at + 1], at + 3, size))
         at += 3 + size
     headers = tuple(start - back for _, start, _ in items for back in (3, 2, 1))
-    return Layout(tuple(items), headers) if at == end else None
+    return PacketLayout(tuple(items), headers) if at == end else None
 
 
 class XsensMtdata2Decoder(base.FrameStreamDecoder):
     """Decoder and encoder of MTData2 packets."""
 
     def __init__(self, settings: Settings) -> None:
-        super().__init__(SYNC, match_message, LONGEST)
+        super().__init__(SYNC, _match_message, LONGEST)
         self._settings = settings
         # (timing, DID, size of the counter in bytes)
         clocks: dict[str, tuple[Timing, int, int]] = {
@@ -144,7 +144,7 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         self._temperature_c = np.nan
 
     def _decode(self, frames: base.Frames) -> list[SampleBlock]:
-        """Return the samples in the packets with rates or accelerations. A packet with an invalid layout is bad."""
+        """Return the samples of packets with rates or accelerations. A packet with an invalid layout is bad."""
         n = len(frames.data)
         values = np.full((n, 6), np.nan)
         temperature_c = np.full(n, np.nan)
@@ -153,12 +153,12 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
             if layout is None:
                 values[rows] = np.inf
                 continue
-            for did, axes in ((self._gyro, slice(0, 3)), (self._accel, slice(3, 6))):
-                if found := layout.find_numbers(did, 3):
+            for data_id, axes in ((self._gyro, slice(0, 3)), (self._accel, slice(3, 6))):
+                if found := layout.locate_numbers(data_id, 3):
                     values[rows, axes] = base.nan_to_infinity(_read_numbers(packets, *found, 3))
-            if found := layout.find_numbers(TEMPERATURE, 1):
+            if found := layout.locate_numbers(TEMPERATURE, 1):
                 temperature_c[rows] = _read_numbers(packets, *found, 1)[:, 0]
-            if self._clock and (at := layout.find_integer(self._clock, self._clock_size)):
+            if self._clock and (at := layout.locate_integer(self._clock, self._clock_size)):
                 weights = 256 ** np.arange(self._clock_size - 1, -1, -1)
                 ticks[rows] = packets[:, at : at + self._clock_size].astype(np.int64) @ weights
         blocks, last = self._build_measured_blocks(frames, values, self._fill_temperatures(temperature_c), ticks)
@@ -167,7 +167,6 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         return blocks
 
     def _fill_temperatures(self, temperature_c: Floats) -> Floats:
-        """Replace missing temperatures by the last known temperature."""
         known = np.concatenate([[self._temperature_c], temperature_c])
         last = np.maximum.accumulate(np.where(np.isnan(known), 0, np.arange(known.size)))
         filled: Floats = known[last][1:]
@@ -175,7 +174,7 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
         return filled
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return one packet per sample with both clocks and the measured quantities."""
+        """Encode each sample as one packet with both clocks and the measured quantities."""
         number_format = FORMATS.index(self._settings.format)
         frames = []
         rows = zip(samples.values, samples.temperature_c.tolist(), samples.ticks.tolist(), strict=True)
@@ -184,18 +183,18 @@ class XsensMtdata2Decoder(base.FrameStreamDecoder):
             payload += struct.pack(">HBI", SAMPLE_TIME_FINE, 4, tick & 0xFFFFFFFF)
             if not np.isnan(temperature_c):
                 payload += struct.pack(">HBf", TEMPERATURE, 4, temperature_c)
-            for did, triple in ((self._accel, row[3:]), (self._gyro, row[:3])):
+            for data_id, triple in ((self._accel, row[3:]), (self._gyro, row[:3])):
                 if not np.isnan(triple).all():
-                    payload += struct.pack(">HB", did | number_format, 3 * SIZES[number_format])
+                    payload += struct.pack(">HB", data_id | number_format, 3 * SIZES[number_format])
                     payload += _encode_numbers(triple, number_format)
             frames.append(encode_message(payload))
-        return base.chunk_per_sample(frames, samples.t_ns)
+        return base.make_chunks(frames, samples.t_ns)
 
 
-def _group_by_layout(frames: base.Frames) -> Iterator[tuple[Layout | None, Ints, base.Bytes]]:
+def _group_by_layout(frames: base.Frames) -> Iterator[tuple[PacketLayout | None, Ints, base.Bytes]]:
     """Yield each layout with the indices and the bytes [k, length] of its packets. An invalid layout is None."""
     for _, rows in base.group_indices([len(packet) for packet in frames.data]):
-        packets, at = frames.stack_bytes(rows), rows
+        packets, at = frames.stack_frames(rows), rows
         while at.size:
             layout = _parse_layout(packets[0].tobytes())
             compared = list(layout.header_offsets) if layout else slice(None)
@@ -205,7 +204,6 @@ def _group_by_layout(frames: base.Frames) -> Iterator[tuple[Layout | None, Ints,
 
 
 def _read_numbers(packets: base.Bytes, at: int, number_format: int, count: int) -> Floats:
-    """Return the ``count`` numbers at the offset ``at`` of each packet as an array [k, count]."""
     data = np.ascontiguousarray(packets[:, at : at + count * SIZES[number_format]])
     if number_format == 0:
         with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
@@ -220,7 +218,6 @@ def _read_numbers(packets: base.Bytes, at: int, number_format: int, count: int) 
 
 
 def _encode_numbers(triple: Floats, number_format: int) -> bytes:
-    """Encode three numbers, clipped to the range of the format."""
     if number_format == 0:
         return triple.astype(">f4").tobytes()
     if number_format == 3:
@@ -240,16 +237,7 @@ def encode_message(payload: bytes) -> bytes:
     return b"\xfa" + body + bytes([-sum(body) & 0xFF])
 
 
-def match_message(buffer: bytes, at: int) -> int:
-    """Return the length of a message at an offset of the buffer (see ``drivers.decoders.base.FrameMatcher``).
-
-    Parameters
-    ----------
-    buffer
-        Received bytes.
-    at
-        Offset of the sync pattern.
-    """
+def _match_message(buffer: bytes, at: int) -> int:
     have = len(buffer) - at
     if have < 6:
         return base.NEED_MORE

@@ -1,10 +1,10 @@
-"""Interface of a link. A link receives bytes and does not interpret them.
+"""Interface of a link. A link receives bytes without interpreting the bytes.
 
 A link module ``drivers/links/<name>_link.py`` defines ``Settings``, ``build(settings) -> Link`` and
 ``DEFAULT_DECODER``. ``Settings`` is a pydantic model with the keys of the link in ``[device.driver]``.
 ``DEFAULT_DECODER`` is the name of a decoder, or "" if the user must choose a decoder. ``build`` opens nothing, and
-raises one ``ConfigError`` with a line for each mistake that the model does not find. The line begins with the key:
-"interface: ...".
+raises one ``ConfigError`` with a line for each mistake that the model does not find. Each line of the ``ConfigError``
+begins with the configuration key, for example "interface: ...".
 """
 
 import threading
@@ -21,7 +21,7 @@ from drivers.number_ranges import SILENCE_S
 from drivers.settings_model import SettingsModel
 
 Carrier = Literal["bytes", "frames", "messages"]
-"""Content of a chunk: part of a stream without boundaries ("bytes"), one CAN frame ("frames") or one message."""
+"""Content of a chunk: part of a byte stream ("bytes"), one CAN frame ("frames") or one message ("messages")."""
 
 
 class LinkSettings(SettingsModel):
@@ -40,12 +40,12 @@ class Link(Protocol):
     name: str  # name in messages, such as "/dev/ttyUSB0 at 460800 baud"
 
     def open(self) -> None:
-        """Open the link. Do nothing if the link is already open.
+        """Open the link. An open link is not changed.
 
         Raises
         ------
         LinkUnavailable
-            If the link cannot be opened. The text names the reason and the remedy.
+            If the link cannot be opened. The error text contains the reason and a remedy.
         """
 
     def poll_chunks(self, timeout_s: float) -> list[Chunk] | None:
@@ -54,17 +54,17 @@ class Link(Protocol):
         Raises
         ------
         LinkLost
-            If the connection was lost, or the link was closed.
+            If the connection was lost or the link was closed.
         LinkEnded
             If a replay has reached the end of the file.
         """
 
     def close(self) -> None:
-        """Close the link and end a waiting ``poll_chunks``. Do nothing if the link is already closed."""
+        """Close the link, and interrupt a waiting call of ``poll_chunks``. A closed link is not changed."""
 
 
 class PolledLink(ABC):
-    """Base class of links that poll a source. A lock ensures that a source is not closed while it is read.
+    """Base class of links that poll a source. A lock prevents that a source is closed during a read.
 
     Parameters
     ----------
@@ -78,7 +78,7 @@ class PolledLink(ABC):
         self._in_use = threading.Lock()
 
     def open(self) -> None:
-        """Open the source unless it is open. Raise ``LinkUnavailable`` if the source cannot be opened."""
+        """Open the source if the source is closed. Raise ``LinkUnavailable`` if opening fails."""
         with self._in_use:
             if not self._is_open():
                 self._open_source()
@@ -97,7 +97,7 @@ class PolledLink(ABC):
         raise LinkLost(f"{self.name}: the link is closed")
 
     def close(self) -> None:
-        """End a waiting ``poll_chunks``, then close the source."""
+        """Interrupt a waiting call of ``poll_chunks``, then close the source."""
         self._closing.set()
         with self._in_use:
             self._close_source()
@@ -112,7 +112,7 @@ class PolledLink(ABC):
 
     @abstractmethod
     def _poll_source(self, deadline: float) -> list[Chunk]:
-        """Wait for chunks until the monotonic time ``deadline`` in s or earlier, and return them."""
+        """Return the received chunks. Wait at most until the monotonic time ``deadline`` in s."""
 
     @abstractmethod
     def _close_source(self) -> None:

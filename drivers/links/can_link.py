@@ -1,18 +1,15 @@
 """CAN buses through python-can, one frame per chunk.
 
-Frames are filtered by the identifiers that the decoder needs. The hardware or the kernel filters the frames if the
-interface supports filters, otherwise python-can does. A read waits for the first frame, and then takes all frames in
-the queue.
+The hardware, the kernel or python-can filters the frames by the identifiers that the decoder needs.
 
-``Chunk.t_ns`` is the arrival time on the monotonic clock of the host. If a reader is delayed, many frames wait in the
-queue, and the time of the read is too late for most of them. The interfaces in ``HOST_STAMPED_INTERFACES`` stamp each
-frame on arrival with the system clock of the host. For these interfaces, the age of a frame is subtracted from the time
-of the read. A step of the system clock affects only the frames that are in the queue during the step. An age outside
-the range 0 to 1 s is ignored. Other interfaces stamp frames with a clock that drifts against the clock of the host. For
-these interfaces, the time of the read is used, and the regression of the sample clock removes the jitter.
+``Chunk.t_ns`` is the arrival time on the monotonic clock of the host. A delayed read would give late times to the
+frames that wait in the queue. The interfaces in ``HOST_STAMPED_INTERFACES`` stamp each frame on arrival with the system
+clock of the host. For these interfaces, the age of a frame is subtracted from the time of the read. An age outside the
+range 0 to 1 s is ignored. Other interfaces stamp frames with a clock that drifts relative to the clock of the host. For
+other interfaces, ``Chunk.t_ns`` is the time of the read, and the sample clock removes the jitter by regression.
 
-If the bus is off, the interface is down or the adapter is unplugged, ``LinkLost`` is raised. Other error frames are
-counted and ignored. Remote frames are ignored. The link sends nothing except commands that configure an adapter.
+``LinkLost`` is raised if the bus is off, the interface is down or the adapter is unplugged. Other error frames are
+counted and ignored. Remote frames are ignored. The link sends only commands that configure an adapter.
 """
 
 import contextlib
@@ -29,9 +26,9 @@ from pydantic import Field, SkipValidation
 
 from drivers.data_types import ANY_SOURCE, EXTENDED_ID, Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
-from drivers.extras import check_extra
+from drivers.extras import require_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BIT_RATE, format_value
 from drivers.settings_model import checked_by
 
@@ -77,7 +74,6 @@ ID_MASK: Final = 0x1FFF_FFFF
 
 
 def _check_channel(channel: object) -> None:
-    """Raise ConfigError if the channel is neither a string nor a whole number."""
     if not isinstance(channel, str | int) or isinstance(channel, bool):
         raise ConfigError(f"expected text in quotes or a whole number, got {format_value(channel)}")
 
@@ -121,7 +117,8 @@ class CanLink(PolledLink):
     def set_address_filter(self, addresses: Sequence[int]) -> None:
         """Receive only frames with these addresses after the next call of ``open``. An empty sequence means all frames.
 
-        ``EXTENDED_ID`` marks 29-bit identifiers. If ``ANY_SOURCE`` is set, only the J1939 parameter group must match.
+        ``EXTENDED_ID`` marks 29-bit identifiers. With ``ANY_SOURCE``, frames of the J1939 parameter group are received
+        from any source address.
         """
         self._filters = [_filter_for_address(address) for address in addresses] or None
 
@@ -151,7 +148,6 @@ class CanLink(PolledLink):
             raise LinkUnavailable(f"{self.name}: {_why_not_open(s, error)}") from error
 
     def _bus_arguments(self) -> dict[str, Any]:
-        """Return the keyword arguments of ``can.Bus``."""
         s = self._settings
         keys: dict[str, Any] = {"receive_own_messages": s.receive_own_messages}
         if s.bitrate is not None:
@@ -181,7 +177,7 @@ class CanLink(PolledLink):
         return chunks
 
     def _receive_frame(self, wait_s: float) -> "can.Message | None":
-        """Return one frame; None if no frame arrives in time. Raise LinkLost if the bus has failed."""
+        """Return one CAN frame; None if no frame arrives within ``wait_s``. Raise LinkLost if the bus has failed."""
         import can
 
         bus = self._bus
@@ -207,12 +203,11 @@ class CanLink(PolledLink):
             ) from error
 
     def _to_chunk(self, message: "can.Message") -> Chunk:
-        """Return a frame as a chunk."""
         address = message.arbitration_id | (EXTENDED_ID if message.is_extended_id else 0)
         return Chunk(bytes(message.data), self._arrival_ns(message), address)
 
     def _arrival_ns(self, message: "can.Message") -> int:
-        """Return the monotonic arrival time of a frame; the present time if the time stamp cannot be used."""
+        """Return the monotonic arrival time of a CAN frame; the present time if the time stamp is unusable."""
         now_ns = time.monotonic_ns()
         if self._settings.interface not in HOST_STAMPED_INTERFACES:
             return now_ns
@@ -238,7 +233,7 @@ class CanLink(PolledLink):
 
 
 def describe_missing_package(interface: str) -> str:
-    """Return a message about the package that a python-can interface lacks; "" if no package is missing."""
+    """Return an error message if a package for a python-can interface is missing, otherwise ""."""
     module, package, requirement = PACKAGES.get(interface, ("", "", ""))
     if not module or importlib.util.find_spec(module) is not None:
         return ""
@@ -248,8 +243,8 @@ def describe_missing_package(interface: str) -> str:
 def _unix_minus_monotonic_ns() -> int:
     """Return Unix time minus monotonic time in ns.
 
-    On a loaded machine, the thread may be interrupted between the readings of the two clocks. The clocks are therefore
-    read several times, and the fastest reading is used.
+    The clocks are read several times, because the thread may be interrupted between two readings. The fastest reading
+    is used.
     """
     pairs = []
     for _ in range(CLOCK_PAIRS):
@@ -266,7 +261,6 @@ def _probe_server(s: Settings) -> None:
 
 
 def _filter_for_address(address: int) -> dict[str, Any]:
-    """Return the python-can filter for an address."""
     extended = bool(address & EXTENDED_ID)
     mask = ID_MASK if extended else 0x7FF
     if address & ANY_SOURCE:
@@ -277,7 +271,6 @@ def _filter_for_address(address: int) -> dict[str, Any]:
 
 
 def _why_not_open(s: Settings, error: Exception) -> str:
-    """Return the reason why a bus cannot be opened, and the remedy."""
     import can
 
     number = getattr(error, "errno", None)
@@ -304,10 +297,10 @@ def build(settings: Settings) -> Link:
     ConfigError
         If python-can is not installed or does not know the interface.
     """
-    check_extra("can", "a CAN bus")
+    require_extra("can", "a CAN bus")
     from can.interfaces import VALID_INTERFACES
 
     if settings.interface not in VALID_INTERFACES:
         known = sorted(VALID_INTERFACES)
-        raise ConfigError(f'interface: "{settings.interface}"{format_choices(settings.interface, known)}')
+        raise ConfigError(f'interface: "{settings.interface}"{format_choices_by_similarity(settings.interface, known)}')
     return CanLink(settings)

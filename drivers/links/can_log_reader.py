@@ -1,8 +1,8 @@
 """Reading of CAN logs: .asc, .blf, .log and .trc files, CSV of python-can, and CSV with t, id_hex and data_hex.
 
-python-can parses the logs. python-can reads any amount of text to find the next frame, and allocates as much memory as
-a BLF log states. The readers in this module therefore limit the length of lines, the size of objects, and the amount of
-data between two frames. If a limit is exceeded, a reader raises ValueError.
+A damaged log may cause python-can to read text without end or to allocate a large amount of memory. The readers in this
+module limit the length of lines, the size of objects, and the amount of data between two frames. A reader raises
+ValueError if a limit is exceeded.
 """
 
 import csv
@@ -35,7 +35,7 @@ BLF_HEADER_BYTES: Final = blf.OBJ_HEADER_BASE_STRUCT.size
 
 
 def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterator[Chunk]:
-    """Yield the data frames of a log in a format of python-can.
+    """Yield the CAN data frames of a log file that python-can can parse.
 
     Parameters
     ----------
@@ -57,13 +57,13 @@ def read_can_log(stream: IO[bytes], suffix: str, channel: str | None) -> Iterato
             yield from _data_frames(iter(reader), channel, lambda: None)
         else:
             lines = _BoundedLineReader(stream)
-            yield from _data_frames(iter(TEXT_READERS[suffix](lines.as_text(None))), channel, lines.note_frame)
+            yield from _data_frames(iter(TEXT_READERS[suffix](lines.open_as_text(None))), channel, lines.note_frame)
     except blf.BLFParseError as error:
         raise ValueError(f"no BLF log: {error}") from error
 
 
 def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
-    """Yield the data frames of a CSV file with the columns t (s), id_hex and data_hex.
+    """Yield the CAN data frames of a CSV file with the columns t (s), id_hex and data_hex.
 
     The columns channel or bus, and extended (0 or 1), are optional.
 
@@ -80,7 +80,7 @@ def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
         If the file is damaged or exceeds a limit.
     """
     lines = _BoundedLineReader(stream)
-    rows = csv.reader(lines.as_text(""))
+    rows = csv.reader(lines.open_as_text(""))
     columns = {name: i for i, name in enumerate(next(rows))}
     t, identifier, data = columns["t"], columns["id_hex"], columns["data_hex"]
     channel_column = columns.get("channel", columns.get("bus"))
@@ -99,7 +99,7 @@ def read_hex_csv(stream: IO[bytes], channel: str | None) -> Iterator[Chunk]:
 def _data_frames(
     messages: Iterator[can.Message], channel: str | None, note_frame: Callable[[], None]
 ) -> Iterator[Chunk]:
-    """Yield the data frames of one channel. Call ``note_frame`` for every message of every channel."""
+    """Yield the data frames of one channel, and call ``note_frame`` for each message of any channel."""
     for message in messages:
         note_frame()
         if message.is_error_frame or message.is_remote_frame:
@@ -119,19 +119,19 @@ def _frame_chunk(data: bytes, t_s: float, address: int) -> Chunk:
 
 
 class _BoundedLineReader(io.RawIOBase):
-    """Reader that raises ValueError if a line is too long, or if too much text contains no frame."""
+    """Reader that raises ValueError if a line, or the text between two frames, is too long."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
         self._line_bytes = 0  # number of bytes since the last line end
         self._bytes_without_frame = 0
 
-    def as_text(self, newline: str | None) -> io.TextIOWrapper:
+    def open_as_text(self, newline: str | None) -> io.TextIOWrapper:
         """Return a text file. ``newline`` has the same meaning as in the function ``open``."""
         return io.TextIOWrapper(io.BufferedReader(self), "utf-8", newline=newline)
 
     def note_frame(self) -> None:
-        """Set the number of bytes without a frame to 0."""
+        """Reset the number of bytes since the last frame."""
         self._bytes_without_frame = 0
 
     def readable(self) -> bool:
@@ -153,7 +153,7 @@ class _BoundedLineReader(io.RawIOBase):
 
 
 class _BoundedReader:
-    """Binary file that raises ValueError for reads of a negative or too large size, as a damaged BLF log causes."""
+    """Binary file that raises ValueError if a read has a negative or too large size, as in a damaged BLF log."""
 
     def __init__(self, stream: IO[bytes]) -> None:
         self._stream = stream
@@ -167,7 +167,7 @@ class _BoundedReader:
 
 
 class _ValidatingBlfReader(can.BLFReader):
-    """BLF reader that rejects too large objects, and empty objects, which python-can would read forever."""
+    """BLF reader that rejects large objects and empty objects. python-can would read empty objects forever."""
 
     def __iter__(self) -> Generator[can.Message, None, None]:
         bytes_without_frame = 0
@@ -180,7 +180,6 @@ class _ValidatingBlfReader(can.BLFReader):
                 raise blf.BLFParseError(f"{MAX_OBJECTS_WITHOUT_FRAME_BYTES} bytes hold no CAN frame")
 
     def _read_container(self) -> bytes | None:
-        """Return the uncompressed content of the next container; None at the end of the file."""
         while header := self.file.read(BLF_HEADER_BYTES):
             mark, _, _, size, kind = blf.OBJ_HEADER_BASE_STRUCT.unpack(header)
             if mark != BLF_OBJECT:
@@ -192,7 +191,7 @@ class _ValidatingBlfReader(can.BLFReader):
         return None
 
     def _parse_container(self, data: bytes) -> Iterator[can.Message]:
-        """Yield the messages of a container after checking the sizes of its objects."""
+        """Yield the CAN messages of a BLF container after checking the object sizes."""
         at = data.find(BLF_OBJECT)
         while at >= 0:
             size = data[at + 8 : at + 12]
@@ -205,7 +204,7 @@ class _ValidatingBlfReader(can.BLFReader):
 
 
 def _unpack_container(container: bytes) -> bytes:
-    """Return the uncompressed content of a container; b"" if the compression method is unknown."""
+    """Return the uncompressed data of a BLF container; b"" if the compression method is unknown."""
     method, _ = blf.LOG_CONTAINER_STRUCT.unpack_from(container)
     data = container[blf.LOG_CONTAINER_STRUCT.size :]
     if method == blf.NO_COMPRESSION:

@@ -1,21 +1,20 @@
-"""Replay of a file in place of a device, at the recorded speed or another speed.
+"""Replay of a recorded file as if a device sent the data, at an adjustable speed.
 
-The chunks depend on the kind of file:
+The chunks depend on the type of the file:
 
 - A recording (``drivers.recordings``: CSV, .npz, Parquet, Arrow, or a folder) becomes messages for the decoder
   ``samples``.
 - A CAN log (``drivers.links.can_log_reader``) becomes CAN frames.
 - A file of captured bytes (.bin, .raw or .txt, also with .gz) becomes bytes.
-- Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages, as the
-  original link has received them.
+- Raw data that the daemon has recorded (a segment or a folder of segments) become bytes, frames or messages,
+  depending on the original link.
 
-The chunks of recordings, logs and raw data have the recorded Unix times. Captured bytes have no times. If
-``bytes_per_second`` is set, each chunk gets the time at which a device with this byte rate would have sent the chunk.
-Otherwise each chunk gets the time of the read.
+The chunks of recordings, logs and raw data have the recorded Unix times. Captured bytes have no times. Each chunk of
+captured bytes gets the time at which a device with the byte rate ``bytes_per_second`` would send the chunk. Without
+``bytes_per_second``, each chunk gets the time of the read.
 
 ``poll_chunks`` raises ``LinkEnded`` after all data have been returned. If a file is truncated, the complete part is
-replayed, and the message at the end mentions the truncation. ``build`` reads the header of a CSV file, since the header
-decides which decoder is needed. ``open`` reads all other content.
+replayed, and the final message mentions the truncation. ``build`` reads the header of a CSV file to choose the decoder.
 """
 
 import binascii
@@ -34,13 +33,13 @@ from pydantic import Field
 from drivers import file_access
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkEnded, LinkUnavailable, RecordingError, describe_error
-from drivers.extras import check_extra
+from drivers.extras import require_extra
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BYTE_RATE, RATE_HZ, REPLAY_SPEED
 from drivers.recordings import FORMATS, Recording, iter_blocks, load_samples
 from drivers.recordings import segment_file as segment
-from drivers.settings_model import FilePath, WordOr
+from drivers.settings_model import FilePath, KeywordOrType
 from drivers.zenoh.sample_message import encode_samples
 
 DEFAULT_DECODER: Final = "samples"
@@ -63,7 +62,7 @@ DAMAGE_ERRORS: Final = (
 """Exceptions, in addition to ValueError, that readers raise if a file is truncated or damaged."""
 
 PACES: Final = {"recorded": 1.0, "max": float("inf")}
-"""Words for the key ``speed`` and the factors that they stand for."""
+"""Values of the key ``speed`` that are words, and the corresponding factors."""
 
 Kind = Literal["recording", "log", "capture", "raw"]
 TimedChunk = tuple[float, Chunk]
@@ -81,7 +80,7 @@ class Settings(LinkSettings):
     path: FilePath = Field(
         examples=["recording.csv"], description="recording, CAN log, file of captured bytes, or folder of segments"
     )
-    speed: Annotated[float, WordOr(PACES, Annotated[float, REPLAY_SPEED])] = Field(
+    speed: Annotated[float, KeywordOrType(PACES, Annotated[float, REPLAY_SPEED])] = Field(
         1.0, examples=["recorded"], description="recorded, max, or a factor: 10 = ten times as fast as recorded"
     )
     rate: Annotated[float, RATE_HZ] | None = Field(
@@ -146,11 +145,10 @@ class ReplayLink(PolledLink):
         return chunks
 
     def _due_s(self, item: TimedChunk) -> float:
-        """Return the due time of an item on the monotonic clock, in s."""
         return self._started_s + item[0] / self._pace
 
     def _fetch_next(self) -> None:
-        """Fetch the next item. If the rest of the file is damaged, end the replay and add a note."""
+        """Fetch the next item. If the file is damaged, end the replay and add a note."""
         assert self._items is not None
         try:
             self._next = next(self._items, None)
@@ -164,7 +162,6 @@ class ReplayLink(PolledLink):
             items.close()
 
     def _read_items(self) -> Generator[TimedChunk]:
-        """Return the chunks of the file with their due times."""
         if self._kind == "recording":
             recording = load_samples(self._path, self._settings.rate)
             self.notes = recording.notes
@@ -177,7 +174,7 @@ class ReplayLink(PolledLink):
         return _read_capture(self._path, self._settings.bytes_per_second)
 
     def _message_rows(self, recording: Recording) -> int:
-        """Return the number of rows per message: STEP_S of recorded time, or many if the speed is not limited."""
+        """Return the number of samples per message, which is MAX_MESSAGE_ROWS if the speed is not limited."""
         t, n = recording.t_s, len(recording)
         if self._pace == float("inf") or n < 2:
             return MAX_MESSAGE_ROWS
@@ -186,7 +183,7 @@ class ReplayLink(PolledLink):
 
 
 def _read_messages(recording: Recording, rows: int) -> Generator[TimedChunk]:
-    """Yield messages of up to ``rows`` samples. A message is due at the time of the newest sample in the message."""
+    """Yield messages of up to ``rows`` samples. The due time of a message is the time of the newest sample."""
     given = 0
     start_ns: int | None = None
     for samples in iter_blocks(recording, rows):
@@ -197,7 +194,6 @@ def _read_messages(recording: Recording, rows: int) -> Generator[TimedChunk]:
 
 
 def _relative_times(chunks: Iterator[Chunk]) -> Generator[TimedChunk]:
-    """Yield each chunk with the time since the first chunk in s."""
     start_ns: int | None = None
     for chunk in chunks:
         start_ns = chunk.t_ns if start_ns is None else start_ns
@@ -205,7 +201,6 @@ def _relative_times(chunks: Iterator[Chunk]) -> Generator[TimedChunk]:
 
 
 def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
-    """Yield the data frames of a CAN log."""
     from drivers.links import can_log_reader as can_log
 
     suffix = _plain_suffix(path)
@@ -220,12 +215,11 @@ def _read_log(path: Path, channel: str | None) -> Iterator[Chunk]:
 
 
 def _raw_segments(path: Path) -> list[Path]:
-    """Return the segments of a folder, oldest first. If the path is a file, return only the file."""
+    """Return the segment files of a folder, oldest first. For a file, return only the file."""
     return segment.list_segments(path) if path.is_dir() else [path]
 
 
 def _is_raw(path: Path) -> bool:
-    """Return True if the newest segment contains raw data. Return False if the segment cannot be read."""
     found = _raw_segments(path)
     if not found or not segment.NAME.fullmatch(found[-1].name):
         return False
@@ -236,7 +230,6 @@ def _is_raw(path: Path) -> bool:
 
 
 def _raw_carrier(path: Path) -> Carrier:
-    """Return the carrier of the newest segment. Raise ConfigError if the carrier is unknown."""
     carrier = segment.read_metadata(_raw_segments(path)[-1]).carrier
     known: tuple[Carrier, ...] = ("bytes", "frames", "messages")
     for one in known:
@@ -249,7 +242,7 @@ def _raw_carrier(path: Path) -> Carrier:
 
 
 def _read_capture(path: Path, bytes_per_second: float | None) -> Generator[TimedChunk]:
-    """Yield captured bytes with due times according to the byte rate. Without a rate, every chunk is due at once."""
+    """Yield captured bytes with due times according to the byte rate. Without a byte rate, all due times are 0."""
     start_ns = time.monotonic_ns()
     size = CHUNK_BYTES if bytes_per_second is None else min(max(1, round(bytes_per_second * STEP_S)), CHUNK_BYTES)
     given = 0
@@ -265,7 +258,7 @@ def _read_capture(path: Path, bytes_per_second: float | None) -> Generator[Timed
 
 
 def _detect_kind(path: Path) -> Kind:
-    """Return the kind of a file according to the suffix and the content. Raise ConfigError for any other file."""
+    """Return the type of a file according to the suffix and the content. Raise ConfigError for an unknown type."""
     suffix = _plain_suffix(path)
     if path == Path():
         raise ConfigError("path: empty; it is a recording, a CAN log, captured bytes, or a folder of segments")
@@ -284,11 +277,10 @@ def _detect_kind(path: Path) -> Kind:
     if suffix in FORMATS:
         return "recording"
     known = (*FORMATS, *CAN_LOGS, *CAPTURES)
-    raise ConfigError(f'path: "{path}" has no suffix of a file to replay{format_choices(suffix, known)}')
+    raise ConfigError(f'path: "{path}" has no suffix of a file to replay{format_choices_by_similarity(suffix, known)}')
 
 
 def _plain_suffix(path: Path) -> str:
-    """Return the last suffix of a path, without a final ".gz"."""
     suffixes = [s.lower() for s in path.suffixes]
     if suffixes and suffixes[-1] == ".gz":
         suffixes.pop()
@@ -296,7 +288,6 @@ def _plain_suffix(path: Path) -> str:
 
 
 def _read_header(path: Path) -> str:
-    """Return the first line of a text file; "" if the file cannot be read."""
     try:
         with _open_text(path) as stream:
             return stream.readline(1000).strip()
@@ -305,8 +296,7 @@ def _read_header(path: Path) -> str:
 
 
 def _open_binary(path: Path) -> IO[bytes]:
-    """Open a binary file for reading. Decompress the content if the name ends in ".gz"."""
-    file = file_access.open_regular(path)
+    file = file_access.open_regular_file(path)
     if path.suffix.lower() != ".gz":
         return file
     unzipped: Any = gzip.GzipFile(fileobj=file, mode="rb")
@@ -315,12 +305,11 @@ def _open_binary(path: Path) -> IO[bytes]:
 
 
 def _open_text(path: Path) -> IO[str]:
-    """Open a text file for reading. Decompress the content if the name ends in ".gz"."""
     return io.TextIOWrapper(_open_binary(path), "utf-8", newline="")
 
 
 def build(settings: Settings) -> Link:
-    """Return the link without opening the file for replay.
+    """Return a link for the file, without opening the file.
 
     Raises
     ------
@@ -331,16 +320,15 @@ def build(settings: Settings) -> Link:
     _check_path(path)
     kind = _detect_kind(path)
     if kind == "log":
-        check_extra("can", "a CAN log")
+        require_extra("can", "a CAN log")
     return ReplayLink(settings, kind)
 
 
 def _check_path(path: Path) -> None:
-    """Raise ConfigError if the path exists but is neither a file nor a folder."""
     if path.is_dir():
         return
     try:
-        file_access.check_regular(path)
+        file_access.check_regular_file(path)
     except FileNotFoundError:
         return
     except OSError as error:

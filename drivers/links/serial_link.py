@@ -1,16 +1,12 @@
 """Serial ports, local or networked, by any URL that pyserial supports.
 
-The link returns bytes as they arrive, without regard to frames. A read waits for the first byte, then for the time
-``read_timeout`` (10 ms by default) for more bytes, and returns all bytes that have arrived. A short wait needs a tenth
-of the processor time of a read per frame, and no byte waits longer than ``read_timeout``. If a URL handler has no file
-descriptor, a read returns at every arrival.
+A read waits for the first byte, then for the time ``read_timeout`` (10 ms by default) for more bytes, and returns all
+bytes that have arrived. Waiting for more bytes needs a tenth of the processor time of one read per frame, and delays
+bytes by at most ``read_timeout``. If a URL handler has no file descriptor, a read returns at every arrival.
 
-``close`` ends a waiting read and closes the port after the read has ended. If the file descriptor were closed earlier,
-the system could assign the same descriptor to another file while the read is waiting.
-
-If the port cannot be opened, ``LinkUnavailable`` names the cause and the remedy, such as a missing permission or
-another program that uses the port. If the device is unplugged or the connection is closed, ``poll_chunks`` raises
-``LinkLost``. Nothing is written to the device.
+``close`` closes the port only after a waiting read has ended. Otherwise the system could assign the file descriptor to
+another file during the read. ``LinkUnavailable`` names the reason and a remedy if the port cannot be opened.
+``LinkLost`` is raised if the device is unplugged or the connection is closed. The link never writes to the device.
 """
 
 import contextlib
@@ -26,7 +22,7 @@ from drivers.credential_masking import mask_secrets
 from drivers.data_types import Chunk
 from drivers.errors import ConfigError, LinkLost, LinkUnavailable, describe_error
 from drivers.links.base import Carrier, Link, LinkSettings, PolledLink
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import BIT_RATE, READ_TIMEOUT_S
 from drivers.settings_model import checked_by
 
@@ -42,16 +38,16 @@ SCHEMES: Final = ("socket", "rfc2217", "loop", "spy", "alt", "hwgrep", "cp2110")
 
 
 def _check_port(port: str) -> None:
-    """Raise ConfigError if the port is empty, or is a URL with an unknown scheme."""
     scheme, found, _ = port.partition("://")
     if not port:
         raise ConfigError('empty; it is a port ("/dev/ttyUSB0") or a URL ("socket://host:port")')
     if found and scheme.lower() not in SCHEMES and not _has_handler(scheme.lower()):
-        raise ConfigError(f'"{port}" has an unknown kind of URL "{scheme}"{format_choices(scheme, SCHEMES)}')
+        raise ConfigError(
+            f'"{port}" has an unknown kind of URL "{scheme}"{format_choices_by_similarity(scheme, SCHEMES)}'
+        )
 
 
 def _check_stop_bits(number: float) -> None:
-    """Raise ConfigError if no port has this number of stop bits."""
     if number not in STOP_BITS:
         raise ConfigError(f"{number:g}; possible are 1, 1.5, 2")
 
@@ -89,7 +85,7 @@ class SerialLink(PolledLink):
         self._buffer_filling = False  # True if the last read returned so many bytes that the next read must not wait
 
     def close(self) -> None:
-        """End a waiting ``poll_chunks``, then close the port."""
+        """Interrupt a waiting call of ``poll_chunks``, then close the port."""
         self._closing.set()
         cancel = getattr(self._port, "cancel_read", None)  # some URL handlers lack this method
         if cancel is not None:
@@ -126,7 +122,6 @@ class SerialLink(PolledLink):
         return [Chunk(data, time.monotonic_ns())] if data else []
 
     def _read_available(self) -> bytes:
-        """Return the bytes that arrive within ``read_timeout``. Raise LinkLost if the device has failed."""
         port = self._port
         assert port is not None
         try:
@@ -156,14 +151,13 @@ class SerialLink(PolledLink):
 
 
 def _has_file_number(port: "serial.SerialBase") -> bool:
-    """Return True if the port is a POSIX port of pyserial, which can be read through its file descriptor."""
+    """Return True if the port can be read through a file descriptor."""
     import serial
 
     return os.name == "posix" and type(port).read is serial.Serial.read
 
 
 def _why_not_open(port: str, error: Exception) -> str:
-    """Return the reason why a port cannot be opened, and the remedy, in one line."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT:
         return f"{port}: no such port; {_list_ports()}"
@@ -179,7 +173,6 @@ def _why_not_open(port: str, error: Exception) -> str:
 
 
 def _list_ports() -> str:
-    """Return a text that lists the existing serial ports."""
     from serial.tools import list_ports
 
     found = sorted(info.device for info in list_ports.comports())

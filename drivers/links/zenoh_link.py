@@ -1,18 +1,16 @@
-"""Messages of another system over zenoh, one message per chunk with its attachment.
+"""Messages of another system over zenoh, one message per chunk with the attachment.
 
-Each link has a zenoh session. The session does not scout or listen, and connects only to the configured endpoints.
+Each link has a separate zenoh session, which does not scout or listen and connects only to the configured endpoints. A
+session with one endpoint is a client, because a router does not forward data from one peer to another peer. A client
+can be opened only if the endpoint answers. A session with several endpoints is a peer, since a client would use only
+the first endpoint that answers. A peer is opened immediately, and zenoh connects in the background. A missing publisher
+therefore causes silence and not ``LinkLost``.
 
-A session with one endpoint is a client. A router does not forward data between two peers, and most publishers are
-peers, so a peer would receive nothing. A client can be opened only if the endpoint answers. A session with several
-endpoints is a peer, since a client would use only the first endpoint that answers. A peer is opened immediately, and
-zenoh connects in the background. If a publisher is missing, the link is therefore silent and ``LinkLost`` is not
-raised.
-
-zenoh writes messages to a ring channel, which overwrites the oldest message when the channel is full. A decoder detects
-the loss by the sequence numbers. A thread of the link takes the messages from the channel and time-stamps them, because
-the channels of zenoh have no timeout. No Python callback is registered, since a callback that exists at exit blocks the
-process. Closing the session ends the thread and a waiting ``poll_chunks``. If a program ends without closing the
-session, ``atexit`` closes the session, since a thread that waits in zenoh would abort the process.
+zenoh writes messages to a ring channel, which overwrites the oldest message when the channel is full. The decoder
+detects the loss by the sequence numbers. A thread takes the messages from the channel and adds the arrival times,
+because the channels of zenoh have no timeout. No Python callback is used, since a callback that exists at exit blocks
+the process. ``atexit`` closes the session if the program has not, since a thread that waits in zenoh would abort the
+process.
 """
 
 import atexit
@@ -70,7 +68,7 @@ class Settings(LinkSettings):
 
 
 class ZenohLink:
-    """Link to one subscription in a separate zenoh session."""
+    """Link that receives the messages of one zenoh subscription."""
 
     carrier: Carrier = "messages"
     epoch: Literal["monotonic", "unix"] = "monotonic"
@@ -127,12 +125,12 @@ class ZenohLink:
             return None
 
     def close(self) -> None:
-        """Close the session and end a waiting ``poll_chunks``."""
+        """Close the session, and interrupt a waiting call of ``poll_chunks``."""
         with self._opening:
             self._close_session()
 
     def _receive(self, subscriber: Any) -> None:
-        """Move messages from the ring channel to the queue and time-stamp them, until the session is closed."""
+        """Move messages from the ring channel to the queue until the session is closed."""
         import zenoh
 
         handler = subscriber.handler  # a subscriber that waits for messages cannot be undeclared
@@ -151,19 +149,17 @@ class ZenohLink:
                 self._changed.notify_all()
 
     def _clear_waiting(self) -> None:
-        """Discard the waiting messages."""
         self._waiting.clear()
         self._waiting_bytes = 0
 
     def _enqueue(self, chunk: Chunk) -> None:
-        """Queue a chunk, and drop the oldest chunks if the queue exceeds a limit."""
+        """Append a chunk to the queue, and drop the oldest chunks if the queue is full."""
         self._waiting.append(chunk)
         self._waiting_bytes += len(chunk.data)
         while len(self._waiting) > 1 and (self._waiting_bytes > MAX_QUEUED_BYTES or len(self._waiting) > MAX_MESSAGES):
             self._waiting_bytes -= len(self._waiting.popleft().data)
 
     def _close_session(self) -> None:
-        """Close the session and wait for the receiving thread."""
         atexit.unregister(self.close)
         session, self._session = self._session, None
         receiver, self._receiver = self._receiver, None
@@ -177,7 +173,6 @@ class ZenohLink:
             receiver.join()
 
     def _why_not_open(self, error: Exception) -> str:
-        """Return the reason why the session cannot be opened, in one line."""
         config = _configuration(self._settings)
         endpoints = find_connect_endpoints(config)
         shown = mask_secrets(", ".join(endpoints)) or "(connect is empty)"
@@ -188,13 +183,11 @@ class ZenohLink:
 
 
 def _to_chunk(sample: Any, t_ns: int) -> Chunk:
-    """Return a zenoh sample as a chunk."""
     attachment = sample.attachment
     return Chunk(bytes(sample.payload), t_ns, attachment=b"" if attachment is None else bytes(attachment))
 
 
 def _configuration(settings: Settings) -> "zenoh.Config":
-    """Return the configuration of the session."""
     own = {
         "mode": settings.mode,
         "connect/endpoints": settings.connect or None,

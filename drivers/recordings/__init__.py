@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.data_types import AXES, Floats, SampleBlock, make_block
-from drivers.errors import ConfigError, RecordingError, describe_error, format_one_line
-from drivers.file_access import check_regular
+from drivers.errors import ConfigError, RecordingError, describe_error, sanitize_error_text
+from drivers.file_access import check_regular_file
 from drivers.number_ranges import DURATION_S, RATE_HZ
 from drivers.recordings import memory_check
 from drivers.recordings.formats import FORMATS, find_format, is_recording
@@ -131,7 +131,7 @@ def _error_text(path: Path, error: RecordingError | OSError) -> str:
 
 def _load_file(path: Path, rate_hz: float | None) -> Recording:
     """Read one regular file."""
-    check_regular(path)
+    check_regular_file(path)
     if path.stat().st_size:
         return _assemble(path, find_format(path).read(path), rate_hz)
     if not is_recording(path):
@@ -176,7 +176,7 @@ def _read_only_recording(
     for array in (t_s, values, temperature_c):
         if array is not None:
             array.flags.writeable = False
-    return Recording(t_s, values, temperature_c, rate_hz, axes, tuple(map(format_one_line, notes)))
+    return Recording(t_s, values, temperature_c, rate_hz, axes, tuple(map(sanitize_error_text, notes)))
 
 
 def _common_length(path: Path, columns: Mapping[str, Floats]) -> int:
@@ -286,7 +286,7 @@ def _check_folder(path: Path, segments: Sequence[Path], free: int | None) -> Non
     rows = size_bytes = 0
     for segment in segments:
         try:
-            check_regular(segment)
+            check_regular_file(segment)
             rows += find_format(segment).count_rows(segment) if segment.stat().st_size else 0
         except (RecordingError, OSError):
             continue  # the note about the segment is added when the segment is read

@@ -14,7 +14,7 @@ from typing import Any, Final
 import numpy as np
 
 from drivers.errors import ConfigError, RecordingError
-from drivers.file_access import open_regular
+from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 from drivers.recordings.arrow_message_sizes import check_buffer_sizes, count_buffers, iter_batch_sizes
 
@@ -88,7 +88,7 @@ def _open_parquet(path: Path) -> Iterator[Any]:
     pa = import_pyarrow(path)
     from pyarrow import parquet
 
-    with open_regular(path) as file:
+    with open_regular_file(path) as file:
         size_bytes = os.fstat(file.fileno()).st_size
         file.seek(max(size_bytes - len(PARQUET_FOOTER), 0))
         index_bytes = int.from_bytes(file.read()[:4], "little")
@@ -123,7 +123,7 @@ def read_ipc(path: Path) -> table.Table:
     pa = import_pyarrow(path)
     notes: list[str] = []
     start = _ipc_start(path)
-    with open_regular(path) as file:
+    with open_regular_file(path) as file:
         schema = _ipc_schema(path, file)
         own = METADATA_KEY in (schema.metadata or {})
         chosen = table.choose_columns(
@@ -151,20 +151,20 @@ def read_ipc(path: Path) -> table.Table:
 
 def count_ipc_rows(path: Path) -> int:
     """Return the total number of rows of all complete batches."""
-    with open_regular(path) as file:
+    with open_regular_file(path) as file:
         return _check_ipc(path, _ipc_start(path), _ipc_schema(path, file), {})[1]
 
 
 def _ipc_start(path: Path) -> int:
     """Return the offset of the stream in bytes: the length of the magic word for a file, 0 for a stream."""
-    with open_regular(path) as file:
+    with open_regular_file(path) as file:
         return len(ARROW_MAGIC) if file.read(len(ARROW_MAGIC)) == ARROW_MAGIC else 0
 
 
 def _has_end_mark(path: Path, is_file: bool) -> bool:
     """Return True if the file or stream ends with its end mark, so that it is not truncated."""
     mark = ARROW_MAGIC.rstrip(b"\0") if is_file else ARROW_END
-    with open_regular(path) as file:
+    with open_regular_file(path) as file:
         file.seek(max(path.stat().st_size - len(mark), 0))
         return file.read() == mark
 
@@ -195,7 +195,7 @@ def _check_ipc(path: Path, start: int, schema: Any, chosen: Mapping[str, str]) -
     ]
     limit = memory_check.measure_read_limit(path)
     batches = rows = dictionaries = 0
-    with open_regular(path) as file:
+    with open_regular_file(path) as file:
         for size in iter_batch_sizes(file, start):
             if size.dictionary:
                 dictionaries += sum(size.buffers)

@@ -26,7 +26,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import RecordingError
-from drivers.file_access import open_regular
+from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 
 READ_BYTES: Final = 1 << 20
@@ -72,7 +72,7 @@ def read_csv(path: Path) -> table.Table:
     notes: list[str] = []
     bad = _BadLines()
     count_csv_rows(path)
-    with open_regular(path) as file:
+    with open_regular_file(path) as file:
         texts = _whole_lines(_decompressed(file, notes), notes)
         head = _find_header(path, texts)
         if head is None:
@@ -97,7 +97,7 @@ def count_csv_rows(path: Path) -> int:
     """Return the number of complete lines. Raise an error if the number of lines or the unpacked size is too large."""
     limit = memory_check.measure_read_limit(path)
     lines = unpacked = 0
-    with open_regular(path) as file:
+    with open_regular_file(path) as file:
         for text in _whole_lines(_decompressed(file, []), []):
             lines += text.count(b"\n")
             unpacked += len(text)

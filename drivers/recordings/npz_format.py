@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.errors import RecordingError
-from drivers.file_access import open_regular
+from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check, table
 
 LOCAL_HEADER: Final = struct.Struct("<4s5H3I2H")  # PKWARE APPNOTE 4.3.7
@@ -281,7 +281,7 @@ def _recover_arrays(path: Path) -> tuple[dict[str, NDArray[Any]], str | None]:
     limit = memory_check.measure_read_limit(path)
     arrays: dict[str, NDArray[Any]] = {}
     unpacked = members = 0
-    with open_regular(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
+    with open_regular_file(path) as file, mmap(file.fileno(), 0, access=ACCESS_READ) as data:
         at = data.find(LOCAL_MAGIC)
         while 0 <= at <= len(data) - LOCAL_HEADER.size:
             members += 1

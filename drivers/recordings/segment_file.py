@@ -30,7 +30,7 @@ import numpy as np
 
 from drivers.data_types import AXES, Chunk, SampleBlock, concatenate_blocks, make_block, ns_to_seconds, seconds_to_ns
 from drivers.errors import ImuError, RecordingError
-from drivers.file_access import open_regular
+from drivers.file_access import open_regular_file
 from drivers.number_ranges import COUNTER_STEP, RATE_HZ
 from drivers.recordings.arrow_format import METADATA_KEY, SEGMENT_COLUMNS, first_line, import_pyarrow
 from drivers.recordings.arrow_message_sizes import iter_batch_sizes
@@ -222,7 +222,7 @@ def parse_segment_number(path: Path) -> int:
 def read_metadata(path: Path) -> SegmentMetadata:
     """Return the source of the data in a segment. Raise RecordingError if the file is not a segment."""
     pa = import_pyarrow(path)
-    with _arrow_errors(path), open_regular(path) as file:
+    with _arrow_errors(path), open_regular_file(path) as file:
         return _check_schema(path, pa.ipc.open_stream(file).schema)
 
 
@@ -317,7 +317,7 @@ def compress_segment(path: Path) -> Iterator[None]:
             for batch, meta in _merged_batches(pa, schema, path, own.kind):
                 writer.write_batch(batch, custom_metadata=meta)
                 yield
-        with open_regular(part) as written:
+        with open_regular_file(part) as written:
             os.fsync(written.fileno())
         os.replace(part, path)
         _sync_folder(path.parent)
@@ -363,7 +363,7 @@ def _read_batches(path: Path, kind: Kind, mapped: bool = False) -> Iterator[tupl
     """
     pa = import_pyarrow(path)
     # the file is opened only once, because the daemon may replace the file by a compressed file at any time
-    with _arrow_errors(path), open_regular(path) as file:
+    with _arrow_errors(path), open_regular_file(path) as file:
         count = _count_regular_batches(file)
         file.seek(0)
         reader = pa.ipc.open_stream(_memory_map(pa, file) if mapped else file)

@@ -9,7 +9,7 @@ from typing import Final
 
 from drivers.data_types import AXES, Floats
 from drivers.errors import RecordingError
-from drivers.file_access import open_regular
+from drivers.file_access import open_regular_file
 from drivers.recordings import memory_check
 
 COLUMNS: Final = ("t", *AXES, "temperature")
@@ -124,7 +124,7 @@ def describe_content(path: Path) -> str:
     The text states the type of the content and the remedy. The text is empty if the type is unknown.
     """
     try:
-        with open_regular(path) as file:
+        with open_regular_file(path) as file:
             start = file.read(256)
     except OSError:
         return ""

@@ -1,1 +1,1 @@
-"""Connection to zenoh: sessions, causes of connection errors, and the message format of samples."""
+"""zenoh sessions, diagnosis of connection errors, and the message format of samples."""

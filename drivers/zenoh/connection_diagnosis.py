@@ -1,9 +1,9 @@
-"""Causes of connection errors, since zenoh itself does not report a cause.
+"""Diagnosis of connection errors, since zenoh does not report a cause.
 
 The functions connect to an endpoint with the configuration of the failed attempt. For TLS, the test includes the
-handshake with the same certificates. Nothing is sent after the handshake. The result is one line, or "" if no program
-listens at the endpoint or if the protocol cannot be tested (QUIC, UDP). The test of an endpoint may take twice
-``timeout_s``, so a thread that handles samples must not run the test.
+handshake with the same certificates. The result is one line. The result is "" if no program listens at the endpoint, or
+if the protocol is QUIC or UDP. The test of an endpoint may take twice ``timeout_s``, so a thread that handles samples
+must not run the test.
 """
 
 import json
@@ -36,7 +36,7 @@ _TLS_REASONS: Final = {
 
 
 def explain_refusals(endpoints: Sequence[str], config: "zenoh.Config") -> str:
-    """Return the reasons why endpoints refuse a connection, without the endpoints for which no reason is found.
+    """Return the reasons why endpoints refuse a connection. Endpoints without a known reason are omitted.
 
     Parameters
     ----------
@@ -50,7 +50,7 @@ def explain_refusals(endpoints: Sequence[str], config: "zenoh.Config") -> str:
 
 
 def explain_refusal(endpoint: str, config: "zenoh.Config", timeout_s: float = TIMEOUT_S) -> str:
-    """Return the reason why an endpoint refuses a connection, in one line without the endpoint; "" if none is found.
+    """Return the reason why an endpoint refuses a connection; "" if the reason is unknown.
 
     Parameters
     ----------
@@ -81,7 +81,6 @@ def explain_refusal(endpoint: str, config: "zenoh.Config", timeout_s: float = TI
 
 
 def _explain_handshake_failure(plain: socket.socket, host: str, config: "zenoh.Config") -> str:
-    """Perform the TLS handshake and return the reason for its failure."""
     try:
         context = _tls_context(json.loads(config.get_json("transport/link/tls")))
     except (OSError, ssl.SSLError) as error:
@@ -102,7 +101,6 @@ def _explain_handshake_failure(plain: socket.socket, host: str, config: "zenoh.C
 
 
 def _tls_context(tls: dict[str, Any]) -> ssl.SSLContext:
-    """Return the TLS context that zenoh creates from these settings."""
     context = ssl.create_default_context(cafile=tls.get("root_ca_certificate"))
     context.check_hostname = tls.get("verify_name_on_connect") is not False
     certificate, key = tls.get("connect_certificate"), tls.get("connect_private_key")

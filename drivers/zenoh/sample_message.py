@@ -1,12 +1,12 @@
 """Conversion between ``SampleBlock`` and the msgpack map that is published under ``<prefix>/<device>/samples``.
 
-The daemon publishes messages of this format, the decoder ``samples`` reads them, and a replayed recording is converted
-to them. ``docs/samples-format.md`` documents the format.
+``docs/samples-format.md`` documents the format. The daemon and the replay of a recording write the messages, and the
+decoder ``samples`` reads the messages.
 
-If the samples are evenly spaced to within half a microsecond, ``t`` is the Unix time of the newest sample in seconds,
-``t0`` the Unix time of the first sample, and ``rate`` the sample rate in Hz. Otherwise ``t`` contains the Unix time of
-each sample in seconds as little-endian float64, with a resolution of 0.24 µs. Unknown keys and columns are ignored. If
-sizes are inconsistent or exceed a limit, a ``DecodeError`` is raised.
+If the samples are evenly spaced to within half a microsecond, ``t`` and ``t0`` are the Unix times of the newest and the
+first sample in seconds, and ``rate`` is the sample rate in Hz. Otherwise ``t`` contains the Unix time of each sample in
+seconds as little-endian float64, with a resolution of 0.24 µs. Unknown keys and columns are ignored. A message with
+inconsistent or too large sizes raises ``DecodeError``.
 """
 
 from collections.abc import Sequence
@@ -40,8 +40,6 @@ Lost = Annotated[int, msgspec.Meta(ge=0, le=1_000_000_000)]
 
 
 class _Payload(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Keys of the msgpack map."""
-
     schema: str
     axes: list[str]
     data: bytes
@@ -62,12 +60,12 @@ class SampleMessage:
     """Content of one message."""
 
     device: str
-    samples: int  # number of samples that the publisher has received since its start, including this message
+    total_samples: int  # number of samples that the publisher has received since its start, including this message
     block: SampleBlock  # t_ns are Unix times
 
 
 def encode_samples(
-    device: str, samples: int, rows: SampleBlock, offset_ns: Ints | int = 0, schema: str = SCHEMA
+    device: str, total_samples: int, block: SampleBlock, unix_offset_ns: Ints | int = 0, schema: str = SCHEMA
 ) -> bytes:
     """Encode samples as one message.
 
@@ -75,21 +73,22 @@ def encode_samples(
     ----------
     device
         Name of the device.
-    samples
+    total_samples
         Number of samples of the device since the start, including the samples of the message.
-    rows
-        Samples to encode. Axes without a value are omitted. If all values are NaN, all six axes are kept.
-    offset_ns
+    block
+        Samples to encode. The message omits axes without a value. If all values are NaN, the message contains all six
+        axes.
+    unix_offset_ns
         Offset from ``t_ns`` to Unix time in ns.
     schema
         Name of the schema.
     """
-    table = np.column_stack((rows.values, rows.temperature_c))
+    table = np.column_stack((block.values, block.temperature_c))
     measured: NDArray[np.bool_] = ~np.all(np.isnan(table), axis=0)
     if not measured.any():
         measured[: len(AXES)] = True
     t: float | bytes
-    t, t0, rate = _encode_times(rows.t_ns + offset_ns)
+    t, t0, rate = _encode_times(block.t_ns + unix_offset_ns)
     return _ENCODER.encode(
         _Payload(
             schema=schema,
@@ -97,8 +96,8 @@ def encode_samples(
             axes=[name for name, there in zip(COLUMNS, measured, strict=True) if there],
             data=np.ascontiguousarray(table[:, measured], "<f8").tobytes(),
             t=t,
-            samples=samples,
-            lost=rows.lost,
+            samples=total_samples,
+            lost=block.lost,
             t0=t0,
             rate=rate,
         )
@@ -127,7 +126,6 @@ def decode_samples(data: bytes) -> SampleMessage:
 
 
 def _encode_times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | None]:
-    """Return the values of the keys ``t``, ``t0`` and ``rate``."""
     n = unix_ns.size
     span_ns = int(unix_ns[-1] - unix_ns[0])
     rate = (n - 1) * 1e9 / span_ns if span_ns > 0 else 0.0
@@ -139,7 +137,6 @@ def _encode_times(unix_ns: Ints) -> tuple[float | bytes, float | None, float | N
 
 
 def _decode_values(payload: _Payload) -> Floats:
-    """Check the sizes, and return the data as an array [rows, columns]."""
     names: Sequence[str] = payload.axes
     if not 0 < len(names) <= MAX_COLUMNS or len(set(names)) != len(names):
         raise DecodeError(f"axes: {len(names)} names, expected 1 to {MAX_COLUMNS} different names")
@@ -152,7 +149,6 @@ def _decode_values(payload: _Payload) -> Floats:
 
 
 def _decode_times_ns(payload: _Payload, n: int) -> Ints:
-    """Return the Unix times [n] of the rows in ns."""
     if isinstance(payload.t, bytes):
         if len(payload.t) != 8 * n:
             raise DecodeError(f"t: {len(payload.t)} bytes for {n} rows, expected one float64 per row")
@@ -173,6 +169,5 @@ def _decode_times_ns(payload: _Payload, n: int) -> Ints:
 
 
 def _check_times(seconds: Floats) -> None:
-    """Raise DecodeError if a time is missing or outside the supported range."""
     if not np.all(np.abs(seconds) < T_LIMIT_S):
         raise DecodeError("t: a time is not a Unix time in seconds")

@@ -1,6 +1,6 @@
 """Configuration of zenoh sessions. By default, a session is a peer that does not scout or listen.
 
-This module opens no session. The link, the publisher of the daemon and the command ``watch`` open separate sessions.
+The link, the publisher and the command ``watch`` open separate sessions.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from drivers.credential_masking import mask_secrets
-from drivers.file_access import check_regular
+from drivers.file_access import check_regular_file
 
 if TYPE_CHECKING:
     import zenoh
@@ -49,13 +49,13 @@ PUBLIC_FILES: Final = (
 
 
 def build_session_config(
-    own: Mapping[str, Any], file: str | Path | None = None, defaults: Mapping[str, Any] = DEFAULT_CONFIGURATION
+    overrides: Mapping[str, Any], file: str | Path | None = None, defaults: Mapping[str, Any] = DEFAULT_CONFIGURATION
 ) -> "zenoh.Config":
     """Return the configuration of a session.
 
     Parameters
     ----------
-    own
+    overrides
         Values by configuration key, which take precedence over the file. A value of None is ignored.
     file
         zenoh configuration file. None for the defaults of zenoh.
@@ -78,7 +78,7 @@ def build_session_config(
     for key, value in defaults.items():
         if config.get_json(key) == unchanged.get_json(key):
             config.insert_json5(key, json.dumps(value))
-    for key, value in own.items():
+    for key, value in overrides.items():
         if value is not None:
             config.insert_json5(key, json.dumps(value))
     return config
@@ -87,8 +87,8 @@ def build_session_config(
 def format_zenoh_error(error: Exception) -> str:
     """Return the text of a zenoh error in one line.
 
-    Positions in the source code of zenoh are removed. Quotations from a configuration file are removed as well, since
-    they may contain a password.
+    Source code positions are removed. Quotations from a configuration file are also removed, since a quotation may
+    contain a password.
     """
     text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error))
     text = re.sub(r"\s*-->\s*(\d+):(\d+)\s*\n.*\n\s*=\s*", r"line \1, column \2: ", text, flags=re.DOTALL)
@@ -102,7 +102,7 @@ def format_zenoh_error(error: Exception) -> str:
 
 
 def is_unconnected(session: "zenoh.Session") -> bool:
-    """Return True if the session has no connection. Return False for a closed session."""
+    """Return True if an open session has no connection. Return False for a closed session."""
     import zenoh
 
     with contextlib.suppress(zenoh.ZError):
@@ -111,7 +111,7 @@ def is_unconnected(session: "zenoh.Session") -> bool:
 
 
 def find_connect_endpoints(config: "zenoh.Config") -> tuple[str, ...]:
-    """Return the endpoints to which a session with this configuration connects."""
+    """Return the endpoints to which a session with the given configuration connects."""
     found = json.loads(config.get_json("connect/endpoints"))
     if isinstance(found, dict):
         found = found.get(json.loads(config.get_json("mode")) or "peer", [])
@@ -119,22 +119,21 @@ def find_connect_endpoints(config: "zenoh.Config") -> tuple[str, ...]:
 
 
 def find_secret_files(config: "zenoh.Config") -> tuple[Path, ...]:
-    """Return the files with private keys and passwords, which other users must not be able to read."""
+    """Return the configured files with private keys or passwords, which other users must not be able to read."""
     return _named_files(config, SECRET_FILES)
 
 
 def _named_files(config: "zenoh.Config", keys: Sequence[str] | None = None) -> tuple[Path, ...]:
-    """Return the files in a configuration under ``keys``, or under all keys of files."""
     found = (json.loads(config.get_json(key)) for key in keys or (*SECRET_FILES, *PUBLIC_FILES))
     return tuple(Path(named) for named in found if named)
 
 
 def _check_file(path: Path) -> None:
-    """Raise ZError if the path is not a regular file. zenoh would wait forever if the path were a FIFO."""
+    """Raise ZError if the path is not a regular file. zenoh would wait forever for a FIFO."""
     import zenoh
 
     try:
-        check_regular(path)
+        check_regular_file(path)
     except FileNotFoundError:
         return  # zenoh reports a missing file
     except OSError as error:

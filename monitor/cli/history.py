@@ -55,7 +55,7 @@ def history(
     from drivers.data_types import AXES
     from drivers.recordings.formats import find_format
     from monitor.estimation.fit.coefficient_values import SYMBOLS
-    from monitor.history.history_table import bucket_width_s as width_of
+    from monitor.history.history_table import choose_bucket_width_s as width_of
     from monitor.history.query_parameters import PARTS, HistoryQuery
     from monitor.history.time_ranges import parse_duration_s
     from monitor.publishing.terminal import history_text
@@ -113,11 +113,11 @@ def _from_file(source: Path | None, name: str | None) -> Get:
         raise ConfigError("CONFIG.toml or a folder is needed, or --connect ENDPOINT for a running daemon")
     path = _history_path(source)
     with open_history(path) as reader:
-        device = _select_device(name, list(reader.devices()), str(path))
+        device = _select_device(name, list(reader.list_devices()), str(path))
 
     def get(asked: "HistoryQuery") -> "HistoryTable":
         with open_history(path) as reader:
-            return past.read_history(reader, device, asked.span, asked.selects, asked.step_s)
+            return past.read_history(reader, device, asked.span, asked.selects_column, asked.step_s)
 
     return get
 
@@ -127,7 +127,9 @@ def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str
     from monitor.publishing.zenoh.history_client import query_histories
 
     def get(asked: "HistoryQuery") -> "HistoryTable":
-        found = {one.device: one for one in query_histories(endpoint, name or "*", asked.parameters(), prefix, file)}
+        found = {
+            one.device: one for one in query_histories(endpoint, name or "*", asked.format_parameters(), prefix, file)
+        }
         return found[_select_device(name, list(found), mask_secrets(endpoint or str(file)))]
 
     return get

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from drivers.errors import NotReady
-from drivers.extras import check_extra
+from drivers.extras import require_extra
 from monitor.cli.shared import options, output, service_in_terminal
 
 
@@ -32,7 +32,7 @@ def reconcile(
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
     """Find where recording and model disagree, which effects are missing, and what remains with these effects."""
-    check_extra("reconcile", "reconcile")
+    require_extra("reconcile", "reconcile")
     from rich.console import Console
 
     from monitor.commands import reconcile as reconciling

@@ -137,7 +137,7 @@ def read_model_file(path: Path) -> dict[str, ThermalModel]:
         If the file cannot be read, or if its content is invalid.
     """
     try:
-        found = msgspec.json.decode(file_access.read_small_file(path, pipe=True), type=_ModelFile)
+        found = msgspec.json.decode(file_access.read_small_file(path, allow_pipe=True), type=_ModelFile)
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:

@@ -115,6 +115,6 @@ class HistoryOutput(Output):
         """
         query = parse_query(parameters, time.time())
         with open_history(self.writer.path) as reader:
-            table = read_history(reader, device, query.span, query.selects, query.step_s)
-            newest_s = reader.newest_s(device)
+            table = read_history(reader, device, query.span, query.selects_column, query.step_s)
+            newest_s = reader.newest_result_s(device)
         return HistoryMessage.build_reply(table, query, newest_s, self._received.get(device, 0)).encode()

@@ -1,1 +1,1 @@
-"""Long-term history of the results in one file: rows of one minute, which are merged into wider rows later."""
+"""Long-term history of the results. Rows of one minute are merged into wider rows later."""

@@ -1,13 +1,12 @@
 """Rows of the history: statistics of the results of a device within one time bucket, and merging of rows.
 
-A row has columns such as ``gz.N``, ``gz.sigma.0.1`` and ``temperature`` (see ``columns``). For each column, the row has
-the count, minimum, maximum and last value. Any number of merges preserves the minimum and the maximum exactly. Counters
-(samples received, lost, bad, overflowed) are increments and are added. Values are rounded to float32 (seven digits)
-before they are compared. Rounding preserves the order, so merging adds no error. The module does no I/O.
+A history row has columns such as ``gz.N``, ``gz.sigma.0.1`` and ``temperature`` (see ``column_conversion``). For each
+column, the row contains the count, minimum, maximum and last value. Merging preserves the minimum and the maximum
+exactly, because values are rounded to float32 before the comparison. The counts of samples (received, lost, bad,
+overflowed) are increments, which are added.
 
-In the packed form, the bits of the maximum and of the last value are stored as differences (XOR) from the minimum.
-Bytes of equal significance are grouped and compressed. Values within a minute differ little, so most of these bytes
-are zero.
+In a packed row, the maximum and the last value are stored as bitwise differences (XOR) from the minimum. The bytes are
+grouped by significance and compressed. Most bytes are zero, because values within a minute differ little.
 """
 
 import zlib
@@ -34,7 +33,7 @@ _MAX_N: Final = 2**32 - 1
 
 @dataclass(frozen=True, slots=True)
 class HistoryRow:
-    """Statistics of k columns in the bucket from ``start_s`` to ``start_s + width_s``."""
+    """Statistics of k columns in the time bucket from ``start_s`` to ``start_s + width_s``."""
 
     start_s: int  # Unix time, a multiple of width_s
     width_s: int
@@ -49,16 +48,16 @@ class HistoryRow:
 
     @property
     def end_s(self) -> int:
-        """Unix time at which the bucket ends [s]."""
+        """Unix time of the end of the time bucket [s]."""
         return self.start_s + self.width_s
 
 
 class RunningStatistics:
-    """Running count, minimum, maximum and last value of k columns.
+    """Running count, minimum, maximum and last value of each column.
 
     >>> seen = RunningStatistics(("a", "b"))
     >>> for numbers in ([1.0, 5.0], [3.0, np.nan], [2.0, 4.0]):
-    ...     seen.add(np.array(numbers))
+    ...     seen.add_values(np.array(numbers))
     >>> seen.count.tolist(), seen.minimum.tolist(), seen.maximum.tolist(), seen.last.tolist()
     ([3, 2], [1.0, 4.0], [3.0, 5.0], [2.0, 4.0])
     """
@@ -70,10 +69,10 @@ class RunningStatistics:
         self.maximum: Singles = self.minimum.copy()
         self.last: Singles = self.minimum.copy()
 
-    def add(self, numbers: Floats) -> None:
-        """Update the statistics with one value per column ([k], SI); NaN marks a missing value."""
+    def add_values(self, values: Floats) -> None:
+        """Add one value per column ([k], SI) to the statistics. NaN is a missing value."""
         with np.errstate(over="ignore"):
-            single = numbers.astype(np.float32)
+            single = values.astype(np.float32)
         there = ~np.isnan(single)
         self.count += there
         np.fmin(self.minimum, single, out=self.minimum)
@@ -101,7 +100,6 @@ def select_columns(row: HistoryRow, names: tuple[str, ...]) -> HistoryRow:
 
 @lru_cache(maxsize=64)
 def _column_indices(names: tuple[str, ...], wanted: tuple[str, ...]) -> NDArray[np.int64]:
-    """Return the index of each wanted name in ``names``; -1 for an unknown name."""
     at = {name: i for i, name in enumerate(names)}
     return np.array([at.get(name, -1) for name in wanted], np.int64)
 
@@ -148,30 +146,30 @@ def pack_count_min_max_last(row: HistoryRow) -> bytes:
     return zlib.compress(words.view(np.uint8).reshape(-1, 4).T.tobytes(), 6)
 
 
-def unpack_count_min_max_last(data: bytes, count: int) -> tuple[Ints, Singles, Singles, Singles]:
+def unpack_count_min_max_last(data: bytes, column_count: int) -> tuple[Ints, Singles, Singles, Singles]:
     """Return the count, minimum, maximum and last value of each column in packed bytes.
 
     Parameters
     ----------
     data
         Bytes made by ``pack_count_min_max_last``.
-    count
+    column_count
         Number of columns.
 
     Raises
     ------
     RecordingError
-        If the bytes cannot be decompressed, or do not contain ``count`` columns.
+        If the bytes cannot be decompressed, or do not contain ``column_count`` columns.
     """
-    size = 16 * count
+    size = 16 * column_count
     try:
         raw = zlib.decompressobj().decompress(data, size + 1)
     except zlib.error as error:
         raise RecordingError(f"a row cannot be read: {error}") from error
-    if len(raw) != size or count > MAX_COLUMNS:
-        raise RecordingError(f"a row of {count} numbers has {len(raw)} bytes, not {size}")
+    if len(raw) != size or column_count > MAX_COLUMNS:
+        raise RecordingError(f"a row of {column_count} numbers has {len(raw)} bytes, not {size}")
     bytes_of = np.frombuffer(raw, np.uint8).reshape(4, -1).T
-    words = np.ascontiguousarray(bytes_of).view("<u4").reshape(4, count).astype(np.uint32)
+    words = np.ascontiguousarray(bytes_of).view("<u4").reshape(4, column_count).astype(np.uint32)
     low = words[1]
     return (
         words[0].astype(np.int64),

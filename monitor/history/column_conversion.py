@@ -2,12 +2,11 @@
 
 Each noise coefficient of a measured axis has four columns. For example, ``gz.N`` is the estimated value of N on axis
 gz. ``gz.N.lo`` and ``gz.N.hi`` are the ends of the confidence interval. ``gz.N.bound`` is the upper bound, if the data
-only bound the value. The status of a coefficient follows from the columns that have a value.
+only bound the value.
 
 Allan deviations have columns such as ``gz.sigma.0.3``, for averaging times of 1 and 3 times powers of ten in seconds.
-The averaging times of an estimate depend on the measured rate, so the deviations are interpolated linearly in log-log
-between two neighbouring points. The error is below 1 % for a deviation with five noise terms, half an octave from a
-point. The module does no I/O.
+An Allan deviation is interpolated linearly in log-log between the two neighbouring averaging times of the estimate. The
+interpolation error is below 1 % for a noise model with five terms, half an octave from an averaging time.
 """
 
 from typing import Final
@@ -33,7 +32,7 @@ MAX_TAU_RATIO: Final = 2.5
 
 
 class ColumnConverter:
-    """Converter of estimates into column values, for fixed axes and averaging times.
+    """Converter from estimates to column values, for fixed axes and averaging times.
 
     Parameters
     ----------
@@ -59,13 +58,13 @@ class ColumnConverter:
         )
         self._coefficient_count = len(self._coefficient_indices)
 
-    def is_compatible(self, estimate: Estimate) -> bool:
+    def matches_axes_and_taus(self, estimate: Estimate) -> bool:
         """Return True if an estimate has the same measured axes and averaging times as the first estimate."""
         tau_s = estimate.curve.tau_s
         same = tau_s is self._tau_s or np.array_equal(tau_s, self._tau_s)
         return same and bool((_measured(estimate) == self._measured).all())
 
-    def convert(self, estimate: Estimate) -> Floats:
+    def convert_estimate(self, estimate: Estimate) -> Floats:
         """Return the column values of an estimate ([k], SI) in the order of ``names``; NaN marks a missing value."""
         c, m = estimate.coefficients, self._coefficient_count
         status, hi = c.status.take(self._coefficient_indices), c.hi.take(self._coefficient_indices)
@@ -79,7 +78,6 @@ class ColumnConverter:
         return numbers
 
     def _deviations(self, estimate: Estimate) -> Floats:
-        """Return the interpolated deviations, shape [τ, axes]."""
         with np.errstate(divide="ignore"):  # an axis without noise has a deviation of 0
             log = np.log(estimate.curve.avar[:, self._axes])
         below, above = log[self._below], log[self._above]
@@ -88,13 +86,13 @@ class ColumnConverter:
 
 
 def _measured(estimate: Estimate) -> NDArray[np.bool_]:
-    """Return for each of the six axes whether the axis has a deviation at the shortest averaging time."""
+    """Return a mask of the axes that have an Allan deviation at the shortest averaging time."""
     shortest = estimate.curve.avar[0]
     return np.asarray(~np.isnan(shortest))
 
 
 def _interpolation_points(tau_s: Floats) -> "tuple[list[int], list[int], list[int], Floats]":
-    """Return the usable indices of TAU_S, the points below and above, and the log-distance from below, 0 to 1."""
+    """Return the indices of the available TAU_S, the indices of the neighbours, and the interpolation weights."""
     at, below, above, share = [], [], [], []
     for i, wanted in enumerate(TAU_S):
         near = int(np.argmin(np.abs(np.log(tau_s / wanted)))) if tau_s.size else 0

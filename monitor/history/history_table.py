@@ -1,8 +1,7 @@
 """Reading of the stored results of a time range as a table with a limited number of buckets.
 
 ``read_history`` merges the rows of each bucket while reading, so the memory depends on the number of requested points
-and not on the length of the time range. A bucket is at least as wide as the stored rows in the bucket. Merging (see
-``bucket``) preserves minima and maxima.
+and not on the length of the time range. A bucket is at least as wide as the stored rows.
 """
 
 import math
@@ -34,7 +33,7 @@ BUCKET_WIDTHS_S: Final = (
 
 @dataclass(frozen=True, slots=True)
 class HistoryTable:
-    """History of one device: k columns in p buckets, ordered by time."""
+    """History of one device with k columns in p time buckets."""
 
     device: str
     span: TimeRange  # requested time range, clipped to the stored time range
@@ -56,11 +55,11 @@ class HistoryTable:
 
     @property
     def end_s(self) -> Ints:
-        """Unix time at which each bucket ends [s], shape [p]."""
+        """Unix time of the end of each bucket [s], shape [p]."""
         return self.start_s + self.width_s
 
-    def column(self, name: str) -> "ColumnStatistics":
-        """Return one column over time; all values are missing if the table has no column of this name."""
+    def select_column(self, name: str) -> "ColumnStatistics":
+        """Return the statistics of one column. All values of an unknown column are missing."""
         if name not in self.names:
             nothing: Floats = np.full(len(self), np.nan)
             return ColumnStatistics(np.zeros(len(self), np.int64), nothing, nothing, nothing)
@@ -68,13 +67,13 @@ class HistoryTable:
         parts = [np.asarray(part[:, at], np.float64) for part in (self.low, self.high, self.last)]
         return ColumnStatistics(self.n[:, at], *parts)
 
-    def axes(self) -> tuple[str, ...]:
+    def list_axes(self) -> tuple[str, ...]:
         """Return the axes that have at least one column."""
         found = dict.fromkeys(name.split(".")[0] for name in self.names if "." in name)
         return tuple(found)
 
-    def taus(self) -> tuple[str, ...]:
-        """Return the averaging times of the deviations [s] as written in the column names, in ascending order."""
+    def list_tau_labels(self) -> tuple[str, ...]:
+        """Return the averaging times in the column names of Allan deviations [s], in ascending order."""
         found = {name.split(".sigma.")[1] for name in self.names if ".sigma." in name}
         return tuple(sorted(found, key=float))
 
@@ -93,7 +92,7 @@ def read_history(
     reader: HistoryReader,
     device: str,
     span: TimeRange | None,
-    wanted: Callable[[str], bool] = lambda _name: True,
+    wants_column: Callable[[str], bool] = lambda _name: True,
     step_s: int | None = None,
     points: int = DEFAULT_POINTS,
 ) -> HistoryTable:
@@ -107,8 +106,8 @@ def read_history(
         Name of the device.
     span
         Time range; None for the last stored day.
-    wanted
-        Returns True for the name of a column that is wanted.
+    wants_column
+        Function that returns True for the name of a column to read.
     step_s
         Minimum bucket width [s]; None for the width that follows from ``points``.
     points
@@ -125,18 +124,18 @@ def read_history(
     if held is None:
         raise NotReady(f"{device}: no history yet")
     span = _clip_to_stored(span or TimeRange(held[1] - DAY_S, held[1]), held)
-    step_s = bucket_width_s(
+    step_s = choose_bucket_width_s(
         replace(span, start_s=max(span.start_s, held[0]), end_s=min(span.end_s, held[1])), step_s, points
     )
     parts: dict[tuple[int, int], list[HistoryRow]] = {}
     names: dict[tuple[str, ...], tuple[str, ...]] = {}
-    for key, rows in groupby(reader.rows(device, span), key=lambda row: _bucket(row, step_s)):
+    for key, rows in groupby(reader.read_rows(device, span), key=lambda row: _bucket(row, step_s)):
         one = merge_rows(list(rows), *key)
         if one.names not in names:
-            names[one.names] = tuple(name for name in one.names if wanted(name))
+            names[one.names] = tuple(name for name in one.names if wants_column(name))
         parts.setdefault(key, []).append(select_columns(one, names[one.names]))
     found = [merge_rows(part, *key) for key, part in sorted(parts.items())]
-    events, in_all = reader.events(device, span, MAX_EVENTS)
+    events, in_all = reader.read_events(device, span, MAX_EVENTS)
     if not found and not events:
         raise NotReady(f"{device}: no results in this time range; stored are {_format_range(held)}")
     return build_table(device, span, step_s, found, events, in_all)
@@ -188,12 +187,12 @@ def build_table(
     )
 
 
-def bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
-    """Return the smallest permitted bucket width [s] for a number of points, at least ``step_s``.
+def choose_bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEFAULT_POINTS) -> int:
+    """Return the smallest permitted bucket width [s] for about ``points`` buckets, at least ``step_s``.
 
-    >>> bucket_width_s(TimeRange(0.0, 86_400.0)), bucket_width_s(TimeRange(0.0, 5 * 31_536_000.0))
+    >>> choose_bucket_width_s(TimeRange(0.0, 86_400.0)), choose_bucket_width_s(TimeRange(0.0, 5 * 31_536_000.0))
     (300, 172800)
-    >>> bucket_width_s(TimeRange(0.0, 3600.0), 900)
+    >>> choose_bucket_width_s(TimeRange(0.0, 3600.0), 900)
     900
 
     Parameters
@@ -213,17 +212,15 @@ def bucket_width_s(span: TimeRange, step_s: int | None = None, points: int = DEF
 
 
 def _clip_to_stored(span: TimeRange, held: tuple[float, float]) -> TimeRange:
-    """Clip a time range to the stored time range plus one day, because events may be outside the stored rows."""
+    """Clip a time range to the stored rows plus one day, because events may precede or follow the rows."""
     start_s, end_s = max(span.start_s, held[0] - DAY_S), min(span.end_s, held[1] + DAY_S)
     return replace(span, start_s=min(start_s, end_s), end_s=max(start_s, end_s))
 
 
 def _bucket(row: HistoryRow, step_s: int) -> tuple[int, int]:
-    """Return the start and width [s] of the bucket that contains a row."""
     width_s = max(row.width_s, step_s)
     return row.start_s // width_s * width_s, width_s
 
 
 def _format_range(held: tuple[float, float]) -> str:
-    """Format the stored time range for a message."""
     return f"{format_utc(held[0])} to {format_utc(held[1])} UTC"

@@ -1,9 +1,9 @@
-"""Aggregation of one device's results into rows of one minute, by the time of the samples.
+"""Aggregation of the results of a device into rows of one minute, by the time of the samples.
 
-A row is returned when the first result of the next minute arrives. A result that is slightly late is added to the
-current row. A result from an earlier time begins a new row, for example after the clock was set back or when a
-recording is replayed. The store merges the new row with the stored row. If the process is killed, at most one minute of
-results is lost. The module does no I/O.
+A row is returned when the first result of the next minute arrives. A result that is up to LATE_TOLERANCE_S late is
+added to the current row. A result from an earlier time, for example after the clock was set back, begins a new row.
+``HistoryStore`` merges the new row with the stored row. If the process is killed, at most one minute of results is
+lost.
 """
 
 from typing import Final
@@ -22,7 +22,7 @@ LATE_TOLERANCE_S: Final = 5.0
 
 
 class MinuteAggregator:
-    """Aggregator of one device's results within the current minute."""
+    """Aggregator of the results of a device within the current minute."""
 
     def __init__(self) -> None:
         self._numbers: ColumnConverter | None = None
@@ -36,7 +36,7 @@ class MinuteAggregator:
         self._state = 0
 
     def add_estimate(self, unix_s: float, estimate: Estimate) -> HistoryRow | None:
-        """Add an estimate, and return the completed row if a new row begins.
+        """Add an estimate. Return the previous row if the estimate begins a new row, otherwise None.
 
         Parameters
         ----------
@@ -46,7 +46,7 @@ class MinuteAggregator:
             Estimate to add.
         """
         full = self._advance(unix_s)
-        if self._numbers is None or not self._numbers.is_compatible(estimate):
+        if self._numbers is None or not self._numbers.matches_axes_and_taus(estimate):
             self._numbers = ColumnConverter(estimate)
         if self._estimates is not None and self._estimates.names != self._numbers.names:
             start_s = self._start_s
@@ -54,11 +54,11 @@ class MinuteAggregator:
             self._start_s, self._newest_s = start_s, unix_s
         if self._estimates is None:
             self._estimates = RunningStatistics(self._numbers.names)
-        self._estimates.add(self._numbers.convert(estimate))
+        self._estimates.add_values(self._numbers.convert_estimate(estimate))
         return full
 
     def add_temperature(self, unix_s: float, temperature_c: Floats) -> HistoryRow | None:
-        """Add the mean temperature of a batch, and return the completed row if a new row begins.
+        """Add the mean temperature of a batch. Return the previous row if the batch begins a new row, otherwise None.
 
         Parameters
         ----------
@@ -71,11 +71,11 @@ class MinuteAggregator:
         if not there.size:
             return None
         full = self._advance(unix_s)
-        self._temperature.add(np.array([there.mean()]))
+        self._temperature.add_values(np.array([there.mean()]))
         return full
 
     def add_health(self, unix_s: float, health: Health) -> HistoryRow | None:
-        """Add a health report, and return the completed row if a new row begins.
+        """Add a health report. Return the previous row if the report begins a new row, otherwise None.
 
         Parameters
         ----------
@@ -86,7 +86,7 @@ class MinuteAggregator:
         """
         full = self._advance(unix_s)
         known = [np.nan if one is None else float(one) for one in (health.rate_hz, health.latency_p99_s)]
-        self._health.add(np.array([*known, float(health.memory_bytes)]))
+        self._health.add_values(np.array([*known, float(health.memory_bytes)]))
         counted = (health.received, health.lost, health.bad, health.overflowed)
         # a counter below the previous value was restarted from zero
         more = tuple(
@@ -99,11 +99,11 @@ class MinuteAggregator:
         return full
 
     def flush(self) -> HistoryRow | None:
-        """Close the current, incomplete row and return it; None if there were no results."""
+        """Close and return the current incomplete row; None if there are no results."""
         return self._close_row() if self._start_s is not None else None
 
     def _advance(self, unix_s: float) -> HistoryRow | None:
-        """Advance to the minute of ``unix_s``, and return the row of the previous minute if it is complete."""
+        """Advance to the minute of ``unix_s``. Return the previous row if a new row begins, otherwise None."""
         start_s = int(unix_s // MINUTE_S) * MINUTE_S
         if self._start_s is not None and self._start_s - LATE_TOLERANCE_S <= unix_s < self._start_s + MINUTE_S:
             self._newest_s = max(self._newest_s, min(unix_s, self._start_s + MINUTE_S))
@@ -113,7 +113,6 @@ class MinuteAggregator:
         return full
 
     def _close_row(self) -> HistoryRow:
-        """Close the current row and return it."""
         sources = (self._estimates, self._health, self._temperature)
         parts = [one for one in sources if one is not None and one.count.any()] or [self._health]
         assert self._start_s is not None

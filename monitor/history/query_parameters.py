@@ -1,8 +1,8 @@
 """Query of a device's history, parsed from the parameters of a zenoh selector.
 
 Parameters are ``_time=[…]`` (default: the last day), ``step=15min``, ``what=coefficients,deviations,status,events``,
-``axis=gz,gx`` and ``letter=N,B``. Other parameters that begin with ``_`` are parameters of zenoh and are ignored. Any
-other parameter raises a ConfigError. The module does no I/O.
+``axis=gz,gx`` and ``letter=N,B``. Other parameters that begin with ``_`` belong to zenoh and are ignored. Any other
+parameter raises ConfigError.
 """
 
 import re
@@ -32,7 +32,7 @@ _PART: Final = re.compile(r"([^=;]+)(?:=((?:[\[\]][^\[\]]*[\[\]])|[^;]*))?(?:;|$
 
 @dataclass(frozen=True, slots=True)
 class HistoryQuery:
-    """Query with time range, bucket width, and the requested parts, axes and coefficients."""
+    """Query of a history by time range, bucket width, parts, axes and coefficients."""
 
     span: TimeRange | None = None  # None: the last day of the stored history
     step_s: int | None = None  # None: chosen by the reader
@@ -40,11 +40,11 @@ class HistoryQuery:
     axes: tuple[str, ...] = AXES
     symbols: tuple[str, ...] = SYMBOLS
 
-    def selects(self, name: str) -> bool:
-        """Return True if the query requests the column ``name`` (see ``columns``).
+    def selects_column(self, name: str) -> bool:
+        """Return True if the query requests the column ``name``.
 
         >>> query = HistoryQuery(axes=("gz",))
-        >>> query.selects("gz.N.lo"), query.selects("gx.N"), HistoryQuery().selects("rate")
+        >>> query.selects_column("gz.N.lo"), query.selects_column("gx.N"), HistoryQuery().selects_column("rate")
         (True, False, True)
         """
         axis, _, rest = name.partition(".")
@@ -55,14 +55,15 @@ class HistoryQuery:
         symbol = rest.split(".")[0]
         return DEVIATIONS in self.what if symbol == "sigma" else COEFFICIENTS in self.what and symbol in self.symbols
 
-    def parameters(self) -> str:
+    def format_parameters(self) -> str:
         """Format the query as the parameters of a zenoh selector.
 
-        >>> HistoryQuery(TimeRange(0.0, float("inf"), end_included=False), 900, ("status",), ("gz",)).parameters()
-        '_time=[1970-01-01T00:00:00.000000Z..[;step=900s;what=status;axis=gz;letter=Q,N,B,K,R'
+        >>> day = TimeRange(0.0, 86400.0, end_included=False)
+        >>> HistoryQuery(day, 900, ("status",), ("gz",)).format_parameters()
+        '_time=[1970-01-01T00:00:00.000000Z..1970-01-02T00:00:00.000000Z[;step=900s;what=status;axis=gz;letter=Q,N,B,K,R'
         """
         parts = {
-            "_time": "" if self.span is None else self.span.to_zenoh(),
+            "_time": "" if self.span is None else self.span.format_for_zenoh(),
             "step": "" if self.step_s is None else f"{self.step_s}s",
             "what": ",".join(self.what),
             "axis": ",".join(self.axes),
@@ -113,7 +114,6 @@ def _split(parameters: str) -> Mapping[str, str]:
 
 
 def _parse_list(key: str, text: str, known: tuple[str, ...]) -> tuple[str, ...]:
-    """Return the words of a comma-separated list, in the order of ``known``."""
     words = [word.strip() for word in text.split(",") if word.strip()]
     for word in words:
         if word not in known:

@@ -1,13 +1,13 @@
 """History file: one SQLite file in WAL mode, with one writer and any number of readers in threads and processes.
 
 Rows have three widths: one minute for a week, 15 minutes for three months, and six hours for all earlier times. The age
-of a row is counted from the newest row of the device, or from the current time if that row is in the future.
+of a row is measured from the newest row of the device, or from the current time if the current time is earlier.
 ``HistoryStore.merge_old_rows`` merges the rows of one wider bucket per transaction, so each moment belongs to exactly
-one row even if the process is killed. A row for an existing bucket is merged with the stored row. Restarts, late rows
-and repeated replays therefore leave one row per bucket.
+one row even if the process is killed. A row for an existing bucket is merged with the stored row, so restarts and
+repeated replays create no duplicate rows.
 
-A file that is damaged, was written by a newer version, or is not a history is never modified. RecordingError states the
-reason. Errors of a full or read-only disk are raised as ``sqlite3.Error``. A transaction is complete or has no effect.
+RecordingError is raised for a file that is damaged, has a newer version or is not a history. Such a file is never
+modified. ``sqlite3.Error`` is raised if the disk is full or read-only.
 """
 
 import contextlib
@@ -23,7 +23,7 @@ from typing import Any, Final
 import msgspec
 
 from drivers.errors import RecordingError
-from drivers.file_access import check_folder_or_absent, check_regular
+from drivers.file_access import check_folder_or_absent, check_regular_file
 from drivers.number_ranges import DAY_S
 from monitor.history.bucket import (
     MAX_COLUMNS,
@@ -37,7 +37,7 @@ from monitor.history.stored_events import (
     MAX_EVENTS,
     THINNING_SPANS_S,
     StoredEvent,
-    clamp_time,
+    clamp_to_sqlite_range,
     count_events,
     insert_event,
     read_events,
@@ -83,11 +83,11 @@ _FileState = tuple[int, int, int, int]
 
 
 class UnusableHistory(RecordingError):
-    """Error: the history file is damaged or is not a history."""
+    """The history file is damaged or is not a history."""
 
 
 class HistoryStore:
-    """Writer of a history file, for one thread.
+    """Writer of a history file. Only one thread may use a writer.
 
     Parameters
     ----------
@@ -125,7 +125,6 @@ class HistoryStore:
             raise
 
     def _prepare(self) -> None:
-        """Create the tables if the file is empty, and set the options of the connection."""
         if not _is_history(self._db, self.path):
             self._db.execute("PRAGMA journal_mode = WAL")
             with self._transaction():
@@ -138,7 +137,9 @@ class HistoryStore:
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
 
-    def add(self, rows: Sequence[tuple[str, HistoryRow]], events: Sequence[tuple[str, StoredEvent]] = ()) -> None:
+    def write_rows_and_events(
+        self, rows: Sequence[tuple[str, HistoryRow]], events: Sequence[tuple[str, StoredEvent]] = ()
+    ) -> None:
         """Write rows and events in one transaction.
 
         Parameters
@@ -162,14 +163,14 @@ class HistoryStore:
                 insert_event(self._db, self._device_id(device), event)
         self._files = _file_states(self.path)
 
-    def merge_old_rows(self, now_s: float, at_most: int = 100) -> int:
-        """Merge rows that are old enough, and return the number of merged buckets.
+    def merge_old_rows(self, now_s: float, max_buckets: int = 100) -> int:
+        """Merge old rows into wider rows, and return the number of merged buckets.
 
         Parameters
         ----------
         now_s
             Current Unix time [s].
-        at_most
+        max_buckets
             Largest number of buckets to merge in this call.
 
         Raises
@@ -189,16 +190,16 @@ class HistoryStore:
                 for (width_s, age_s), (wider_s, _) in pairwise(LEVELS):
                     assert age_s is not None
                     limit_s = (age_from_s - age_s) // wider_s * wider_s
-                    while done < at_most and self._merge_oldest(device, width_s, wider_s, limit_s):
+                    while done < max_buckets and self._merge_oldest(device, width_s, wider_s, limit_s):
                         done += 1
         if done:
             self._files = _file_states(self.path)
         return done
 
     def describe_external_change(self) -> str:
-        """Return how another program has changed the file since the last use of this store; "" if unchanged.
+        """Return a description of the change that another program made to the history file; "" if there is no change.
 
-        SQLite does not detect such changes and would continue to write to a deleted file.
+        Without this check, SQLite would continue to write to a deleted file.
         """
         now = _file_states(self.path)
         if now == self._files:
@@ -211,10 +212,11 @@ class HistoryStore:
         return CHANGED if file[2] else EMPTIED
 
     def close(self) -> None:
-        """Close the connection. Without readers, SQLite merges the write-ahead log into the file.
+        """Close the history file.
 
-        SQLite does not merge the log if the file was deleted or renamed, so this method does. If another program has
-        overwritten the file, SQLite would apply the log to the new content, so this method empties the log.
+        SQLite does not merge the write-ahead log of a deleted or renamed file, so the method merges the log. The method
+        empties the log if another program has overwritten the file, since SQLite would apply the log to the new
+        content.
         """
         before, now = self._files[0], _file_states(self.path)[0]
         if before is not None and (now is None or now[:2] != before[:2]):
@@ -228,7 +230,7 @@ class HistoryStore:
     # --- rows
 
     def _put(self, device: int, row: HistoryRow) -> None:
-        """Merge a row into the stored row of its bucket, or into the wider row that contains the bucket."""
+        """Store a row. If a stored row covers the same bucket, merge the two rows."""
         for width_s, _ in LEVELS[::-1]:
             start_s = row.start_s // width_s * width_s
             held = self._stored_row(device, width_s, start_s)
@@ -238,30 +240,28 @@ class HistoryStore:
         self._write(device, row)
 
     def _stored_row(self, device: int, width_s: int, start_s: int) -> HistoryRow | None:
-        """Return the stored row of a bucket; None if there is none."""
         found = self._db.execute(
             f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start = ?", (device, width_s, start_s)
         ).fetchone()
-        return None if found is None else self._layouts.row(found)
+        return None if found is None else self._layouts.parse_row(found)
 
     def _write(self, device: int, row: HistoryRow) -> None:
-        """Insert a row, or replace the stored row of the same bucket."""
         self._db.execute(
             f"INSERT OR REPLACE INTO row (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (
-                *(device, row.start_s, row.width_s, row.newest_s, self._layouts.id(row.names)),
+                *(device, row.start_s, row.width_s, row.newest_s, self._layouts.layout_id(row.names)),
                 *(*row.counts, row.state, pack_count_min_max_last(row)),
             ),
         )
 
     def _newest_end_s(self) -> dict[int, float]:
-        """Return the end of the newest row of each device (Unix time); -inf without rows."""
+        """Return the end of the newest row of each device in Unix seconds; -inf if a device has no rows."""
         devices = [one for (one,) in self._db.execute("SELECT id FROM device").fetchall()]
         spans = {device: _stored_span(self._db, device) for device in devices}
         return {device: -math.inf if span is None else span[1] for device, span in spans.items()}
 
     def _merge_oldest(self, device: int, width_s: int, wider_s: int, limit_s: float) -> bool:
-        """Merge the oldest rows into a wider bucket that ends by ``limit_s``; return True if rows were merged."""
+        """Merge the oldest rows into a wider row. Return False if the wider row would end after ``limit_s``."""
         oldest = self._db.execute(
             "SELECT min(start) FROM row WHERE device = ? AND width = ?", (device, width_s)
         ).fetchone()[0]
@@ -274,14 +274,14 @@ class HistoryStore:
         where = "device = ? AND width = ? AND start >= ? AND start < ?"
         with self._transaction():
             found = self._db.execute(f"SELECT {_FIELDS} FROM row WHERE {where} ORDER BY start", bucket).fetchall()
-            rows = [self._layouts.row(one) for one in found]
+            rows = [self._layouts.parse_row(one) for one in found]
             held = self._stored_row(device, wider_s, start_s)
             self._write(device, merge_rows([*([held] if held else []), *rows], start_s, wider_s))
             self._db.execute(f"DELETE FROM row WHERE {where}", bucket)
         return True
 
     def _thin_events(self, device: int) -> None:
-        """Thin the events of a device by day, month and year until half of the limit remains."""
+        """Thin the events of a device by day, month and year until at most half of MAX_EVENTS remain."""
         for span_s in THINNING_SPANS_S:
             with self._transaction():
                 thin_events(self._db, device, span_s)
@@ -291,7 +291,6 @@ class HistoryStore:
     # --- internal
 
     def _device_id(self, name: str) -> int:
-        """Return the identifier of a device. A new device gets a new identifier."""
         if name not in self._devices:
             self._devices[name] = _identifier(self._db, "device", "name", name)
         return self._devices[name]
@@ -302,22 +301,20 @@ class HistoryStore:
         if version != self._version:
             self._version = version
             self._devices.clear()
-            self._layouts.forget()
+            self._layouts.clear()
 
     def _committed_by_others(self) -> bool:
-        """Return True if another SQLite connection has changed the file; False if the file has been overwritten."""
         try:
             return self._data_version() != self._version
         except sqlite3.Error:
             return False
 
     def _data_version(self) -> int:
-        """Return a number that changes with every commit of another connection."""
+        """Return a version number that changes with every commit of another connection."""
         return int(self._db.execute("PRAGMA data_version").fetchone()[0])
 
     @contextlib.contextmanager
     def _transaction(self) -> Iterator[None]:
-        """Run the body in one transaction, which is rolled back after an exception."""
         self._db.execute("BEGIN IMMEDIATE")
         try:
             self._refresh_identifiers()
@@ -325,36 +322,36 @@ class HistoryStore:
             self._db.execute("COMMIT")
         except BaseException:
             self._devices.clear()  # identifiers created in this transaction may no longer exist
-            self._layouts.forget()
+            self._layouts.clear()
             if self._db.in_transaction:
                 self._db.execute("ROLLBACK")
             raise
 
 
 class HistoryReader:
-    """Reader of a history file, created by ``open_history``. All results show the file at one moment."""
+    """Reader of a history file. All results refer to the moment at which ``open_history`` opened the file."""
 
     def __init__(self, db: sqlite3.Connection, path: Path) -> None:
         self._db = db
         self.path = path
         self._layouts = _LayoutCache(db)
 
-    def devices(self) -> tuple[str, ...]:
-        """Return the names of all devices in the file, sorted."""
+    def list_devices(self) -> tuple[str, ...]:
+        """Return the sorted names of all devices in the history file."""
         return tuple(name for (name,) in self._db.execute("SELECT name FROM device ORDER BY name"))
 
     def stored_range(self, device: str) -> tuple[float, float] | None:
-        """Return the start and end of the stored rows of a device (Unix time [s]); None without rows."""
+        """Return the start and end of the stored rows of a device in Unix seconds; None if there are no rows."""
         return _stored_span(self._db, self._id(device))
 
-    def newest_s(self, device: str) -> float:
-        """Return the Unix time of the newest result of a device [s]; NaN without rows."""
+    def newest_result_s(self, device: str) -> float:
+        """Return the Unix time of the newest result of a device [s]; NaN if there are no rows."""
         query = "SELECT newest FROM row WHERE device = ? AND width = ? ORDER BY start DESC LIMIT 1"
         found = [self._db.execute(query, (self._id(device), width_s)).fetchone() for width_s, _ in LEVELS]
         return max((one[0] for one in found if one is not None), default=math.nan)
 
-    def rows(self, device: str, span: TimeRange) -> Iterator[HistoryRow]:
-        """Iterate over the rows that overlap a time range: wide rows first, rows of one width in order of time.
+    def read_rows(self, device: str, span: TimeRange) -> Iterator[HistoryRow]:
+        """Yield the rows that overlap a time range, wide rows first. Rows of one width are in order of time.
 
         Parameters
         ----------
@@ -366,15 +363,20 @@ class HistoryReader:
         for width_s, _ in LEVELS[::-1]:
             found = self._db.execute(
                 f"SELECT {_FIELDS} FROM row WHERE device = ? AND width = ? AND start > ? AND start <= ? ORDER BY start",
-                (self._id(device), width_s, clamp_time(span.start_s - width_s), clamp_time(span.end_s)),
+                (
+                    self._id(device),
+                    width_s,
+                    clamp_to_sqlite_range(span.start_s - width_s),
+                    clamp_to_sqlite_range(span.end_s),
+                ),
             )
             for one in found:
-                row = self._layouts.row(one)
+                row = self._layouts.parse_row(one)
                 if span.overlaps(row.start_s, row.end_s):
                     yield row
 
-    def events(self, device: str, span: TimeRange, at_most: int) -> tuple[list[StoredEvent], int]:
-        """Return the newest events in a time range, in order of time, and the number of all events in this range.
+    def read_events(self, device: str, span: TimeRange, max_events: int) -> tuple[list[StoredEvent], int]:
+        """Return the newest events in a time range in order of time, and the total number of events in the range.
 
         Parameters
         ----------
@@ -382,20 +384,19 @@ class HistoryReader:
             Name of the device.
         span
             Time range.
-        at_most
+        max_events
             Largest number of events to return.
         """
-        return read_events(self._db, self._id(device), span, at_most)
+        return read_events(self._db, self._id(device), span, max_events)
 
     def _id(self, device: str) -> int:
-        """Return the identifier of a device; -1 if the file does not contain the device."""
         found = self._db.execute("SELECT id FROM device WHERE name = ?", (device,)).fetchone()
         return -1 if found is None else int(found[0])
 
 
 @contextlib.contextmanager
 def open_history(path: Path) -> Iterator[HistoryReader]:
-    """Open a history file for reading, without changing it.
+    """Open a history file for reading. The file is not modified.
 
     Raises
     ------
@@ -420,7 +421,6 @@ def open_history(path: Path) -> Iterator[HistoryReader]:
 
 
 def _stored_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | None:
-    """Return the start and end of the rows of a device, each by one index lookup."""
     starts: list[int] = []
     ends: list[int] = []
     for width_s, _ in LEVELS:
@@ -433,7 +433,7 @@ def _stored_span(db: sqlite3.Connection, device: int) -> tuple[float, float] | N
 
 
 def _is_history(db: sqlite3.Connection, path: Path) -> bool:
-    """Return True for a history and False for an empty database; raise an error for any other database."""
+    """Return True for a history and False for an empty database. Raise RecordingError for any other database."""
     (version,), (application,) = (
         db.execute(f"PRAGMA {what}").fetchone() for what in ("user_version", "application_id")
     )
@@ -451,27 +451,27 @@ def _is_history(db: sqlite3.Connection, path: Path) -> bool:
 
 
 class _LayoutCache:
-    """Cache of layouts. A layout is a tuple of column names, which the file stores once under an identifier."""
+    """Cache of layouts. A layout is a tuple of column names, which the history file stores once with an identifier."""
 
     def __init__(self, db: sqlite3.Connection) -> None:
         self._db = db
         self._ids: dict[tuple[str, ...], int] = {}
         self._names: dict[int, tuple[str, ...]] = {}
 
-    def forget(self) -> None:
+    def clear(self) -> None:
         """Clear the cache."""
         self._ids.clear()
         self._names.clear()
 
-    def id(self, names: tuple[str, ...]) -> int:
-        """Return the identifier of a layout. A new layout gets a new identifier."""
+    def layout_id(self, names: tuple[str, ...]) -> int:
+        """Return the identifier of a layout. A new layout is inserted."""
         if names not in self._ids:
             self._ids[names] = _identifier(self._db, "layout", "names", " ".join(names))
         return self._ids[names]
 
-    def row(self, found: Sequence[Any]) -> HistoryRow:
-        """Convert a record of the database into a row."""
-        start, width, newest, layout, received, lost, bad, overflowed, state, data = found
+    def parse_row(self, record: Sequence[Any]) -> HistoryRow:
+        """Convert a database record to a history row."""
+        start, width, newest, layout, received, lost, bad, overflowed, state, data = record
         whole = (start, width, layout, received, lost, bad, overflowed, state)
         if not (all(isinstance(one, int) for one in whole) and isinstance(newest, float) and isinstance(data, bytes)):
             raise RecordingError("a row has fields of another kind")
@@ -488,13 +488,12 @@ class _LayoutCache:
 
 
 def _identifier(db: sqlite3.Connection, table: str, column: str, text: str) -> int:
-    """Return the identifier of a text in a table. A new text is inserted."""
     db.execute(f"INSERT OR IGNORE INTO {table} ({column}) VALUES (?)", (text,))
     return int(db.execute(f"SELECT id FROM {table} WHERE {column} = ?", (text,)).fetchone()[0])
 
 
 def _open_read_only(path: Path) -> sqlite3.Connection:
-    """Open a file for reading. Without a log and without write access to the folder, open it as immutable."""
+    """Open a database for reading, as immutable if there is no log and the folder is not writable."""
     uri = f"{path.resolve().as_uri()}?mode=ro"
     db = sqlite3.connect(uri, uri=True, timeout=BUSY_TIMEOUT_S, isolation_level=None)
     try:
@@ -508,7 +507,7 @@ def _open_read_only(path: Path) -> sqlite3.Connection:
 
 
 def _file_states(path: Path) -> tuple[_FileState | None, _FileState | None]:
-    """Return the state of the file and of its log; None for a missing file, or a missing or empty log."""
+    """Return the states of the database and of the write-ahead log; None for a missing file or an empty log."""
     found: list[_FileState | None] = []
     for one in (path, Path(f"{path}-wal")):
         try:
@@ -522,15 +521,14 @@ def _file_states(path: Path) -> tuple[_FileState | None, _FileState | None]:
 
 
 def _check_files(path: Path) -> None:
-    """Raise OSError if the file, or an additional file of the database, is not a regular file."""
     for end in ("", *SQLITE_SUFFIXES):
         with contextlib.suppress(FileNotFoundError):
-            check_regular(Path(f"{path}{end}"))
+            check_regular_file(Path(f"{path}{end}"))
 
 
 @contextlib.contextmanager
 def _damage_as_unusable(path: Path) -> Iterator[None]:
-    """Raise UnusableHistory for a damaged file. Temporary errors (busy, full, read-only) are not changed."""
+    """Convert errors of a damaged file to UnusableHistory. Temporary errors are not converted."""
     try:
         yield
     except sqlite3.OperationalError:

@@ -1,7 +1,7 @@
 """Events of a history file: insertion, reading and thinning.
 
 If a device has more than MAX_EVENTS events, only the first, the last and the most significant event of each kind, axis
-and day are kept. If too many events remain, only three per month, and then only three per year, are kept in this way.
+and day are kept. If more than half of MAX_EVENTS remain, the same is done for each month, and then for each year.
 ``represented_events`` of the last event includes the number of deleted events.
 """
 
@@ -33,47 +33,49 @@ class StoredEvent:
     text: str
     axis: str | None = None
     what: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    since_s: float | None = None  # Unix time at which the reported condition began
+    since_s: float | None = None  # Unix time of the beginning of the reported condition
     sigma: float | None = None
     represented_events: int = 1  # this event, and deleted earlier events of the same kind
 
 
-def insert_event(db: sqlite3.Connection, device: int, event: StoredEvent) -> None:
+def insert_event(db: sqlite3.Connection, device_id: int, event: StoredEvent) -> None:
     """Insert an event into the history file.
 
     Parameters
     ----------
     db
         Connection to the history file.
-    device
+    device_id
         Identifier of the device.
     event
         Event to insert.
     """
     text, values = event.text[:MAX_TEXT_LENGTH], _encode_values(event.what)
     fields = (event.t_s, event.kind, text, event.axis, values, event.since_s, event.sigma, event.represented_events)
-    db.execute(f"INSERT INTO event (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", (device, *fields))
+    db.execute(f"INSERT INTO event (device, {_FIELDS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", (device_id, *fields))
 
 
-def read_events(db: sqlite3.Connection, device: int, span: TimeRange, at_most: int) -> tuple[list[StoredEvent], int]:
-    """Return the newest events in a time range, in order of time, and the number of all events in this range.
+def read_events(
+    db: sqlite3.Connection, device_id: int, span: TimeRange, max_events: int
+) -> tuple[list[StoredEvent], int]:
+    """Return the newest events in a time range in order of time, and the total number of events in the range.
 
     Parameters
     ----------
     db
         Connection to the history file.
-    device
+    device_id
         Identifier of the device.
     span
         Time range.
-    at_most
+    max_events
         Largest number of events to return.
     """
     where = "device = ? AND t >= ? AND t <= ?"
-    bounds = (device, clamp_time(span.start_s), clamp_time(span.end_s))
+    bounds = (device_id, clamp_to_sqlite_range(span.start_s), clamp_to_sqlite_range(span.end_s))
     found = db.execute(
         f"SELECT {_FIELDS} FROM event WHERE {where} ORDER BY t DESC, id DESC LIMIT ?",
-        (*bounds, at_most + 2),  # events exactly at the ends may be excluded by the time range
+        (*bounds, max_events + 2),  # events exactly at the ends may be excluded by the time range
     ).fetchall()
     events = [
         StoredEvent(t, kind, text, axis, _decode_values(values), *rest)
@@ -81,40 +83,40 @@ def read_events(db: sqlite3.Connection, device: int, span: TimeRange, at_most: i
         if span.contains(t)
     ]
     (count,) = db.execute(f"SELECT count(*) FROM event WHERE {where}", bounds).fetchone()
-    return events[:at_most][::-1], max(int(count), len(events[:at_most]))
+    return events[:max_events][::-1], max(int(count), len(events[:max_events]))
 
 
-def count_events(db: sqlite3.Connection, device: int) -> int:
+def count_events(db: sqlite3.Connection, device_id: int) -> int:
     """Return the number of stored events of a device.
 
     Parameters
     ----------
     db
         Connection to the history file.
-    device
+    device_id
         Identifier of the device.
     """
-    return int(db.execute("SELECT count(*) FROM event WHERE device = ?", (device,)).fetchone()[0])
+    return int(db.execute("SELECT count(*) FROM event WHERE device = ?", (device_id,)).fetchone()[0])
 
 
-def thin_events(db: sqlite3.Connection, device: int, span_s: int) -> None:
-    """Keep only the first, last and most significant event of each kind, axis and time range.
+def thin_events(db: sqlite3.Connection, device_id: int, interval_s: int) -> None:
+    """Delete all events except the first, last and most significant event of each kind, axis and time range.
 
     Parameters
     ----------
     db
         Connection to the history file.
-    device
+    device_id
         Identifier of the device.
-    span_s
+    interval_s
         Length of the time ranges [s].
     """
     groups: dict[tuple[Any, ...], list[tuple[Any, ...]]] = {}
     rows = db.execute(
-        "SELECT id, t, kind, axis, sigma, stands_for FROM event WHERE device = ? ORDER BY t, id", (device,)
+        "SELECT id, t, kind, axis, sigma, stands_for FROM event WHERE device = ? ORDER BY t, id", (device_id,)
     )
     for one in rows:
-        groups.setdefault((int(one[1] // span_s), one[2], one[3]), []).append(one)
+        groups.setdefault((int(one[1] // interval_s), one[2], one[3]), []).append(one)
     for group in groups.values():
         most_significant = max(group, key=lambda one: -math.inf if one[4] is None else one[4])
         kept = {group[0][0], most_significant[0], group[-1][0]}
@@ -125,19 +127,18 @@ def thin_events(db: sqlite3.Connection, device: int, span_s: int) -> None:
             db.execute("UPDATE event SET stands_for = stands_for + ? WHERE id = ?", (more, group[-1][0]))
 
 
-def clamp_time(t_s: float) -> float:
-    """Clamp a time to the range that SQLite can compare."""
+def clamp_to_sqlite_range(t_s: float) -> float:
+    """Clamp a time to ±1e18 s for comparisons in SQLite."""
     return max(min(t_s, 1e18), -1e18)
 
 
 def _encode_values(what: Mapping[str, Mapping[str, float]]) -> str:
-    """Encode event values as JSON, with null for NaN. If the JSON is too long, return ``{}``."""
+    """Encode event values as JSON, with null for NaN. Values that are too long are replaced by ``{}``."""
     text = msgspec.json.encode(what).decode()
     return text if len(text) <= MAX_TEXT_LENGTH else "{}"
 
 
 def _decode_values(text: str) -> dict[str, dict[str, float]]:
-    """Decode event values from JSON, with NaN for null."""
     found = msgspec.json.decode(text, type=dict[str, dict[str, float | None]])
     return {
         name: {key: math.nan if one is None else one for key, one in sides.items()} for name, sides in found.items()

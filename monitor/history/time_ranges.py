@@ -1,9 +1,9 @@
-"""Parsing and formatting of times, durations and time ranges, as users and zenoh write them.
+"""Parsing and formatting of times, durations and time ranges. Results are Unix times in seconds.
 
-A selector of zenoh has ``_time=[<start>..<end>]`` or ``_time=[<start>;<duration>]``. The start or the end may be
-omitted. A bracket that points outwards excludes this end of the range. Times are ``now()``, ``now(-1h)`` or RFC 3339
-times in UTC. Users write ``-1d``, ``2026-11-20``, ``2026-11-20 14:30`` (UTC) or ``now``. For any other text, a
-ConfigError lists valid examples. Results are Unix times in seconds. The module does no I/O.
+A selector of zenoh contains ``_time=[<start>..<end>]`` or ``_time=[<start>;<duration>]``. The start or the end may be
+omitted. A bracket that points outwards excludes the start or the end from the range. Times in a selector are ``now()``,
+``now(-1h)`` or RFC 3339 times in UTC. Times in options are ``-1d``, ``2026-11-20``, ``2026-11-20 14:30`` (UTC) or
+``now``.
 """
 
 import math
@@ -37,7 +37,7 @@ _NOW: Final = re.compile(r"now\(\s*([+-]?)\s*([^)]*)\)")
 
 @dataclass(frozen=True, slots=True)
 class TimeRange:
-    """Time range from ``start_s`` to ``end_s`` in Unix seconds. A range without start or end is infinite there.
+    """Time range from ``start_s`` to ``end_s`` in Unix seconds. The start or the end may be infinite.
 
     >>> TimeRange(10.0, 20.0).contains(20.0), TimeRange(10.0, 20.0, end_included=False).contains(20.0)
     (True, False)
@@ -54,8 +54,8 @@ class TimeRange:
         before = t_s <= self.end_s if self.end_included else t_s < self.end_s
         return after and before
 
-    def to_zenoh(self) -> str:
-        """Return the range in the notation of zenoh. A time before 1970 or after 9999 is omitted."""
+    def format_for_zenoh(self) -> str:
+        """Format the time range for a zenoh selector. Times before 1970 or after 9999 are omitted."""
         ends = [
             "" if not 0.0 <= one < MAX_DATE_S else f"{datetime.fromtimestamp(one, UTC):%Y-%m-%dT%H:%M:%S.%fZ}"
             for one in (self.start_s, self.end_s)
@@ -63,7 +63,7 @@ class TimeRange:
         return f"{'[' if self.start_included else ']'}{'..'.join(ends)}{']' if self.end_included else '['}"
 
     def overlaps(self, start_s: float, end_s: float) -> bool:
-        """Return True if the range overlaps the row from ``start_s`` (included) to ``end_s`` (excluded).
+        """Return True if the time range overlaps a row from ``start_s`` (included) to ``end_s`` (excluded).
 
         >>> TimeRange(60.0, 120.0).overlaps(0.0, 60.0), TimeRange(60.0, 120.0).overlaps(120.0, 180.0)
         (False, True)
@@ -119,7 +119,7 @@ def parse_zenoh_range(text: str, now_s: float) -> TimeRange:
 
 
 def parse_time(text: str, now_s: float) -> float:
-    """Parse a time that a user has written, and return Unix time [s].
+    """Parse a time in a command option, and return the Unix time [s].
 
     >>> parse_time("-1d", 90_000.0), parse_time("1970-01-02", 0.0), parse_time("1970-01-01T00:01:30Z", 0.0)
     (3600.0, 86400.0, 90.0)
@@ -147,7 +147,7 @@ def parse_time(text: str, now_s: float) -> float:
 
 
 def parse_duration_s(text: str) -> float:
-    """Parse a duration above zero, and return the seconds.
+    """Parse a positive duration, and return the duration in seconds.
 
     >>> parse_duration_s("15min"), parse_duration_s("1d"), parse_duration_s("90")
     (900.0, 86400.0, 90.0)
@@ -164,7 +164,7 @@ def parse_duration_s(text: str) -> float:
 
 
 def _zenoh_time(text: str, now_s: float) -> float:
-    """Return the Unix time of an RFC 3339 time or of ``now(±duration)``."""
+    """Parse an RFC 3339 time or ``now(±duration)``, and return the Unix time [s]."""
     text = text.strip()
     match = _NOW.fullmatch(text)
     if match is None:
@@ -174,7 +174,7 @@ def _zenoh_time(text: str, now_s: float) -> float:
 
 
 def _instant(text: str) -> float:
-    """Parse an RFC 3339 time. A date means midnight, and a time without an offset means UTC."""
+    """Parse an RFC 3339 time. A date without a time is midnight, and a time without an offset is in UTC."""
     try:
         found = datetime.fromisoformat(text.strip())
         found = found if found.tzinfo is not None else found.replace(tzinfo=UTC)
@@ -186,7 +186,6 @@ def _instant(text: str) -> float:
 
 
 def _duration_s(text: str) -> float:
-    """Parse a duration of zero or more, and return the seconds."""
     match = _DURATION.fullmatch(text)
     if match is None or match[2] not in UNITS_S:
         raise ConfigError(f'"{_short(text)}" is not a duration; write 90s, 30m, 1h, 2d, 1w')
@@ -197,6 +196,5 @@ def _duration_s(text: str) -> float:
 
 
 def _short(text: str) -> str:
-    """Return at most 60 printable characters of a text, for an error message."""
     printable = "".join(c if c.isprintable() else "?" for c in text)
     return printable if len(printable) <= 60 else f"{printable[:57]}…"

@@ -1,18 +1,15 @@
-"""Background writer of the history: rows and events are queued, and a thread writes the queue to a file.
+"""Background writer of the history, which writes queued rows and events to a file in a thread.
 
-``HistoryWriter.queue_item`` adds to a bounded queue and returns at once. The thread writes the queue in one transaction
-and then merges a few old rows. If a write fails (disk full, read-only or busy), the data remain in the queue and the
-write is repeated. If the queue is full, new data are dropped and counted. ``close`` makes one attempt to write the
-remaining data. ``state`` reports errors and changes of the file.
+The thread writes the queue in one transaction and then merges a few old rows. If a write fails (disk full, read-only or
+busy), the data remain in the queue and the write is repeated. If the queue is full, new data are dropped and counted.
 
-A file of a newer version is not modified, and writing continues as soon as a user has moved the file away. A file that
-is damaged or is not a history is renamed, and a new file is created, unless MAX_RENAMED_FILES renamed files exist.
-Before each write and every CHECK_S, the thread checks whether another program has deleted, replaced or emptied the
-file. In these cases, the thread opens or creates the file again.
+A file of a newer version is not modified. An unusable file is renamed and replaced by a new file, unless there are
+already MAX_RENAMED_FILES renamed files. Before each write and every CHECK_S, the thread checks whether another program
+has deleted, replaced or emptied the file. The thread then opens or creates the file again.
 
 Only one process at a time writes the history of a folder (``FolderLock``). While another process holds the lock, rows
-and events are discarded, because the other process stores the same results. When that process ends, this writer
-continues, but discards the first row of each device, which the other process has stored in part.
+and events are discarded, because the other process stores the same results. After the other process has ended, the
+writer discards the first row of each device, because the other process has stored a part of the same minute.
 """
 
 import contextlib
@@ -89,7 +86,7 @@ class HistoryWriter:
 
     @property
     def state(self) -> str:
-        """Status message: ``ok``, or a description of the problem."""
+        """Status of the writer: "ok", or a description of the problem."""
         dropped = f"{self.dropped} results not stored" if self.dropped else ""
         if self._error:
             return f"{self._error} ({dropped})" if dropped else self._error
@@ -101,7 +98,7 @@ class HistoryWriter:
         self._thread.start()
 
     def queue_item(self, device: str, item: HistoryRow | StoredEvent | None) -> None:
-        """Queue a row or an event for writing. If the queue is full, drop and count the item.
+        """Add a row or an event to the queue. If the queue is full, the item is dropped and counted.
 
         Parameters
         ----------
@@ -120,7 +117,7 @@ class HistoryWriter:
         self._wake.set()
 
     def close(self) -> None:
-        """Write the remaining data and stop the thread. After CLOSE_TIMEOUT_S, log a warning and return."""
+        """Write the remaining data and stop the thread. After CLOSE_TIMEOUT_S, log a warning."""
         self._closing.set()
         self._wake.set()
         if self._thread.is_alive():
@@ -129,7 +126,7 @@ class HistoryWriter:
                 _log.warning("history writer did not end in time", path=str(self.path))
 
     def _discards(self, device: str, what: HistoryRow | StoredEvent) -> bool:
-        """Return True if another process stores the item."""
+        """Return True if an item must be discarded because another process stores the item."""
         if self._excluded:
             return True
         if self._resumed_devices is None or device in self._resumed_devices or isinstance(what, StoredEvent):
@@ -140,7 +137,6 @@ class HistoryWriter:
     # --- methods of the thread
 
     def _run(self) -> None:
-        """Write until the writer is closed."""
         while True:
             closing = self._closing.is_set()
             self._wake.clear()
@@ -158,7 +154,6 @@ class HistoryWriter:
         self._folder.release()
 
     def _write(self) -> bool:
-        """Write the queue and merge old rows; return False after an error."""
         try:
             if holder := self._folder.hold():
                 self._suspend(holder)
@@ -168,7 +163,7 @@ class HistoryWriter:
             while batch := self._next_batch():
                 rows = [(device, what) for device, what in batch if isinstance(what, HistoryRow)]
                 events = [(device, what) for device, what in batch if isinstance(what, StoredEvent)]
-                store.add(rows, events)
+                store.write_rows_and_events(rows, events)
                 self._remove_written(len(batch))
             while (
                 store.merge_old_rows(self._now_s(), MERGES_PER_STEP)
@@ -189,7 +184,6 @@ class HistoryWriter:
         return True
 
     def _suspend(self, holder: str) -> None:
-        """Discard the queue, and stop to write while another process holds the lock."""
         self._close_store()
         with self._lock:
             self._excluded = True
@@ -199,13 +193,12 @@ class HistoryWriter:
         )
 
     def _resume(self) -> None:
-        """Continue to write after the process that held the lock has ended."""
         if self._excluded:
             with self._lock:
                 self._excluded, self._resumed_devices = False, set()
 
     def _current_store(self) -> HistoryStore:
-        """Return the open store. If another program has changed the file, open the store again."""
+        """Return the open history store. The store is opened again if another program has changed the file."""
         change = "" if self._store is None else self._store.describe_external_change()
         if change:
             self._close_store()
@@ -218,7 +211,7 @@ class HistoryWriter:
         return self._store
 
     def _move_aside(self, error: UnusableHistory) -> bool:
-        """Rename an unusable file, and return True if a new one can be created."""
+        """Rename an unusable history file. Return False if the file cannot be renamed."""
         taken = {
             one.name for one in self.path.parent.iterdir() if one.name.startswith(f"{self.path.name}{RENAMED_SUFFIX}")
         }
@@ -242,24 +235,20 @@ class HistoryWriter:
         return True
 
     def _next_batch(self) -> list[tuple[str, HistoryRow | StoredEvent]]:
-        """Return the next items of the queue without removing them."""
         with self._lock:
             return [self._waiting[i] for i in range(min(BATCH_SIZE, len(self._waiting)))]
 
     def _remove_written(self, n: int) -> None:
-        """Remove ``n`` written items from the queue."""
         with self._lock:
             for _ in range(n):
                 self._waiting.popleft()
         self.written += n
 
     def _set_note(self, note: str) -> None:
-        """Set and log the note about the file."""
         self._note = note
         _log.warning("history", text=note)
 
     def _set_error(self, wrong: str) -> None:
-        """Set the error, and log a changed error."""
         if wrong == self._error:
             return
         self._error = wrong
@@ -269,12 +258,10 @@ class HistoryWriter:
             _log.info("history", text="writing continues")
 
     def _close_store(self) -> None:
-        """Close the store."""
         store, self._store = self._store, None
         if store is not None:
             store.close()
 
 
 def _error_text(error: Exception) -> str:
-    """Return the text of an error, without the number of an OSError."""
     return getattr(error, "strerror", None) or str(error)

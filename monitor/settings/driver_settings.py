@@ -18,7 +18,7 @@ import drivers.decoders
 import drivers.links
 from drivers import module_lookup as discovery
 from drivers import number_ranges
-from drivers.decoders.base import AddressFilter, Decoder
+from drivers.decoders.base import AddressFilteringDecoder, Decoder
 from drivers.errors import ConfigError
 from drivers.links.base import AddressFilteringLink, Link, LinkSettings
 from drivers.number_ranges import format_value
@@ -118,7 +118,7 @@ def link_settings(name: str) -> type[LinkSettings]:
     if name == VIRTUAL:
         return VirtualTable
     if name not in link_names():
-        raise ConfigError(f'"{name}"{discovery.format_choices(name, link_names())}')
+        raise ConfigError(f'"{name}"{discovery.format_choices_by_similarity(name, link_names())}')
     settings: type[LinkSettings] = discovery.import_module(drivers.links, name, "_link").Settings
     return settings
 
@@ -157,7 +157,9 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
     carrier, silence_s = "", 0.0
     if not isinstance(name, str) or name not in link_names():
         said = "missing" if name is None else format_value(name)
-        problems.append(Problem("link", f"{said}{discovery.format_choices(str(name or ''), link_names())}"))
+        problems.append(
+            Problem("link", f"{said}{discovery.format_choices_by_similarity(str(name or ''), link_names())}")
+        )
     else:
         module = None if name == VIRTUAL else discovery.import_module(drivers.links, name, "_link")
         checked = check_table(link_settings(name), keys, folder)
@@ -171,7 +173,7 @@ def read_driver(table: Mapping[str, Any], folder: Path | None) -> Driver:
         decoder = _read_decoder(decoder_name, options, folder, (str(name), carrier), problems)
     if problems or link is None or decoder is None:
         raise TableError(problems, link if isinstance(link, VirtualTable) else None)
-    if isinstance(link, AddressFilteringLink) and isinstance(decoder, AddressFilter):
+    if isinstance(link, AddressFilteringLink) and isinstance(decoder, AddressFilteringDecoder):
         link.set_address_filter(decoder.addresses)
     return Driver(link, decoder, silence_s)
 
@@ -183,7 +185,7 @@ def _read_decoder(
     known = discovery.list_modules(drivers.decoders)
     if not isinstance(name, str) or name not in known:
         said = format_value(name) if name else "missing"
-        problems.append(Problem("decoder", f"{said}{discovery.format_choices(str(name), known)}"))
+        problems.append(Problem("decoder", f"{said}{discovery.format_choices_by_similarity(str(name), known)}"))
         return None
     module = discovery.import_module(drivers.decoders, name)
     if not isinstance(options, dict):
@@ -207,7 +209,7 @@ def _build(module: ModuleType | None, checked: TableCheckResult[Any]) -> Any:
     if checked.value is None or module is None:
         return None
     keys = fields_by_key(type(checked.value))
-    if any(problem.place in keys and keys[problem.place].is_required() for problem in checked.problems):
+    if any(problem.key_path in keys and keys[problem.key_path].is_required() for problem in checked.problems):
         return None
     sound = not checked.problems
     try:

@@ -8,9 +8,9 @@ from pydantic import BeforeValidator
 
 from drivers import file_access
 from drivers.errors import ConfigError
-from drivers.module_lookup import format_choices
+from drivers.module_lookup import format_choices_by_similarity
 from drivers.number_ranges import DURATION_S, PERCENT, PORT, SIZE_BYTES, UPDATE_RATE_HZ, format_value
-from drivers.settings_model import ReadAs, checked_by
+from drivers.settings_model import ConvertedFrom, checked_by
 from monitor.common.topics import ENDPOINT
 
 UNITS_S: Final = {"": 1.0, "ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
@@ -62,9 +62,9 @@ def parse_rate_as_period(value: str, always: str) -> float:
     return 1.0 / UPDATE_RATE_HZ.check(rate_hz)
 
 
-def period_annotation(always: str) -> ReadAs:
+def period_annotation(always: str) -> ConvertedFrom:
     """Return the annotation of a period in seconds that the file states as a rate or as the text ``always``."""
-    return ReadAs(str, lambda value, folder: parse_rate_as_period(value, always))
+    return ConvertedFrom(str, lambda value, folder: parse_rate_as_period(value, always))
 
 
 def check_memory(size: str) -> None:
@@ -86,7 +86,7 @@ def check_memory(size: str) -> None:
 def check_viewer_mode(mode: str) -> None:
     """Raise ConfigError for an unknown mode of the viewer."""
     if mode not in VIEWER_MODES and not mode.endswith(".rrd"):
-        raise ConfigError(f'"{mode}"{format_choices(mode, VIEWER_MODES)}, or a file ending in .rrd')
+        raise ConfigError(f'"{mode}"{format_choices_by_similarity(mode, VIEWER_MODES)}, or a file ending in .rrd')
 
 
 def _seconds(value: Any) -> Any:
@@ -135,8 +135,8 @@ def _address(text: str, _: Path | None) -> Metrics:
 DURATION_FROM_TEXT: Final = BeforeValidator(_seconds)
 """Annotation of a duration in seconds, which may be a text such as "1h" in the file."""
 Duration = Annotated[float, DURATION_S, DURATION_FROM_TEXT]
-RelativePath = Annotated[Path, ReadAs(str, _path)]
+RelativePath = Annotated[Path, ConvertedFrom(str, _path)]
 """Path. A relative path refers to the folder of the configuration file."""
 Endpoint = Annotated[str, checked_by(_check_endpoint)]
 ZenohKey = Annotated[str, checked_by(_check_zenoh_key)]
-Address = Annotated[Metrics, ReadAs(str, _address)]
+Address = Annotated[Metrics, ConvertedFrom(str, _address)]

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Final
 
 from drivers.credential_masking import has_secret
-from drivers.file_access import open_regular, real_path
+from drivers.file_access import open_regular_file, real_path
 
 MAX_SECRET_FILE_BYTES: Final = 1_000_000
 """Number of bytes at the start of a file that are searched for a secret."""
@@ -49,7 +49,7 @@ def describe_exposed_secret(path: Path, secret: bool | None = None) -> str:
 def contains_secret(path: Path) -> bool:
     """Return True if a file seems to contain a password or a key."""
     try:
-        with open_regular(path) as file:
+        with open_regular_file(path) as file:
             return has_secret(file.read(MAX_SECRET_FILE_BYTES).decode("utf-8", "replace"))
     except OSError:  # the reader of the file reports the error
         return False

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from drivers import file_access
-from drivers.errors import ConfigError, format_one_line
+from drivers.errors import ConfigError, sanitize_error_text
 from drivers.settings_model import Problem, TableCheckResult, check_table
 from drivers.zenoh.session_config import build_session_config, find_secret_files, format_zenoh_error
 from monitor.settings import file_permissions, toml_parser
@@ -123,7 +123,7 @@ def examine(path: Path, *, pipe: bool = False) -> Reading:
         True if a pipe may be read as well.
     """
     try:
-        table = toml_parser.parse_toml(file_access.read_small_file(path, pipe=pipe).decode("utf-8"))
+        table = toml_parser.parse_toml(file_access.read_small_file(path, allow_pipe=pipe).decode("utf-8"))
     except FileNotFoundError:
         return Reading(None, [f"{path}: no such file; imu-monitor check --print-defaults prints one to start from"])
     except (OSError, UnicodeDecodeError) as error:
@@ -139,7 +139,7 @@ def examine(path: Path, *, pipe: bool = False) -> Reading:
         warnings.insert(0, line)
     models = _model_dependent_settings(checked, table)
     if wrong or checked.value is None:
-        return Reading(None, [format_one_line(f"{path}: {line}") for line in wrong], models)
+        return Reading(None, [sanitize_error_text(f"{path}: {line}") for line in wrong], models)
     config = _configuration(checked.value)
     lines = tuple(f"{path}: {line}" for line in warnings)
     return Reading(dataclasses.replace(config, path=path, table=table, warnings=lines), [], models)
@@ -185,7 +185,7 @@ def _zenoh_file_secrets(path: Path) -> tuple[Path, ...]:
 
 def _format_problem(problem: Problem, table: Mapping[str, Any]) -> str:
     """Return the message of a problem. For a problem of a device, the message begins with its name."""
-    match = DEVICE_PLACE.fullmatch(problem.place)
+    match = DEVICE_PLACE.fullmatch(problem.key_path)
     name = _device_name(table, int(match[1])) if match else ""
     return f"{name}: {Problem(match[2], problem.text)}" if match and name else str(problem)
 
@@ -204,9 +204,9 @@ def _model_dependent_settings(
     uses = []
     for i, device in enumerate(checked.value.devices if checked.value else ()):
         at = f"device[{i}]"
-        limits = tuple(one for k, one in enumerate(device.limits) if checked.is_sound(f"{at}.limit[{k}]"))
-        virtual = device.link if checked.is_sound(f"{at}.driver") else checked.partial.get(f"{at}.driver")
-        model = device.model if checked.is_sound(f"{at}.model") else None
+        limits = tuple(one for k, one in enumerate(device.limits) if checked.has_no_problem(f"{at}.limit[{k}]"))
+        virtual = device.link if checked.has_no_problem(f"{at}.driver") else checked.partial.get(f"{at}.driver")
+        model = device.model if checked.has_no_problem(f"{at}.model") else None
         simulated = virtual if isinstance(virtual, VirtualTable) else None
         uses.append(ModelDependentSettings(_device_name(table, i) or at, model, limits, simulated))
     return tuple(uses)

@@ -15,7 +15,7 @@ from drivers import module_lookup as discovery
 from drivers.data_types import AXES
 from drivers.errors import ConfigError
 from drivers.number_ranges import NumberRange
-from drivers.settings_model import SettingsModel, fields_by_key, find_model
+from drivers.settings_model import SettingsModel, fields_by_key, find_settings_model
 from monitor.settings import driver_settings
 from monitor.settings.schema import ConfigFile, Device, Hook, Limit
 
@@ -36,7 +36,7 @@ def format_defaults() -> str:
     """Return a configuration file with the keys of all tables, links and decoders."""
     links = [name for name in driver_settings.link_names() if name != FIRST_LINK]
     decoders = [name for name in discovery.list_modules(drivers.decoders) if name != FIRST_DECODER]
-    top = {key: find_model(info.annotation) for key, info in fields_by_key(ConfigFile).items()}
+    top = {key: find_settings_model(info.annotation) for key, info in fields_by_key(ConfigFile).items()}
     blocks = [
         INTRODUCTION,
         _table(Device, "device", omit=("driver", "axes", "limit")),
@@ -84,7 +84,7 @@ def format_decoder(name: str) -> str:
     """
     known = discovery.list_modules(drivers.decoders)
     if name not in known:
-        raise ConfigError(f'"{name}"{discovery.format_choices(name, known)}')
+        raise ConfigError(f'"{name}"{discovery.format_choices_by_similarity(name, known)}')
     settings = discovery.import_module(drivers.decoders, name).Settings
     lacking = "" if fields_by_key(settings) else " has no keys"
     return _table(settings, DECODER_TABLE, f'decoder = "{name}"{lacking}')

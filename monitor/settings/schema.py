@@ -20,7 +20,7 @@ from drivers.driver import AxisMap, parse_axis_map
 from drivers.errors import ConfigError
 from drivers.links.base import Link
 from drivers.number_ranges import DAY_S, NumberRange
-from drivers.settings_model import Conflict, ListOf, ReadAs, SettingsModel, WordOr, checked_by, one_of
+from drivers.settings_model import Conflict, ConvertedFrom, KeywordOrType, ListOf, SettingsModel, checked_by, one_of
 from monitor.common.shipped_config_paths import model_path
 from monitor.common.topics import ENDPOINT
 from monitor.settings.driver_settings import Driver, VirtualTable, read_driver
@@ -57,14 +57,14 @@ def select_axes(pattern: str, _: object = None) -> tuple[str, ...]:
     (('gx', 'gy', 'gz'), ('az',))
     """
     if pattern not in AXIS_PATTERNS:
-        raise ConfigError(f'"{pattern}"{discovery.format_choices(pattern, AXIS_PATTERNS)}')
+        raise ConfigError(f'"{pattern}"{discovery.format_choices_by_similarity(pattern, AXIS_PATTERNS)}')
     return tuple(axis for axis in AXES if fnmatch(axis, pattern))
 
 
 class Limit(SettingsModel):
     """``[[device.limit]]``: bounds of one noise coefficient."""
 
-    axes: Annotated[tuple[str, ...], ReadAs(str, select_axes)] = Field(
+    axes: Annotated[tuple[str, ...], ConvertedFrom(str, select_axes)] = Field(
         examples=["g*"], description='gx ... az, "g*", "a*" or "*"'
     )
     letter: Literal["Q", "N", "B", "K", "R"] = Field(examples=["N"], description="noise coefficient")
@@ -110,7 +110,7 @@ class Device(SettingsModel):
     name: Annotated[str, checked_by(_check_name)] = Field(
         examples=["bench-1"], description="letters, digits, - and _; unique, since it is part of every zenoh key"
     )
-    driver: Annotated[Driver, ReadAs(dict[str, Any], read_driver)] = Field(
+    driver: Annotated[Driver, ConvertedFrom(dict[str, Any], read_driver)] = Field(
         examples=[{"link": "virtual"}], description="link and decoder"
     )
     rate_hz: Annotated[float, number_ranges.RATE_HZ] | None = Field(
@@ -119,7 +119,9 @@ class Device(SettingsModel):
     window_s: Duration = Field(3600.0, alias="window", examples=["1h"], description="length of the sliding window")
     tau: Annotated[
         Literal["octave", "decade10"] | tuple[float, ...],
-        WordOr({"octave": "octave", "decade10": "decade10"}, ListOf[Annotated[float, number_ranges.AVERAGING_TIME_S]]),
+        KeywordOrType(
+            {"octave": "octave", "decade10": "decade10"}, ListOf[Annotated[float, number_ranges.AVERAGING_TIME_S]]
+        ),
     ] = Field("octave", description="averaging times: a grid, or a list of seconds")
     refit_s: Annotated[float, period_annotation("every sample")] = Field(
         0.1,
@@ -138,14 +140,14 @@ class Device(SettingsModel):
         0.033, description="accepted false alarms of changed noise per day, of all axes together; 0 = no detection"
     )
     restart: bool = Field(True, description="true: the fit of an axis starts again after its noise has changed")
-    model: Annotated[Path | None, ReadAs(str, _model_in_force)] = Field(
+    model: Annotated[Path | None, ConvertedFrom(str, _model_in_force)] = Field(
         None,
         examples=["consumer-mems"],
         description="model in force, with which the samples are compared: a model file, or name of a shipped model",
     )
     compensate: bool = Field(True, description="true: also publish the samples without the drift of the gyroscopes")
     thermal_s: Annotated[
-        float | None, WordOr({"off": None}, Annotated[float, THERMAL_INTERVAL_S, DURATION_FROM_TEXT])
+        float | None, KeywordOrType({"off": None}, Annotated[float, THERMAL_INTERVAL_S, DURATION_FROM_TEXT])
     ] = Field(
         600.0,
         alias="thermal_interval",
@@ -155,7 +157,7 @@ class Device(SettingsModel):
     reconcile_folder: RelativePath | None = Field(
         None, examples=["reports"], description="folder for the reports of command/reconcile; absent: they are not kept"
     )
-    axes: Annotated[AxisMap, ReadAs(dict[str, str], lambda table, folder: parse_axis_map(table))] = Field(
+    axes: Annotated[AxisMap, ConvertedFrom(dict[str, str], lambda table, folder: parse_axis_map(table))] = Field(
         AxisMap(),
         examples=[{axis: axis for axis in AXES}],
         description='mounting of the sensor: axis of the output = axis of the sensor, as in gx = "-gy"',
@@ -331,7 +333,7 @@ class Hook(SettingsModel):
     devices: Annotated[frozenset[str], Strict(False)] = Field(
         frozenset(), examples=[["bench-1"]], description="names of devices; absent: all"
     )
-    command: Annotated[tuple[str, ...], ReadAs(ListOf[str], _program)] = Field(
+    command: Annotated[tuple[str, ...], ConvertedFrom(ListOf[str], _program)] = Field(
         (),
         examples=[["/usr/local/bin/tell", "--loud"]],
         description="program with arguments, without a shell; the event is JSON on standard input",
@@ -388,7 +390,9 @@ class ConfigFile(SettingsModel):
             yield Conflict(same[-1], f'{len(same)} devices are named "{name}"; names must be unique', tuple(same))
         for i, hook in enumerate(self.hooks):
             for name in sorted(hook.devices - set(names)):
-                yield Conflict(f"hook[{i}].devices", f'"{name}"{discovery.format_choices(name, names)}', places)
+                yield Conflict(
+                    f"hook[{i}].devices", f'"{name}"{discovery.format_choices_by_similarity(name, names)}', places
+                )
             if hook.key is not None and self.zenoh.mode == "none":
                 text = 'zenoh.mode is "none", so the message cannot be published'
                 yield Conflict(f"hook[{i}].key", text, ("zenoh.mode",))

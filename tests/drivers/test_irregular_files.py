@@ -71,21 +71,21 @@ def one_line(error: BaseException) -> str:
 def test_open_regular_says_what_it_is(kind: str, tmp_path: Path) -> None:
     path = tmp_path / "name"
     make(kind, path)
-    for read in (file_access.read_small_file, file_access.open_regular, file_access.check_regular):
+    for read in (file_access.read_small_file, file_access.open_regular_file, file_access.check_regular_file):
         with pytest.raises(OSError, match=KINDS[kind]):
             read(path)
 
 
 def test_a_descriptor_is_not_inherited(tmp_path: Path) -> None:
     (tmp_path / "a").write_bytes(b"1")
-    with file_access.open_regular(tmp_path / "a") as file:
+    with file_access.open_regular_file(tmp_path / "a") as file:
         assert not os.get_inheritable(file.fileno())
         assert file.read() == b"1"
 
 
 def test_a_name_with_a_nul_character_is_an_os_error() -> None:
     with pytest.raises(OSError, match="null byte"):
-        file_access.open_regular(Path("a\0b"))
+        file_access.open_regular_file(Path("a\0b"))
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".csv.gz", ".npz", ".parquet", ".arrow", ".arrows"])
@@ -211,7 +211,7 @@ def test_a_history(kind: str, end: str, tmp_path: Path) -> None:
 
 def read_history(folder: Path) -> Iterator[str]:
     with sqlite_store.open_history(folder / sqlite_store.FILE_NAME) as reader:
-        yield from reader.devices()
+        yield from reader.list_devices()
 
 
 # --- from the command line

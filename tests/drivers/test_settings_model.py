@@ -11,7 +11,16 @@ from pydantic import Field
 
 from drivers.errors import ConfigError
 from drivers.number_ranges import FRACTION, RATE_HZ
-from drivers.settings_model import Conflict, FileOrName, FilePath, ListOf, SettingsModel, WordOr, check_table, one_of
+from drivers.settings_model import (
+    Conflict,
+    FileOrName,
+    FilePath,
+    KeywordOrType,
+    ListOf,
+    SettingsModel,
+    check_table,
+    one_of,
+)
 from tests.support.settings import read_settings
 
 
@@ -26,7 +35,9 @@ class Whole(SettingsModel):
     mode: Literal["peer", "client"] | None = None
     flag: bool = False
     words: ListOf[str] = ()
-    tau: Annotated[str | tuple[float, ...], WordOr({"octave": "octave"}, ListOf[Annotated[float, FRACTION]])] = "octave"
+    tau: Annotated[str | tuple[float, ...], KeywordOrType({"octave": "octave"}, ListOf[Annotated[float, FRACTION]])] = (
+        "octave"
+    )
     scale: dict[Annotated[str, one_of(("gx", "gy"))], float] = Field({})
     parts: ListOf[Part] = Field((), alias="part")
     part: Part = Field(Part(name="b"), alias="other")

@@ -10,11 +10,11 @@ from drivers.errors import ConfigError
 
 
 def test_rates() -> None:
-    assert units.rate_factor("rad/s") == 1.0
-    assert units.rate_factor("deg/s") * 180.0 == pytest.approx(math.pi)
-    assert units.rate_factor("°/h") * 3600.0 * 180.0 == pytest.approx(math.pi)
-    assert units.rate_factor("mdps") == pytest.approx(math.radians(1e-3))
-    assert units.rate_factor("mrad/s") == 1e-3
+    assert units.angular_rate_factor("rad/s") == 1.0
+    assert units.angular_rate_factor("deg/s") * 180.0 == pytest.approx(math.pi)
+    assert units.angular_rate_factor("°/h") * 3600.0 * 180.0 == pytest.approx(math.pi)
+    assert units.angular_rate_factor("mdps") == pytest.approx(math.radians(1e-3))
+    assert units.angular_rate_factor("mrad/s") == 1e-3
 
 
 def test_accelerations() -> None:
@@ -29,7 +29,7 @@ def test_accelerations() -> None:
     [("°C", 25.0, 25.0), ("K", 273.15, 0.0), ("°F", 212.0, 100.0), ("F", 32.0, 0.0), ("m°C", 25_000.0, 25.0)],
 )
 def test_temperatures(unit: str, number: float, celsius: float) -> None:
-    factor, offset = units.temperature_scale(unit)
+    factor, offset = units.temperature_factor_and_offset(unit)
     assert factor * number + offset == pytest.approx(celsius, abs=1e-12)
 
 
@@ -44,10 +44,10 @@ def test_both_micro_signs_and_blanks_are_understood() -> None:
 @pytest.mark.parametrize(
     ("look_up", "unit", "words"),
     [
-        (units.rate_factor, "deg/sek", ("angular rate", '"deg/sek"', "possible are deg/sec, deg/s, ")),
-        (units.rate_factor, "furlong", ('"furlong"', "rad/s", "deg/s")),
+        (units.angular_rate_factor, "deg/sek", ("angular rate", '"deg/sek"', "possible are deg/sec, deg/s, ")),
+        (units.angular_rate_factor, "furlong", ('"furlong"', "rad/s", "deg/s")),
         (units.acceleration_factor, "G", ('"G"', "m/s²", "mg")),
-        (units.temperature_scale, "Réaumur", ('"Réaumur"', "°C", "K")),
+        (units.temperature_factor_and_offset, "Réaumur", ('"Réaumur"', "°C", "K")),
         (units.time_factor, "fortnight", ('"fortnight"', "ms", "ns")),
     ],
 )

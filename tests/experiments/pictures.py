@@ -351,7 +351,9 @@ def write_history(path: Path, device: str, now_s: float) -> None:
     told = [("noise_changed", "gz angle random walk rose by 50 %"), ("link_lost", "/dev/ttyUSB0: gone"),
             ("link_back", "/dev/ttyUSB0: back after 1 h 00 min")]  # fmt: skip
     events = [StoredEvent(at, kind, text) for at, (kind, text) in zip(times, told, strict=True)]
-    store.add([(device, row) for row in (*rows, minutes.flush()) if row is not None], [(device, one) for one in events])
+    store.write_rows_and_events(
+        [(device, row) for row in (*rows, minutes.flush()) if row is not None], [(device, one) for one in events]
+    )
     store.close()
 
 

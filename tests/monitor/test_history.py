@@ -101,7 +101,7 @@ def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, 
     minutes = found.start_s.tolist()
     assert set(minutes) <= {int(T0) + 60 * i for i in range(math.ceil(SECONDS / 60))}  # a busy machine skips some
     assert len(minutes) >= 3
-    n = found.column("gz.N")
+    n = found.select_column("gz.N")
     assert len(told.estimates) > 3
     for p, start_s in enumerate(found.start_s.tolist()):
         values = [one.coefficients.value[1, 2] for at, one in told.estimates if start_s <= at < start_s + 60]
@@ -111,7 +111,7 @@ def test_what_was_published_is_kept_and_a_second_run_adds_to_it(tmp_path: Path, 
             assert (n.low[p], n.high[p], n.last[p]) == (min(values), max(values), values[-1])
     assert found.counts.sum(axis=0)[0] == told.received == round(SECONDS * RATE_HZ) - 100
     assert [(one.t_s, one.text) for one in found.events] == [(at, event.text) for at, event in told.events]
-    assert found.column("temperature").low[0] == pytest.approx(20.0, abs=1.5)
+    assert found.select_column("temperature").low[0] == pytest.approx(20.0, abs=1.5)
 
     Service(config(tmp_path, recording)).run(PATIENCE_S)
     again = kept(tmp_path)
@@ -155,7 +155,7 @@ def test_a_query_over_zenoh_honours_its_time(asked: tuple[Service, Any]) -> None
     first, last = (format_utc(one).replace(" ", "T") + "Z" for one in (minutes[1], minutes[2] + 60))
     some = answer(f"_time=[{first}..{last}[;step=1m;axis=gz;what=coefficients")
     assert some.start_s.tolist() == minutes[1:3]
-    assert some.axes() == ("gz",)
+    assert some.list_axes() == ("gz",)
     np.testing.assert_array_equal(some.column("gz.N").last, whole.column("gz.N").last[1:3])
     duration = answer(f"_time=[{first};60s[;step=60s")
     assert duration.start_s.tolist() == minutes[1:2]

@@ -54,7 +54,7 @@ def test_rates_come_out_without_drift_live_as_offline(tmp_path: Path) -> None:
 
         def last_batch() -> bool:
             batches.extend(decode_samples(bytes(one.payload)) for one in iter(heard.try_recv, None))
-            return bool(batches) and batches[-1].samples == n
+            return bool(batches) and batches[-1].total_samples == n
 
         wait_for(last_batch, "the last batch over zenoh")
     rates = concatenate_blocks(caught.rates["bench-1"])
@@ -64,7 +64,7 @@ def test_rates_come_out_without_drift_live_as_offline(tmp_path: Path) -> None:
     assert np.sqrt(np.mean((rates.values[turning, 1] - truth) ** 2)) < 1.05 * SIGMA
     assert np.sqrt(np.mean(rates.values[14_000:, :3] ** 2)) < 0.3 * SIGMA
     last = batches[-1]
-    assert (last.device, last.samples) == ("bench-1", n)
+    assert (last.device, last.total_samples) == ("bench-1", n)
     np.testing.assert_array_equal(last.block.values, rates.values[-len(last.block) :])
     for k, look in enumerate(caught.drifts["bench-1"][:2], start=1):
         assert abs(look.t_ns - round((T0 + k - 0.01) * 1e9)) < 1000

@@ -208,7 +208,7 @@ def test_a_file_that_cannot_be_written(tmp_path: Path) -> None:
 def test_a_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from monitor.publishing.rerun import sinks
 
-    monkeypatch.setattr(sinks, "check_regular", lambda path: None)  # a device stands for the full disk here
+    monkeypatch.setattr(sinks, "check_regular_file", lambda path: None)  # a device stands for the full disk here
     (tmp_path / "live.rrd").symlink_to("/dev/full")
     with healthy(tmp_path, f'[viewer]\nmode = "{tmp_path}/live.rrd"\n' + NO_ZENOH) as run:
         output_says(run, "viewer", lambda text: "No space left" in text)

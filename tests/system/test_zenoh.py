@@ -181,8 +181,8 @@ mode = "none"
                 assert content["samples"] >= 0
     batches = [decode_samples(payload) for _, payload in listener.heard["imu/bench-1/samples"]]
     # those before the first were sent before zenoh had joined the three sessions
-    assert sum(len(batch.block) for batch in batches[1:]) == batches[-1].samples - batches[0].samples
-    assert batches[-1].samples == run.station("bench-1").driver.counts.received
+    assert sum(len(batch.block) for batch in batches[1:]) == batches[-1].total_samples - batches[0].total_samples
+    assert batches[-1].total_samples == run.station("bench-1").driver.counts.received
     assert {"link_lost", "link_back"} <= set(events(listener))
     (ok_encoding, ok), (error_encoding, error) = listener.replies
     assert ok_encoding == error_encoding == topics.JSON

@@ -1,20 +1,16 @@
-"""Decoder for CAN sensors that a DBC file describes. The settings map axes to signals.
+"""Decoder for CAN sensors that are described by a DBC file. The settings map axes to signals.
 
-``build`` reads the DBC file with cantools and checks the settings. The decoder then works without cantools. Each signal
-is extracted from the frames of many samples at once. The tests compare the extracted values with the values that
-cantools decodes.
+A sample may consist of several CAN messages, which ``drivers.decoders.dbc.sample_assembly`` joins. A sample is bad if a
+frame is missing or too short, or if the signal ``valid`` is not 1. With ``partial = true``, only the axes of a missing
+frame are marked as not measured. A sample with late frames is counted in ``dropped_late_samples`` and not in ``bad``. A
+message that contains only the temperature may have a lower rate than the samples. Each sample then contains the newest
+temperature.
 
-One sample may be spread over several messages. ``drivers.decoders.dbc.sample_assembly`` joins the frames in order of
-arrival. A sample is bad, and counts as missing, if one of its frames is missing, too short or not ``valid``. With
-``partial = true``, the axes of a missing frame are only marked as not measured. A sample also counts as missing if one
-of its frames arrived later than the time ``window`` allows. Such samples are counted in ``dropped_late_samples``
-instead of ``bad``. A message that contains only the temperature may be sent less often than the other messages. Each
-sample then gets the newest temperature.
-
-J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by their parameter group, without priority
-and sender. The decoder accepts the first sender that it receives, unless ``source`` names the sender. A raw value in
-the top 2/256 of its range means "error" or "not available" (SAE J1939-71: 0xFE00 to 0xFFFF of 16 bits), and the axis is
-marked as not measured. With ``not_available = true``, this rule also applies to messages other than J1939.
+J1939 messages (attribute VFrameFormat, or ``j1939 = true``) are identified by the parameter group, without the priority
+and the source address. The decoder accepts the first source address that it receives, unless the key ``source`` is set.
+A J1939 value in the top 2/256 of the range means "error" or "not available" (SAE J1939-71: 0xFE00 to 0xFFFF of 16
+bits), and the axis is marked as not measured. With ``not_available = true``, other messages are treated in the same
+way.
 """
 
 from collections.abc import Sequence
@@ -26,7 +22,7 @@ from numpy.typing import NDArray
 from drivers.data_types import ANY_SOURCE, AXES, EXTENDED_ID, NO_TICK, Chunk, Ints, SampleBlock, Timing
 from drivers.decoders.base import HINT_FRAMES, BlockBuilder, Bytes, Decoder
 from drivers.decoders.dbc.database import Database
-from drivers.decoders.dbc.sample_assembly import Message, SampleAssembler, SampleFrames
+from drivers.decoders.dbc.sample_assembly import CanMessage, SampleAssembler, SampleFrames
 from drivers.decoders.dbc.settings import COLUMNS, Settings, SignalSettings
 
 __all__ = ["DbcDecoder", "Settings", "SignalSettings", "build"]
@@ -36,7 +32,7 @@ MAX_CACHED_IDS: Final = 4096
 
 
 class DbcDecoder:
-    """Decoder and encoder of the frames of one device according to its DBC.
+    """Decoder and encoder of the CAN frames of one device.
 
     Parameters
     ----------
@@ -50,8 +46,8 @@ class DbcDecoder:
 
     carrier: ClassVar[str] = "frames"
 
-    def __init__(self, messages: Sequence[Message], settings: Settings, timing: Timing) -> None:
-        slow = [m for m in messages if m.only_temperature and len(messages) > 1]
+    def __init__(self, messages: Sequence[CanMessage], settings: Settings, timing: Timing) -> None:
+        slow = [m for m in messages if m.has_only_temperature and len(messages) > 1]
         self._slow = slow[0] if slow else None
         self._messages = [m for m in messages if m is not self._slow]
         self._settings = settings
@@ -76,7 +72,7 @@ class DbcDecoder:
         return tuple(m.address | (ANY_SOURCE if m.j1939 else 0) for _, m in self._numbered_messages())
 
     def reset(self) -> None:
-        """Discard an incomplete sample, the newest temperature and the selected sender."""
+        """Discard an incomplete sample, the newest temperature and the accepted J1939 source address."""
         self._assembler.reset()
         self._builder.forget_rejected_frames()
         self._source = self._settings.source
@@ -84,7 +80,7 @@ class DbcDecoder:
         self._cache.clear()
 
     def feed(self, chunks: Sequence[Chunk]) -> list[SampleBlock]:
-        """Return the samples that these frames complete. ``t_ns`` is the arrival time of the last frame of a sample."""
+        """Return the completed samples. ``t_ns`` is the arrival time of the last frame of a sample."""
         done: list[SampleFrames] = []
         for chunk in chunks:
             which = self._message_index(chunk.address)
@@ -115,10 +111,10 @@ class DbcDecoder:
         return blocks
 
     def encode(self, samples: SampleBlock) -> list[Chunk]:
-        """Return the frames of each sample. Bits without a signal are 0, or 1 in J1939 messages."""
+        """Encode samples as CAN frames. Unused bits are 1 in J1939 messages and 0 in other messages."""
         n = len(samples)
         table = np.column_stack((samples.values, samples.temperature_c))
-        sent: list[tuple[Message, Bytes]] = []
+        sent: list[tuple[CanMessage, Bytes]] = []
         # the temperature is sent first, since the decoder applies it to the following samples
         for _, message in sorted(self._numbered_messages()):
             frames = np.full((n, message.length), 0xFF if message.j1939 else 0, np.uint8)
@@ -136,13 +132,12 @@ class DbcDecoder:
             if message is not self._slow or not np.isnan(samples.temperature_c[row])
         ]
 
-    def _numbered_messages(self) -> list[tuple[int, Message]]:
-        """Return the messages and their indices. The message that contains only the temperature has the index -1."""
+    def _numbered_messages(self) -> list[tuple[int, CanMessage]]:
+        """Return the CAN messages and indices. A message that contains only the temperature has the index -1."""
         slow = [(-1, self._slow)] if self._slow is not None else []
         return [*slow, *enumerate(self._messages)]
 
     def _message_index(self, address: int) -> int | None:
-        """Return the index of the message with this address; None if the message is not used."""
         if address in self._known:
             return self._known[address]
         if not self._groups or not address & EXTENDED_ID:
@@ -154,7 +149,6 @@ class DbcDecoder:
         return self._cache[address]
 
     def _find_j1939_message(self, address: int) -> int | None:
-        """Return the index of a J1939 message; None if the message is not used or has another sender."""
         which = self._groups.get(_parameter_group(address))
         if which is None:
             return None
@@ -171,13 +165,11 @@ class DbcDecoder:
         return None
 
     def _note_temperature(self, data: bytes) -> None:
-        """Store the newest frame of the message that contains only the temperature."""
         assert self._slow is not None
         if len(data) >= self._slow.size:
             self._assembler.temperature = data[: self._slow.size]
 
     def _decode_samples(self, done: Sequence[SampleFrames]) -> list[SampleBlock]:
-        """Return the samples as blocks. Each signal is extracted from all samples at once."""
         n = len(done)
         table = np.full((n, len(COLUMNS)), np.nan)
         ticks = np.full(n, NO_TICK, np.int64)
@@ -207,7 +199,6 @@ class DbcDecoder:
 
 
 def _stack_frames(done: Sequence[SampleFrames], which: int, size: int) -> tuple[Bytes, NDArray[np.bool_]]:
-    """Return the frames [n, size] of one message, and a mask [n] of the frames that have arrived."""
     frames = [s.temperature if which < 0 else s.frames[which] for s in done]
     empty = bytes(size)
     data = np.frombuffer(b"".join(f or empty for f in frames), np.uint8)
@@ -221,12 +212,12 @@ def _parameter_group(frame_id: int) -> int:
 
 
 def build(settings: Settings) -> Decoder:
-    """Read the DBC file and return the decoder.
+    """Return a decoder for the DBC file in the settings.
 
     Raises
     ------
     ConfigError
-        If settings are wrong. The error has one line for each mistake.
+        If the settings contain mistakes. The error has one line for each mistake.
     """
     database = Database(settings)
     return DbcDecoder(database.messages, settings, database.timing)

@@ -1,7 +1,6 @@
 """Lookup of the configured messages and signals in a DBC file.
 
-The file is read once with cantools. Every name must exist, every unit must be known, and every signal must fit in its
-message. A ``ConfigError`` describes all violations.
+The DBC file is read with cantools. A ``ConfigError`` lists all unknown names, unknown units and invalid signals.
 """
 
 import contextlib
@@ -13,11 +12,11 @@ from typing import Any, Final
 import drivers
 from drivers import file_access, units
 from drivers.data_types import ArrivalTimedFormat, CounterTimedFormat, Timing
-from drivers.decoders.dbc.sample_assembly import Column, Message
+from drivers.decoders.dbc.sample_assembly import CanMessage, MeasuredSignal
 from drivers.decoders.dbc.settings import COLUMNS, TEMPERATURE, Settings, SignalSettings
 from drivers.decoders.dbc.signal_bits import SignalBits
 from drivers.errors import ConfigError
-from drivers.extras import check_extra
+from drivers.extras import require_extra
 from drivers.module_lookup import format_suggestion
 
 SHIPPED: Final = Path(drivers.__file__).parent.parent / "config" / "dbc"
@@ -27,7 +26,7 @@ MAX_COUNTER_BITS: Final = 62
 
 
 class Database:
-    """Messages and signals of a DBC file that the settings name.
+    """Messages and signals that the settings select from a DBC file.
 
     Parameters
     ----------
@@ -37,13 +36,13 @@ class Database:
     Raises
     ------
     ConfigError
-        If settings are wrong. The error has one line for each mistake.
+        If the settings contain mistakes. The error has one line for each mistake.
     """
 
     def __init__(self, settings: Settings) -> None:
         self._settings = settings
         self._errors: list[str] = []
-        self._used: dict[str, Message] = {}
+        self._used: dict[str, CanMessage] = {}
         self.timing: Timing = ArrivalTimedFormat()
         """Timing of the samples."""
         with self._collecting():
@@ -54,20 +53,19 @@ class Database:
             raise ConfigError(*self._errors)
 
     @property
-    def messages(self) -> list[Message]:
-        """Messages with the configured signals, beginning with the message that contains only the counter."""
-        return sorted(self._used.values(), key=lambda m: not m.only_counter)
+    def messages(self) -> list[CanMessage]:
+        """CAN messages with the configured signals. A message that contains only the counter is the first one."""
+        return sorted(self._used.values(), key=lambda m: not m.has_only_counter)
 
     @contextlib.contextmanager
     def _collecting(self) -> Iterator[None]:
-        """Store the lines of a ConfigError instead of raising the error, so that all mistakes are reported."""
+        """Collect the lines of a ConfigError instead of raising the error, so that all mistakes are reported."""
         try:
             yield
         except ConfigError as error:
             self._errors += error.lines
 
     def _find_configured_signals(self) -> None:
-        """Find the signals of all axes, the counter and the signal ``valid``."""
         s = self._settings
         for axis, entry in s.signals.items():
             with self._collecting():
@@ -82,7 +80,6 @@ class Database:
                 self._add_counter()
 
     def _add_counter(self) -> None:
-        """Find the counter and derive the timing."""
         s = self._settings
         for message, signal in self._find_counters():
             if signal.is_float or signal.length > MAX_COUNTER_BITS:
@@ -94,30 +91,27 @@ class Database:
             self.timing = CounterTimedFormat(1 << int(signal.length), s.tick)
 
     def _find_counters(self) -> list[tuple[Any, Any]]:
-        """Return message and signal of each counter."""
         name = self._settings.counter
         if "." in name or self._settings.join == "time":
             return [self._find_signal("counter", name)]
         # a message with only the temperature needs no counter
-        inertial = [m.name for m in self._used.values() if not m.only_temperature]
+        inertial = [m.name for m in self._used.values() if not m.has_only_temperature]
         return [self._find_signal("counter", f"{message}.{name}") for message in inertial]
 
     def _add_axis(self, axis: str, entry: SignalSettings) -> None:
-        """Find the signal of an axis."""
         message, signal = self._find_signal(f"signals.{axis}", entry.signal)
         factor, offset = self._conversion_to_si(axis, entry, signal)
         bits = self._signal_bits(message, signal)
-        column = Column(COLUMNS.index(axis), bits, factor, offset)
+        column = MeasuredSignal(COLUMNS.index(axis), bits, factor, offset)
         self._register_message(message, bits).columns.append(column)
 
     def _conversion_to_si(self, axis: str, entry: SignalSettings, signal: Any) -> tuple[float, float]:
-        """Return the factor and the offset that convert the values of a signal to SI units."""
         unit = entry.unit or signal.unit or ""
         try:
             if axis == TEMPERATURE:
-                factor, offset = units.temperature_scale(unit)
+                factor, offset = units.temperature_factor_and_offset(unit)
             else:
-                look_up = units.rate_factor if axis.startswith("g") else units.acceleration_factor
+                look_up = units.angular_rate_factor if axis.startswith("g") else units.acceleration_factor
                 factor, offset = look_up(unit), 0.0
         except ConfigError as error:
             where = "" if entry.unit else f" (the unit in {self._path.name})"
@@ -128,7 +122,6 @@ class Database:
         return factor * entry.factor, offset * entry.factor
 
     def _find_signal(self, key: str, name: str) -> tuple[Any, Any]:
-        """Return the message and the signal that a name such as "Message.Signal" refers to."""
         message_name, dot, signal_name = name.partition(".")
         if not dot:
             hint = ', or with join = "counter" a bare name' if key == "counter" else ""
@@ -146,21 +139,19 @@ class Database:
             raise ConfigError(f"{key}: {name} is multiplexed; such signals are not supported")
         return message, signal
 
-    def _register_message(self, message: Any, bits: SignalBits) -> Message:
-        """Add a message to the used messages, and extend its ``size`` so that a frame contains the signal."""
+    def _register_message(self, message: Any, bits: SignalBits) -> CanMessage:
+        """Add a CAN message to the used messages, and increase ``size`` if the message is too short for the signal."""
         extended, j1939 = bool(message.is_extended_frame), self._is_j1939(message)
-        new = Message(message.name, message.frame_id, extended, j1939, size=0, length=message.length, columns=[])
+        new = CanMessage(message.name, message.frame_id, extended, j1939, size=0, length=message.length, columns=[])
         entry = self._used.setdefault(message.name, new)
         entry.size = max(entry.size, bits.end_byte)
         return entry
 
     def _is_j1939(self, message: Any) -> bool:
-        """Return True if a message is a J1939 message."""
         s = self._settings
         return bool(message.protocol == "j1939" if s.j1939 is None else s.j1939)
 
     def _signal_bits(self, message: Any, signal: Any) -> SignalBits:
-        """Return the position and the scale of a signal. Raise ConfigError if the signal is not supported."""
         s = self._settings
         big_endian = signal.byte_order == "big_endian"
         # a DBC file states the most significant bit of a Motorola signal and numbers the bits of a byte from 7 to 0
@@ -190,7 +181,7 @@ class Database:
 
 
 def _locate(file: str) -> Path:
-    """Return the path of a database file. A name without a folder may refer to a database shipped with the program."""
+    """Return the path of a DBC file. A name without a folder may refer to a shipped DBC file."""
     path = file_access.expand_user(file)
     name = file.removeprefix(SHIPPED_PREFIX)
     if name == file and (file_access.is_file(path) or len(path.parts) != 1):
@@ -203,8 +194,8 @@ def _locate(file: str) -> Path:
 
 
 def _load(path: Path) -> Any:
-    """Read a database without strict checks, since unused signals overlap in many files."""
-    check_extra("can", "a CAN database")
+    """Read a DBC file without strict checks, since unused signals overlap in many DBC files."""
+    require_extra("can", "a CAN database")
     import cantools
 
     try:

@@ -1,18 +1,16 @@
 """Assembly of samples from the frames of several CAN messages, and detection of incomplete samples.
 
-A sample is complete when one frame of every message has arrived. The next sample starts with the first frame of a
-message that the current sample already contains, or with a message that contains only the counter. With
-``join = "counter"``, a frame with another counter value also starts the next sample. A sample that ends before all
-frames have arrived is bad, unless ``partial`` is True. Frames before the first complete sample are ignored, since the
-link may have been opened in the middle of a sample.
+A sample is complete when one frame of every message has arrived. A frame starts the next sample if the current sample
+already contains a frame of the same message, or if the message contains only the counter. With ``join = "counter"``, a
+frame with a new counter value also starts the next sample. An incomplete sample is bad, unless ``partial`` is True.
+Frames before the first complete sample are ignored, since the link may have been opened in the middle of a sample.
 
-A frame may arrive more than ``window`` after the first frame of the current sample. Such a frame is either late, or it
-starts the next sample because earlier frames were lost. If the frames contain counter values, a frame with the counter
-value of the current sample is late. Otherwise the order of the messages decides. The first message of a sample is the
-message with the longest median pause before its frames. A frame of the first message starts the next sample. A frame of
-any other message is late, unless a complete sample period has passed. While the order of the messages is unknown, the
-frame waits. If all frames of a sample have arrived, but some of them late, the sample is dropped. A dropped late sample
-counts as missing, but not as bad.
+A frame that arrives more than ``window`` after the first frame of the current sample is either late or starts the next
+sample. A frame with the counter value of the current sample is late. Without counter values, the order of the messages
+decides. The first message of a sample is the message with the longest median pause before the frame. A frame of the
+first message starts the next sample. A frame of any other message is late, unless a complete sample period has passed.
+A frame is kept in a queue while the order of the messages is unknown. If all frames of a sample have arrived but some
+were late, the sample is dropped and counted as missing, but not as bad.
 """
 
 from collections import deque
@@ -36,8 +34,8 @@ MAX_UNDECIDED_PER_MESSAGE: Final = 8
 
 
 @dataclass(frozen=True, slots=True)
-class Column:
-    """Signal of one axis, with the conversion to SI units."""
+class MeasuredSignal:
+    """Signal of one axis or of the temperature, with the conversion to SI units."""
 
     index: int  # in COLUMNS
     bits: SignalBits
@@ -46,8 +44,8 @@ class Column:
 
 
 @dataclass(slots=True)
-class Message:
-    """CAN message that contains a part of a sample."""
+class CanMessage:
+    """Definition of a CAN message that contains a part of a sample."""
 
     name: str
     frame_id: int
@@ -55,7 +53,7 @@ class Message:
     j1939: bool
     size: int  # number of bytes from the start of the message to the end of the last used signal
     length: int  # number of bytes of the complete message
-    columns: list[Column]
+    columns: list[MeasuredSignal]
     valid: SignalBits | None = None
     counter: SignalBits | None = None
 
@@ -65,20 +63,20 @@ class Message:
         return self.frame_id | (EXTENDED_ID if self.extended else 0)
 
     @property
-    def only_counter(self) -> bool:
+    def has_only_counter(self) -> bool:
         """True if the message contains only the counter."""
         return self.counter is not None and not self.columns and self.valid is None
 
     @property
-    def only_temperature(self) -> bool:
-        """True if the message contains only the temperature. Such a message may be sent less often than samples."""
+    def has_only_temperature(self) -> bool:
+        """True if the message contains only the temperature."""
         indices = {column.index for column in self.columns}
         return indices == {len(AXES)} and self.valid is None and self.counter is None
 
 
 @dataclass(slots=True)
 class SampleFrames:
-    """Frames of one sample by message. A missing frame is None, and a frame that is too short is empty."""
+    """CAN frames of one sample, in the order of the messages. A missing frame is None, and a short frame is b""."""
 
     frames: list[bytes | None]
     t_ns: int  # arrival time of the newest frame
@@ -95,7 +93,7 @@ class SampleFrames:
 
 
 class SampleAssembler:
-    """Assembler of samples from frames in order of arrival.
+    """Assembler that joins CAN frames to samples, in order of arrival.
 
     Parameters
     ----------
@@ -105,11 +103,11 @@ class SampleAssembler:
         Settings of the decoder.
     """
 
-    def __init__(self, messages: Sequence[Message], settings: Settings) -> None:
+    def __init__(self, messages: Sequence[CanMessage], settings: Settings) -> None:
         self._n = len(messages)
         self._by_count = settings.join == "counter"
         self._counters = [m.counter for m in messages]
-        self._counter_message = next((i for i, m in enumerate(messages) if m.only_counter), None)
+        self._counter_message = next((i for i, m in enumerate(messages) if m.has_only_counter), None)
         self._window_ns = round(settings.window * 1e9) or (1 << 62)
         self._partial = settings.partial
         self.dropped_late_samples = 0
@@ -118,7 +116,7 @@ class SampleAssembler:
         self.reset()
 
     def reset(self) -> None:
-        """Discard the current sample, the known order of the messages and the synchronization."""
+        """Discard the current sample and the known order of the messages."""
         self._current: SampleFrames | None = None
         self._synchronized = False
         self._missing = 0
@@ -129,90 +127,93 @@ class SampleAssembler:
         self.temperature: bytes | None = None
 
     def take_missing_samples(self) -> int:
-        """Return the number of bad and late samples since the last good sample, and set the number to 0."""
+        """Return the number of bad and late samples since the last good sample, and reset the number to 0."""
         missing, self._missing = self._missing, 0
         return missing
 
     def take_late_frame_delay_ns(self) -> int:
-        """Return the time from the first frame of a sample to the newest late frame of the sample, in ns.
-
-        The result is 0 if no frame has been late since the last call.
+        """Return the delay of the newest late frame relative to the first frame of the sample in ns, and reset the
+        delay.
         """
         delay_ns, self._delay_ns = self._delay_ns, 0
         return delay_ns
 
-    def add_frame(self, which: int, data: bytes, t_ns: int, done: list[SampleFrames]) -> None:
-        """Add one frame to the sample to which it belongs.
+    def add_frame(self, message_index: int, data: bytes, t_ns: int, finished: list[SampleFrames]) -> None:
+        """Add one CAN frame to the current or the next sample.
 
         Parameters
         ----------
-        which
+        message_index
             Index of the message.
         data
-            Bytes of the frame; b"" if it is too short.
+            Bytes of the frame; b"" if the frame is too short.
         t_ns
             Arrival time in ns.
-        done
+        finished
             List to which finished samples are appended.
         """
         if self._newest_ns is not None:
-            self._pauses[which].append(t_ns - self._newest_ns)
+            self._pauses[message_index].append(t_ns - self._newest_ns)
         self._newest_ns = t_ns
-        if not self._undecided and self._assign_frame(which, data, t_ns, done):
+        if not self._undecided and self._assign_frame(message_index, data, t_ns, finished):
             return
-        self._undecided.append((which, data, t_ns))
-        while self._undecided and self._assign_frame(*self._undecided[0], done):
+        self._undecided.append((message_index, data, t_ns))
+        while self._undecided and self._assign_frame(*self._undecided[0], finished):
             self._undecided.popleft()
 
-    def _assign_frame(self, which: int, data: bytes, t_ns: int, done: list[SampleFrames]) -> bool:
+    def _assign_frame(self, message_index: int, data: bytes, t_ns: int, finished: list[SampleFrames]) -> bool:
         """Add a frame to the current or the next sample. Return False if the order of the messages is unknown."""
-        count = self._read_count(which, data)
+        count = self._read_count(message_index, data)
         sample = self._current
         if sample is not None:
             delay_ns = t_ns - sample.start_ns
-            next_one = self._begins_next(sample, which, count, delay_ns)
+            next_one = self._begins_next(sample, message_index, count, delay_ns)
             if next_one is None:
                 return False
             if next_one:
                 if NO_TICK != count == self._count_before:
                     return True  # the frame belongs to the previous sample, which has already been counted
-                self._finish(sample, done)
+                self._finish(sample, finished)
                 sample = None
             elif delay_ns > self._window_ns:
                 self._delay_ns = delay_ns
-                self._add_late_frame(sample, which, data, done)
+                self._add_late_frame(sample, message_index, data, finished)
                 return True
         if sample is None:
             sample = self._current = SampleFrames([None] * self._n, t_ns, t_ns, NO_TICK)
-        sample.frames[which] = data
+        sample.frames[message_index] = data
         sample.t_ns = t_ns
         if count != NO_TICK:
             sample.count = count
         if sample.complete:
-            self._finish(sample, done)
+            self._finish(sample, finished)
             self._current = None
         return True
 
-    def _add_late_frame(self, sample: SampleFrames, which: int, data: bytes, done: list[SampleFrames]) -> None:
-        """Mark a message of the current sample as late."""
+    def _add_late_frame(
+        self, sample: SampleFrames, message_index: int, data: bytes, finished: list[SampleFrames]
+    ) -> None:
         if data:
-            sample.late.add(which)
+            sample.late.add(message_index)
         else:
-            sample.frames[which] = data  # the frame is too short, so the sample is bad
+            sample.frames[message_index] = data  # the frame is too short, so the sample is bad
         if sample.frames.count(None) == len(sample.late):
-            self._finish(sample, done)
+            self._finish(sample, finished)
             self._current = None
 
-    def _read_count(self, which: int, data: bytes) -> int:
-        """Return the counter value in a frame; NO_TICK if the frame contains no counter."""
-        bits = self._counters[which]
+    def _read_count(self, message_index: int, data: bytes) -> int:
+        bits = self._counters[message_index]
         if bits is None or not data or not self._by_count:
             return NO_TICK
         return int(bits.extract_raw(np.frombuffer(data, np.uint8)[None, :])[0])
 
-    def _begins_next(self, sample: SampleFrames, which: int, count: int, delay_ns: int) -> bool | None:
-        """Return True if a frame starts the next sample; None if this depends on the unknown order of the messages."""
-        if sample.frames[which] is not None or which in sample.late or which == self._counter_message:
+    def _begins_next(self, sample: SampleFrames, message_index: int, count: int, delay_ns: int) -> bool | None:
+        """Return True if a frame starts the next sample; None if the order of the messages must be known first."""
+        if (
+            sample.frames[message_index] is not None
+            or message_index in sample.late
+            or message_index == self._counter_message
+        ):
             return True
         if NO_TICK not in (count, sample.count):
             return count != sample.count
@@ -224,17 +225,17 @@ class SampleAssembler:
         pauses = [median(newest) if newest else 0 for newest in self._pauses]
         first = pauses.index(max(pauses)) if self._counter_message is None else self._counter_message
         # the sum of the pauses before all messages is the sample period
-        return which == first or delay_ns >= sum(pauses)
+        return message_index == first or delay_ns >= sum(pauses)
 
-    def _finish(self, sample: SampleFrames, done: list[SampleFrames]) -> None:
-        """Append a good sample to ``done``, or count a late or bad sample."""
+    def _finish(self, sample: SampleFrames, finished: list[SampleFrames]) -> None:
+        """Append a good sample to ``finished``, or increase the number of late or bad samples."""
         self._count_before = sample.count
         whole = sample.complete and b"" not in sample.frames
         if whole or (self._partial and any(sample.frames)):
             sample.missing_before = self.take_missing_samples()
             sample.temperature = self.temperature
             self._synchronized = True
-            done.append(sample)
+            finished.append(sample)
         elif sample.late and b"" not in sample.frames and sample.frames.count(None) == len(sample.late):
             self._synchronized = True
             self.dropped_late_samples += 1

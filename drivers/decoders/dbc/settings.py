@@ -15,7 +15,7 @@ COLUMNS: Final = (*AXES, TEMPERATURE)
 
 
 class SignalSettings(SettingsModel):
-    """Signal of one axis, with its unit and an additional factor."""
+    """Settings of the signal of one axis: name, unit and an additional factor."""
 
     signal: str = Field(examples=["RateOfTurn.RateX"], description='"Message.Signal"')
     unit: str = Field("", examples=["rad/s"], description="unit of the signal; absent: as the DBC says")
@@ -25,7 +25,7 @@ class SignalSettings(SettingsModel):
 
 
 def _signal(value: Any) -> Any:
-    """Return the table of a signal for its short form "Message.Signal" or "-Message.Signal"."""
+    """Convert the short form "Message.Signal" or "-Message.Signal" to the table of a signal."""
     if isinstance(value, str):
         return {"signal": value.removeprefix("-"), "factor": -1.0 if value.startswith("-") else 1.0}
     if not isinstance(value, dict | SignalSettings):
@@ -75,7 +75,7 @@ class Settings(SettingsModel):
     )
 
     def find_conflicts(self) -> Iterator[Conflict]:
-        """Yield a conflict if no axis is measured, or if the counter that joins samples is missing."""
+        """Yield a conflict if no axis is configured, or if ``join = "counter"`` has no counter."""
         if not self.signals:
             yield Conflict("signals", 'empty; it maps axes to signals: gz = "Message.Signal"')
         elif set(self.signals) == {TEMPERATURE}:

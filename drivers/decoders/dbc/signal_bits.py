@@ -1,7 +1,7 @@
-"""Extraction of one CAN signal from many frames at once, and insertion of a signal into frames.
+"""Extraction of a CAN signal from an array of frames, and insertion of a signal into frames.
 
-Frames are arrays [n, size] of bytes, and values are arrays [n]. Bits are numbered from the least significant bit of
-each byte for Intel signals, and from the most significant bit of each byte for Motorola signals.
+Frames are a uint8 array [n, size], and values are a float64 array [n]. Bits are numbered from the least significant bit
+of each byte for Intel signals, and from the most significant bit of each byte for Motorola signals.
 """
 
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ RawNumbers = NDArray[np.uint64]
 
 @dataclass(frozen=True, slots=True)
 class SignalBits:
-    """Position of a signal in its frame, and the conversion of its raw number to a physical value."""
+    """Position of a signal in a CAN frame, and the conversion from the raw number to a physical value."""
 
     first: int  # number of the first bit
     length: int
@@ -40,7 +40,6 @@ class SignalBits:
 
     @property
     def _bit_order(self) -> Literal["big", "little"]:
-        """Bit order for ``numpy.unpackbits`` and ``numpy.packbits``."""
         return "big" if self.big_endian else "little"
 
     def extract_raw(self, frames: Bytes) -> RawNumbers:
@@ -51,7 +50,7 @@ class SignalBits:
         return np.packbits(padded, axis=1, bitorder="little").view("<u8")[:, 0].astype(np.uint64)
 
     def extract_values(self, frames: Bytes) -> Floats:
-        """Return the values [n] of frames [n, size] in the unit of the DBC; NaN for indicators."""
+        """Return the values [n] of frames [n, size] in the unit of the DBC file; NaN for "error" or "not available"."""
         raw = self.extract_raw(frames)
         values = self._to_float(raw) * self.scale + self.offset
         if self.indicators:
@@ -67,7 +66,7 @@ class SignalBits:
         frames
             [n, size] uint8, changed in place.
         values
-            [n] float64 in the unit of the DBC. NaN is written as "not available" if the signal has this indicator.
+            [n] float64 in the unit of the DBC. NaN is written as "not available" if ``indicators`` is True.
         """
         with np.errstate(over="ignore"):
             raw = self._from_float((values - self.offset) / self.scale)
@@ -91,7 +90,6 @@ class SignalBits:
         frames[:] = np.packbits(bits, axis=1, bitorder=self._bit_order)
 
     def _to_float(self, raw: RawNumbers) -> Floats:
-        """Convert raw numbers to float64."""
         if self.is_float:
             bits = raw.astype(f"<u{self.length // 8}")
             with np.errstate(invalid="ignore"):  # the conversion of a signalling NaN gives a warning
@@ -103,7 +101,7 @@ class SignalBits:
         return raw.astype(np.float64)
 
     def _from_float(self, numbers: Floats) -> RawNumbers:
-        """Convert numbers to raw numbers, rounded and clipped. Only the lowest ``length`` bits are defined."""
+        """Convert numbers to raw numbers, rounded and clipped. The bits above ``length`` are undefined."""
         if self.is_float:
             bits: RawNumbers = numbers.astype(f"<f{self.length // 8}").view(f"<u{self.length // 8}").astype(np.uint64)
             return bits

@@ -10,7 +10,7 @@ from typing import Any, Final
 import typer
 from typer.exceptions import TyperException
 
-from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, format_one_line
+from drivers.errors import ConfigError, ImuError, NotReady, RecordingError, sanitize_error_text
 
 FAILED: Final = 1
 """Exit status of a failure at run time."""
@@ -37,7 +37,7 @@ def message_and_status(error: Exception) -> tuple[str, int]:
     """Return the message and the exit status for an error that ended a command."""
     match error:
         case TyperException():
-            return format_one_line(_usage(error)), WRONG
+            return sanitize_error_text(_usage(error)), WRONG
         case ConfigError() | RecordingError():
             return str(error), WRONG
         case NotReady():
@@ -47,7 +47,7 @@ def message_and_status(error: Exception) -> tuple[str, int]:
         case typer.Abort():
             return "interrupted", INTERRUPTED
         case OSError():
-            return format_one_line(_system_error(error)), FAILED
+            return sanitize_error_text(_system_error(error)), FAILED
         case MemoryError():
             why = f" ({cause})" if (cause := _cause(error)) else ""
             return f"not enough memory{why}; read less data, e.g. the end of a recording with --last 1h", FAILED
@@ -60,7 +60,7 @@ def message_and_status(error: Exception) -> tuple[str, int]:
 
 def _cause(error: Exception) -> str:
     """Return the text of an error in one line of limited length."""
-    text = " ".join(format_one_line(str(error)).split())
+    text = " ".join(sanitize_error_text(str(error)).split())
     return text if len(text) <= MAX_CAUSE_CHARACTERS else f"{text[:MAX_CAUSE_CHARACTERS]} …"
 
 

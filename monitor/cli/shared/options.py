@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Final, overload
 
 import typer
 
-from drivers.errors import ConfigError, format_one_line
+from drivers.errors import ConfigError, sanitize_error_text
 from drivers.number_ranges import (
     AVERAGING_TIME_S,
     DURATION_S,
@@ -121,7 +121,7 @@ def parse_averaging_times(text: str) -> "TauGrid":
         listed = tuple(float(part) for part in text.split(","))
     except ValueError:
         raise ConfigError(
-            f'--tau: "{format_one_line(text)[:60]}"; possible are octave, decade10, or seconds with commas'
+            f'--tau: "{sanitize_error_text(text)[:60]}"; possible are octave, decade10, or seconds with commas'
         ) from None
     if len(listed) > MAX_AVERAGING_TIMES:
         raise ConfigError(f"--tau: {len(listed)} averaging times; at most {MAX_AVERAGING_TIMES} are possible")
@@ -192,7 +192,7 @@ def read_noise_coefficients(source: Path) -> "NoiseCoefficients":
     from monitor.publishing.exporters import from_analysis_json, from_model
 
     try:
-        text = sys.stdin.buffer.read() if source == Path("-") else file_access.read_small_file(source, pipe=True)
+        text = sys.stdin.buffer.read() if source == Path("-") else file_access.read_small_file(source, allow_pipe=True)
         if text.lstrip().startswith(b"{"):
             return from_analysis_json(text, source.name)
         return from_model(NoiseModel.from_toml(text.decode()), source.name)

@@ -64,8 +64,8 @@ class CoefficientHistory(NumberHistory, frozen=True, kw_only=True):
     @classmethod
     def coefficient_from_history(cls, past: HistoryTable, value_column: str) -> Self:
         """Build the history of a coefficient from the value column, such as gz.N."""
-        value, bound = past.column(value_column), past.column(f"{value_column}.bound")
-        lo, hi = (past.column(f"{value_column}.{end}") for end in ("lo", "hi"))
+        value, bound = past.select_column(value_column), past.select_column(f"{value_column}.bound")
+        lo, hi = (past.select_column(f"{value_column}.{end}") for end in ("lo", "hi"))
         estimated, bounded = value.n > 0, bound.n > 0
         status = np.where(estimated, Status.ESTIMATED, np.where(bounded, Status.UPPER_BOUND, Status.UNESTIMATED))
         only_bounded = bounded & ~estimated
@@ -111,9 +111,9 @@ class DeviationHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
     @classmethod
     def deviations_from_history(cls, past: HistoryTable, axes: tuple[str, ...]) -> Self:
         """Build the history of the Allan deviations of the given axes."""
-        taus, found = past.taus(), {}
+        taus, found = past.list_tau_labels(), {}
         for axis in axes:
-            columns = [past.column(f"{axis}.sigma.{tau}") for tau in taus]
+            columns = [past.select_column(f"{axis}.sigma.{tau}") for tau in taus]
             if any(one.n.any() for one in columns):
                 n, low, high, last = (
                     np.column_stack([getattr(one, part) for one in columns]) for part in ("n", "low", "high", "last")
@@ -151,7 +151,7 @@ class StatusHistory(msgspec.Struct, frozen=True, kw_only=True, eq=False):
         """Build the history of states, sample counters and temperature."""
         counts: dict[str, Any] = {name: past.counts[:, i] for i, name in enumerate(COUNTS)}
         numbers: dict[str, Any] = {
-            name: NumberHistory.from_column(past.column(name)) for name in STATUS_COLUMNS if name in past.names
+            name: NumberHistory.from_column(past.select_column(name)) for name in STATUS_COLUMNS if name in past.names
         }
         return cls(state=[STATES[one] for one in past.state.tolist()], **counts, **numbers)
 
@@ -237,7 +237,7 @@ class HistoryMessage(Message, frozen=True, kw_only=True, tag=topics.HISTORY.sche
                 for symbol in query.symbols
             }
             for axis in query.axes
-            if axis in past.axes()
+            if axis in past.list_axes()
         }
         return cls(
             device=past.device,

@@ -94,15 +94,15 @@ def save_history_plot(past: HistoryTable, path: Path, axes: Sequence[str] = AXES
 
 
 def _estimated_coefficients(past: HistoryTable, axis: str) -> list[str]:
-    return [letter for letter in SYMBOLS if np.isfinite(past.column(f"{axis}.{letter}").last).any()]
+    return [letter for letter in SYMBOLS if np.isfinite(past.select_column(f"{axis}.{letter}").last).any()]
 
 
 def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str, axes: Sequence[str]) -> None:
     unit = COEFFICIENT_UNITS[kind][letter]
     lows, highs = [], []
     for axis in axes:
-        column, colour = past.column(f"{axis}.{letter}"), style.axis_colour(axis)
-        ends = [past.column(f"{axis}.{letter}.{end}").last for end in ("lo", "hi")]
+        column, colour = past.select_column(f"{axis}.{letter}"), style.axis_colour(axis)
+        ends = [past.select_column(f"{axis}.{letter}.{end}").last for end in ("lo", "hi")]
         t, low, high, last, lo, hi = _with_gaps(past, *(
             unit.factor * part for part in (column.low, column.high, column.last, *ends)
         ))  # fmt: skip
@@ -123,7 +123,7 @@ def _draw_coefficient(panel: "Axes", past: HistoryTable, kind: Kind, letter: str
 
 
 def _draw_temperature(panel: "Axes", past: HistoryTable) -> None:
-    column = past.column("temperature")
+    column = past.select_column("temperature")
     t, low, high, last = _with_gaps(past, column.low, column.high, column.last)
     if np.isfinite(last).any():
         style.draw_band(panel, t, low, high, style.ORANGE, alpha=EXTREMES_ALPHA)

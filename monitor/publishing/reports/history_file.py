@@ -50,7 +50,7 @@ def history_columns(past: HistoryTable) -> dict[str, Floats]:
         "width (s)": past.width_s.astype(np.float64),
     }
     for name in past.names:
-        course, unit = past.column(name), _column_unit(name)
+        course, unit = past.select_column(name), _column_unit(name)
         columns[f"{name} ({unit})"] = course.last
         if name.endswith((".lo", ".hi", ".bound")):
             continue

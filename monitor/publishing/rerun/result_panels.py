@@ -147,7 +147,7 @@ class SamplesPanel(Panel):
 
     def draw_history(self, history: HistoryTable) -> None:
         """Draw the stored temperature."""
-        temperature = history.column("temperature")
+        temperature = history.select_column("temperature")
         if np.isfinite(temperature.last).any():
             at, values = past_points.history_points(history, temperature, temperature.last, temperature.last)
             self.scene.log_scalars(self.entity_path("temperature"), at, values[:, 0])
@@ -320,8 +320,8 @@ class CoefficientsPanel(Panel):
     def draw_history(self, history: HistoryTable) -> None:
         """Draw the stored coefficients."""
         for symbol in SYMBOLS:
-            for axis in history.axes():
-                value, lo, hi = (history.column(f"{axis}.{symbol}{end}") for end in ("", ".lo", ".hi"))
+            for axis in history.list_axes():
+                value, lo, hi = (history.select_column(f"{axis}.{symbol}{end}") for end in ("", ".lo", ".hi"))
                 if np.isfinite(value.last).any():
                     at, values = past_points.history_points(history, value, lo.last, hi.last)
                     self.log_coefficient(symbol, axis, at, values)

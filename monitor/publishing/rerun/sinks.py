@@ -30,7 +30,7 @@ from urllib.parse import quote
 import rerun as rr
 import rerun_cli  # type: ignore[import-untyped]
 
-from drivers.file_access import check_regular
+from drivers.file_access import check_regular_file
 from monitor.common.folder_lock import LOCKS_UNSUPPORTED_ERRNOS
 from monitor.publishing.rerun.viewer_settings import ViewerClosed, ViewerError, ViewerSettings
 
@@ -262,7 +262,7 @@ def open_output(settings: ViewerSettings, recording_id: str, should_stop: Callab
 def _open_file(path: Path, recording_id: str) -> RerunOutput:
     try:
         if path.exists():
-            check_regular(path)  # opening a FIFO would block until a reader opens it
+            check_regular_file(path)  # opening a FIFO would block until a reader opens it
         lock = path.open("ab")
     except OSError as error:
         raise ViewerError(f"cannot write {path}: {error.strerror}") from error

@@ -54,7 +54,7 @@ def print_history(past: HistoryTable, axes: tuple[str, ...], symbols: tuple[str,
     """
     console.print(summary_line(past), highlight=False, soft_wrap=True)
     for kind in KINDS:
-        shown = [axis for axis in axes_of(kind) if axis in axes and axis in past.axes()]
+        shown = [axis for axis in axes_of(kind) if axis in axes and axis in past.list_axes()]
         if shown:
             console.print(Padding(_summary(past, kind, shown, symbols), (1, 0, 0, 0)))
     for line in _temperature_and_loss_lines(past):
@@ -81,7 +81,7 @@ def print_axis_history(past: HistoryTable, axis: str, symbols: tuple[str, ...], 
         table.add_column(f"{symbol} {unit_of(symbol, axis).name}", justify="right", no_wrap=True)
     for name in ("°C", "lost", "state"):
         table.add_column(name, justify="right")
-    temperature = past.column("temperature")
+    temperature = past.select_column("temperature")
     for p in range(len(past)):
         cells = [_cell(past, axis, symbol, p) for symbol in symbols]
         lost = int(past.counts[p, COUNTS.index("lost")])
@@ -125,7 +125,7 @@ def summary_line(past: HistoryTable) -> str:
 
 def _temperature_and_loss_lines(past: HistoryTable) -> list[str]:
     lines = []
-    temperature = past.column("temperature")
+    temperature = past.select_column("temperature")
     if temperature.n.any():
         low, high = np.nanmin(temperature.low), np.nanmax(temperature.high)
         lines.append(f"temperature {format_number(float(low))} … {format_number(float(high))} °C")
@@ -179,7 +179,7 @@ def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str
     middle_s = past.start_s + 0.5 * past.width_s
     for axis in axes:
         for symbol in symbols:
-            column, unit = past.column(f"{axis}.{symbol}"), unit_of(symbol, axis)
+            column, unit = past.select_column(f"{axis}.{symbol}"), unit_of(symbol, axis)
             label = Text.assemble((f"{axis} {symbol}", "bold"), f"  {unit.name}")
             there = column.last[np.isfinite(column.last)]
             if not there.size:
@@ -191,7 +191,7 @@ def _summary(past: HistoryTable, kind: Kind, axes: list[str], symbols: tuple[str
 
 
 def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
-    bound, unit = past.column(f"{axis}.{symbol}.bound"), unit_of(symbol, axis)
+    bound, unit = past.select_column(f"{axis}.{symbol}.bound"), unit_of(symbol, axis)
     there = bound.last[np.isfinite(bound.last)]
     if not there.size:
         return NO_VALUE, NO_VALUE, NO_VALUE
@@ -199,12 +199,12 @@ def _bound(past: HistoryTable, axis: str, symbol: str) -> tuple[str, str, str]:
 
 
 def _cell(past: HistoryTable, axis: str, symbol: str, p: int) -> str:
-    column, unit = past.column(f"{axis}.{symbol}"), unit_of(symbol, axis)
+    column, unit = past.select_column(f"{axis}.{symbol}"), unit_of(symbol, axis)
     low, high, last = (float(part[p]) * unit.factor for part in (column.low, column.high, column.last))
     if math.isfinite(last):
         alike = format_number(low) == format_number(high)
         return format_number(last) if alike else f"{format_number(last)} [{format_number(low)} … {format_number(high)}]"
-    bound = float(past.column(f"{axis}.{symbol}.bound").last[p]) * unit.factor
+    bound = float(past.select_column(f"{axis}.{symbol}.bound").last[p]) * unit.factor
     return f"≤ {format_number(bound)}" if math.isfinite(bound) else NO_VALUE
 
 

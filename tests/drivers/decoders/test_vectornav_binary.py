@@ -15,7 +15,7 @@ from drivers.data_types import (
     concatenate_blocks,
     make_block,
 )
-from drivers.decoders.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, find_layout
+from drivers.decoders.vectornav_binary import FIELD_SIZES, TICKS, Settings, build, build_message_dtype
 
 EXAMPLE_1 = bytes.fromhex("FA 01 08 00 93 50 2E 42 83 3E F1 3F 48 B5 04 BB 92 88")
 EXAMPLE_2_WRONG = bytes.fromhex("FA 05 08 00 01 00" + "00" * 20 + "A8 3A")
@@ -41,7 +41,7 @@ def vector(*numbers: float) -> bytes:
 def test_the_manuals_first_example_is_a_message_but_no_sample() -> None:
     decoder = build(Settings())
     assert decoder.feed([Chunk(EXAMPLE_1, 0)]) == []
-    form = find_layout(EXAMPLE_1[1:4], False)
+    form = build_message_dtype(EXAMPLE_1[1:4], False)
     assert form is not None
     assert form.itemsize == len(EXAMPLE_1)
     assert not {"gyro", "accel"} & {*(form.names or ())}

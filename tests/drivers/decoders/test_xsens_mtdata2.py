@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from drivers.data_types import NO_TICK, Chunk, CounterTimedFormat, SampleBlock, concatenate_blocks
-from drivers.decoders.xsens_mtdata2 import MAX_PAYLOAD, Settings, build, encode_message, match_message
+from drivers.decoders.xsens_mtdata2 import MAX_PAYLOAD, Settings, _match_message, build, encode_message
 
 DOCUMENTED = bytes.fromhex(
     "FA FF 36 31 10 20 02 DF C5 10 60 04 00 45 9D A0 40 20 0C BE DC 9A FA 3F 54 9F 37 41 1C BB 70"
@@ -21,12 +21,12 @@ LONG = bytes.fromhex(
 COMMANDS = bytes.fromhex("FA FF 30 00 D1 FA FF 31 00 D0 FA FF 10 00 F1")
 
 
-def item(did: int, data: bytes) -> bytes:
-    return struct.pack(">HB", did, len(data)) + data
+def item(data_id: int, data: bytes) -> bytes:
+    return struct.pack(">HB", data_id, len(data)) + data
 
 
-def floats(did: int, *numbers: float) -> bytes:
-    return item(did, struct.pack(f">{len(numbers)}f", *numbers))
+def floats(data_id: int, *numbers: float) -> bytes:
+    return item(data_id, struct.pack(f">{len(numbers)}f", *numbers))
 
 
 def decoded(data: bytes, **settings: object) -> SampleBlock | None:
@@ -165,4 +165,4 @@ def test_extended_length() -> None:
     assert got is not None
     assert got.values[0, 3:].tolist() == [1, 2, 3]
     too_long = b"\xfa\xff\x36\xff" + (MAX_PAYLOAD + 1).to_bytes(2, "big")
-    assert match_message(too_long, 0) == -1
+    assert _match_message(too_long, 0) == -1

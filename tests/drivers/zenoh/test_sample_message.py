@@ -41,7 +41,7 @@ def loose(payload: bytes) -> dict[str, Any]:
 def test_there_and_back(n: int, jitter_ns: int) -> None:
     sent = rows(n, jitter_ns)
     batch = decode_samples(encode_samples("bench-1", 1000, sent))
-    assert (batch.device, batch.samples, batch.block.lost) == ("bench-1", 1000, 4)
+    assert (batch.device, batch.total_samples, batch.block.lost) == ("bench-1", 1000, 4)
     np.testing.assert_array_equal(batch.block.values, sent.values)
     np.testing.assert_array_equal(batch.block.temperature_c, sent.temperature_c)
     # float64 of Unix seconds resolves 0.24 µs; the grid may be off by half a microsecond
@@ -72,7 +72,7 @@ def test_only_measured_columns_travel() -> None:
 
 def test_offset_makes_unix_time() -> None:
     sent = make_block(np.array([5_000_000_000]), np.ones((1, 6)))
-    assert decode_samples(encode_samples("d", 1, sent, offset_ns=START_NS)).block.t_ns[0] == pytest.approx(
+    assert decode_samples(encode_samples("d", 1, sent, unix_offset_ns=START_NS)).block.t_ns[0] == pytest.approx(
         START_NS + 5e9, abs=250
     )
 

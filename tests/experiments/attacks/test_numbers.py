@@ -26,7 +26,7 @@ from drivers.data_types import AXES
 from drivers.errors import ConfigError, ImuError
 from drivers.number_ranges import NumberRange
 from drivers.recordings import load_samples
-from drivers.settings_model import SettingsModel, WordOr, fields_by_key
+from drivers.settings_model import KeywordOrType, SettingsModel, fields_by_key
 from monitor import cli
 from monitor.commands.analyze import Request, run_analysis
 from monitor.common import shipped_config_paths as shipped_file_paths
@@ -307,7 +307,7 @@ def names_quantity(parts: Any) -> bool:
     """Whether a quantity is among annotations, or in a type that a word may replace."""
     if isinstance(parts, NumberRange):
         return True
-    if isinstance(parts, WordOr):
+    if isinstance(parts, KeywordOrType):
         return names_quantity(parts._kind)
     inner = parts if isinstance(parts, tuple | list) else (*get_args(parts), *getattr(parts, "__metadata__", ()))
     return any(names_quantity(one) for one in inner)

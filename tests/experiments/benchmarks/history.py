@@ -88,7 +88,7 @@ def years(path: Path, count: float) -> None:
     largest = 0
     for day in range(days):
         rows = course.day(day, rng)
-        store.add([(DEVICE, row) for row in rows], [(DEVICE, one) for one in _events(day, rng)])
+        store.write_rows_and_events([(DEVICE, row) for row in rows], [(DEVICE, one) for one in _events(day, rng)])
         written += len(rows)
         while store.merge_old_rows(math.inf, 1000):
             pass
@@ -101,9 +101,9 @@ def years(path: Path, count: float) -> None:
     print(f"{count:g} years of one device: {_size(path) / 1e6:.1f} MB (with its log at most {largest / 1e6:.1f} MB)")
     print(f"  {written:,} rows written and thinned, {took / written * 1e6:.0f} µs each")
     with open_history(path) as reader:
-        widths = [row.width_s for row in reader.rows(DEVICE, TimeRange(-math.inf, math.inf))]
+        widths = [row.width_s for row in reader.read_rows(DEVICE, TimeRange(-math.inf, math.inf))]
         print("  rows: " + ", ".join(f"{widths.count(one):,} of {one} s" for one in sorted(set(widths))))
-        print(f"  events: {reader.events(DEVICE, TimeRange(-math.inf, math.inf), 10**9)[1]:,}")
+        print(f"  events: {reader.read_events(DEVICE, TimeRange(-math.inf, math.inf), 10**9)[1]:,}")
 
 
 def queries(path: Path) -> None:
@@ -139,7 +139,7 @@ class _Course:
     def __init__(self, first: Estimate) -> None:
         numbers = ColumnConverter(first)
         self.names = (*numbers.names, *HEALTH_COLUMNS, *TEMPERATURE_COLUMNS)
-        values = np.concatenate([numbers.convert(first), [100.0, 0.02, 1.8e8, 25.0]])
+        values = np.concatenate([numbers.convert_estimate(first), [100.0, 0.02, 1.8e8, 25.0]])
         self._centre = values
         # wide for what a short window knows badly, narrow for rate and memory
         self._spread = np.array([_spread(name) for name in self.names])
@@ -193,7 +193,7 @@ def _events(day: int, rng: np.random.Generator) -> list[StoredEvent]:
 
 def _read(path: Path, span: TimeRange, asked: HistoryQuery) -> HistoryTable:
     with open_history(path) as reader:
-        return past.read_history(reader, DEVICE, span, asked.selects, asked.step_s)
+        return past.read_history(reader, DEVICE, span, asked.selects_column, asked.step_s)
 
 
 def _timed(work: Callable[[], object]) -> float:

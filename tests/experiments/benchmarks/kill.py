@@ -216,7 +216,7 @@ class Bench:
         with contextlib.closing(sqlite3.connect(f"file:{path}?mode=ro", uri=True)) as store:
             assert store.execute("PRAGMA integrity_check").fetchone() == ("ok",)
         with open_history(path) as reader:
-            starts = [row.start_s for row in reader.rows("bench", TimeRange(-np.inf, np.inf))]
+            starts = [row.start_s for row in reader.read_rows("bench", TimeRange(-np.inf, np.inf))]
         assert starts == sorted(set(starts))
 
     def _start(self) -> subprocess.Popen[bytes]:

@@ -22,7 +22,7 @@ import psutil
 
 from drivers.data_types import Chunk, make_block
 from drivers.decoders import vectornav_binary
-from drivers.driver import Counts
+from drivers.driver import SampleCounts
 from drivers.errors import LinkEnded, LinkLost
 from drivers.links.base import Carrier
 from drivers.recordings import segment_file as segment
@@ -193,8 +193,8 @@ def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Pa
             missing += piece.samples.lost
     print(f"recorded {recorded}, missing in the recording {missing}: sum {recorded + missing}")
     with open_history(store / "history.sqlite") as reader:
-        kept = list(reader.rows("soak", TimeRange(-np.inf, np.inf)))
-        _, events = reader.events("soak", TimeRange(-np.inf, np.inf), 1)
+        kept = list(reader.read_rows("soak", TimeRange(-np.inf, np.inf)))
+        _, events = reader.read_events("soak", TimeRange(-np.inf, np.inf), 1)
     print(f"history: {len(kept)} rows of {', '.join(sorted({f'{row.width_s} s' for row in kept}))}, {events} events")
     sums = [sum(row.counts[at] for row in kept) for at in range(3)]
     print(f"received, lost and bad of all its rows: {sums}")
@@ -208,7 +208,7 @@ def _tell(service: Service, wire: Wire, course: Course, took_s: float, store: Pa
     print(f"the window holds {estimator.samples_in_window if estimator is not None else 0} samples")
 
 
-def _sum(counts: Counts, truth: Truth) -> int:
+def _sum(counts: SampleCounts, truth: Truth) -> int:
     """A stretch of rubbish counts as a bad frame, too: nobody can tell that it never was one."""
     assert truth.flipped <= counts.bad <= truth.flipped + truth.rubbish
     return counts.received + counts.lost + truth.flipped

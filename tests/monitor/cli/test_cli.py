@@ -1253,7 +1253,7 @@ def histories(tmp_path_factory: pytest.TempPathFactory) -> Path:
             last = np.array([1.5e-4, 1.4e-4, 1.6e-4, 4e-5, 25.0], np.float32) * np.float32(rng.uniform(0.9, 1.1))
             start_s, n = 1_763_683_200 + 60 * i, np.full(5, 600)
             row = HistoryRow(start_s, 60, start_s + 59.0, names, n, last, last, last, (6000, 0, 0, 0), 1)
-            store.add(
+            store.write_rows_and_events(
                 [(device, row)], [(device, StoredEvent(start_s + 1.0, "moved", f"moved {i}"))] if i % 50 == 0 else []
             )
     store.close()

@@ -149,7 +149,7 @@ def test_a_running_device_whose_can_frames_are_late_says_so():
     for i, chunk in enumerate(sent):
         delay_ns = i % 2 * (8_000_000 if i // 2 == 30 else 1_000_000)
         rig.link.write(replace(chunk, t_ns=chunk.t_ns + delay_ns))
-    rig.station.driver.step()
+    rig.station.driver.run_once()
     health = rig.station.status.build_health({}, 0)
     assert health.state == "running"
     assert (health.received, health.bad, health.lost, health.late) == (49, 0, 1, 1)

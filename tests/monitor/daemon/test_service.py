@@ -247,13 +247,13 @@ record = false
     if rate_hz == 100.0:
         assert Status.ESTIMATED in published
         assert told.kinds >= {"limit_crossed", "model_disagrees"}
-        assert np.isfinite(kept.column("gz.N").last).any()
+        assert np.isfinite(kept.select_column("gz.N").last).any()
         assert Status.ESTIMATED in known.coefficients.coefficients.status
     else:
         assert published == {Status.UNESTIMATED}
         assert not told.kinds & {"limit_crossed", "model_disagrees"}
         assert all(look.axes == {} for look in told.gaps)
-        assert not np.isfinite(kept.column("gz.N").last).any()
+        assert not np.isfinite(kept.select_column("gz.N").last).any()
         assert set(known.coefficients.coefficients.status.ravel().tolist()) == {Status.UNESTIMATED}
         assert known.status is not None
         assert known.status.text == told.health_text

@@ -36,7 +36,9 @@ def main() -> None:
     store = HistoryStore(path)
     i = first
     while True:
-        store.add([("bench-1", row_of(i))], [("bench-1", StoredEvent(T0 + 60.0 * i, "moved", f"event {i}"))])
+        store.write_rows_and_events(
+            [("bench-1", row_of(i))], [("bench-1", StoredEvent(T0 + 60.0 * i, "moved", f"event {i}"))]
+        )
         print(i, flush=True)
         store.merge_old_rows(float("inf"), 5)
         i += 1

@@ -43,8 +43,8 @@ def kill_once(path: Path, first: int, rng: random.Random, within_s: float) -> Le
 def check(path: Path, acknowledged: int) -> Left:
     """Every minute in one row, none missing, sums and extremes exact."""
     with open_history(path) as reader:
-        rows = sorted(reader.rows("bench-1", ALL), key=lambda row: row.start_s)
-        events, in_all = reader.events("bench-1", ALL, 10_000_000)
+        rows = sorted(reader.read_rows("bench-1", ALL), key=lambda row: row.start_s)
+        events, in_all = reader.read_events("bench-1", ALL, 10_000_000)
     found = (rows[-1].end_s - T0) // 60 if rows[-1].width_s == 60 else _minutes(rows)
     assert found in (acknowledged, acknowledged + 1), (found, acknowledged)
     assert in_all == len(events) == found

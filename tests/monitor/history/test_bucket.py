@@ -58,7 +58,7 @@ def test_a_small_piece_that_unpacks_to_a_flood_is_refused() -> None:
 def test_extremes_are_those_of_the_numbers(looks: list[tuple[float, float, float]]) -> None:
     seen = RunningStatistics(NAMES)
     for look in looks:
-        seen.add(np.array(look))
+        seen.add_values(np.array(look))
     for i in range(3):
         there = [look[i] for look in looks if look[i] == look[i]]
         expected = (len(there), min(there), max(there), there[-1]) if there else (0, *[float("nan")] * 3)

@@ -13,7 +13,7 @@ from tests.monitor.publishing.made import estimate, terms, true_coefficients
 
 def kept(found):
     numbers = ColumnConverter(found)
-    return dict(zip(numbers.names, numbers.convert(found), strict=True))
+    return dict(zip(numbers.names, numbers.convert_estimate(found), strict=True))
 
 
 def test_each_letter_has_its_numbers_by_its_status() -> None:
@@ -74,9 +74,9 @@ def test_axes_that_are_not_measured_are_not_kept_and_new_ones_do_not_fit() -> No
     fewer = replace(found, curve=replace(found.curve, avar=avar))
     numbers = ColumnConverter(fewer)
     assert {name.split(".")[0] for name in numbers.names} == {"gx", "gy", "gz"}
-    assert numbers.is_compatible(fewer)
-    assert not numbers.is_compatible(found)
-    assert not numbers.is_compatible(replace(fewer, curve=replace(fewer.curve, tau_s=fewer.curve.tau_s * 1.1)))
+    assert numbers.matches_axes_and_taus(fewer)
+    assert not numbers.matches_axes_and_taus(found)
+    assert not numbers.matches_axes_and_taus(replace(fewer, curve=replace(fewer.curve, tau_s=fewer.curve.tau_s * 1.1)))
 
 
 def test_between_averaging_times_far_apart_nothing_is_made_up() -> None:

@@ -19,7 +19,9 @@ def test_all_at_once_in_any_order_and_a_range_keeps_its_semicolon() -> None:
         TimeRange(NOW - 3600.0, NOW - 1800.0), 900, ("coefficients", "deviations"), ("gz",), ("N", "B")
     )
     assert asked == expected
-    wanted = [name for name in ("gz.N", "gz.B.bound", "gz.K", "gx.N", "gz.sigma.1", "rate") if asked.selects(name)]
+    wanted = [
+        name for name in ("gz.N", "gz.B.bound", "gz.K", "gx.N", "gz.sigma.1", "rate") if asked.selects_column(name)
+    ]
     assert wanted == ["gz.N", "gz.B.bound", "gz.sigma.1"]
 
 

@@ -24,7 +24,7 @@ DAY_S = 86_400
 
 def kept(path: Path, rows: list[HistoryRow], events: tuple[StoredEvent, ...] = ()) -> None:
     store = HistoryStore(path)
-    store.add([("a", one) for one in rows], [("a", one) for one in events])
+    store.write_rows_and_events([("a", one) for one in rows], [("a", one) for one in events])
     while store.merge_old_rows(math.inf):
         pass
     store.close()
@@ -70,7 +70,7 @@ def test_every_bucket_has_the_sums_and_extremes_of_its_rows(
     for p in inner:
         inside = [one for one in rows if found.start_s[p] <= one.start_s < found.end_s[p]]
         for name in NAMES:
-            course = found.column(name)
+            course = found.select_column(name)
             numbers = (int(course.n[p]), *(float(part[p]) for part in (course.low, course.high, course.last)))
             assert same(numbers, together(inside, name))
         assert found.counts[p].tolist() == [sum(one.counts[i] for one in inside) for i in range(4)]
@@ -87,10 +87,10 @@ def test_nothing_asked_is_the_last_day(long: tuple[Path, list[HistoryRow]]) -> N
 
 
 def test_numbers_that_are_not_wanted_are_not_there(long: tuple[Path, list[HistoryRow]]) -> None:
-    found = read(long[0], None, wanted=lambda name: name == "rate")
+    found = read(long[0], None, wants_column=lambda name: name == "rate")
     assert found.names == ("rate",)
-    assert np.isnan(found.column("gz.N").last).all()
-    assert found.column("gz.N").n.sum() == 0
+    assert np.isnan(found.select_column("gz.N").last).all()
+    assert found.select_column("gz.N").n.sum() == 0
 
 
 def test_where_there_is_nothing_it_is_said_with_what_there_is(long: tuple[Path, list[HistoryRow]]) -> None:
@@ -123,7 +123,7 @@ def test_a_table_is_read_while_rows_are_written(tmp_path: Path) -> None:
     def write() -> None:
         store = HistoryStore(path)
         for i in range(1, 200):
-            store.add([("a", row(T0 + 60 * i, rng))])
+            store.write_rows_and_events([("a", row(T0 + 60 * i, rng))])
             store.merge_old_rows(math.inf)
         store.close()
         done.set()

@@ -37,7 +37,7 @@ def writing(path: Path) -> Iterator[HistoryStore]:
 
 def rows_in(path: Path, device: str = "a", span: TimeRange = ALL) -> list[HistoryRow]:
     with open_history(path) as reader:
-        return sorted(reader.rows(device, span), key=lambda one: one.start_s)
+        return sorted(reader.read_rows(device, span), key=lambda one: one.start_s)
 
 
 def thinned(store: HistoryStore, now_s: float) -> int:
@@ -58,9 +58,9 @@ def test_thinning_keeps_every_sum_and_extreme(
     rows = [row(T0 + 60 * int(i), rng) for i in minutes]
     cut = data.draw(st.integers(0, len(rows)))
     with writing(path) as store:
-        store.add([("a", one) for one in rows[:cut]])
+        store.write_rows_and_events([("a", one) for one in rows[:cut]])
         thinned(store, math.inf)  # at two ages: some rows are merged twice
-        store.add([("a", one) for one in rows[cut:]])
+        store.write_rows_and_events([("a", one) for one in rows[cut:]])
         thinned(store, math.inf)
     found = rows_in(path)
     newest_s = rows[-1].end_s
@@ -81,7 +81,7 @@ def test_rows_have_the_widths_of_their_age(tmp_path: Path) -> None:
     ages_s = {60: 6 * DAY_S, 900: 80 * DAY_S, 21_600: 200 * DAY_S}
     newest_s = T0 + 200 * DAY_S
     with writing(path) as store:
-        store.add([("a", row(newest_s - age_s, rng)) for age_s in (*ages_s.values(), 0)])
+        store.write_rows_and_events([("a", row(newest_s - age_s, rng)) for age_s in (*ages_s.values(), 0)])
         assert thinned(store, math.inf) == 3  # one twice
         assert thinned(store, math.inf) == 0
     assert [one.width_s for one in rows_in(path)] == [21_600, 900, 60, 60]
@@ -90,7 +90,7 @@ def test_rows_have_the_widths_of_their_age(tmp_path: Path) -> None:
 def test_a_clock_that_was_ahead_once_does_not_age_what_is_new(tmp_path: Path) -> None:
     path, rng = tmp_path / "h.sqlite", np.random.default_rng(2)
     with writing(path) as store:
-        store.add([("a", row(T0 + 50 * 365 * DAY_S, rng)), ("a", row(T0, rng))])
+        store.write_rows_and_events([("a", row(T0 + 50 * 365 * DAY_S, rng)), ("a", row(T0, rng))])
         assert thinned(store, T0 + 60.0) == 0
     assert [one.width_s for one in rows_in(path)] == [60, 60]
 
@@ -99,10 +99,10 @@ def test_a_bucket_that_comes_again_is_added_wherever_it_is_by_now(tmp_path: Path
     path, rng = tmp_path / "h.sqlite", np.random.default_rng(3)
     old, new, again = row(T0, rng), row(T0 + 30 * DAY_S, rng), row(T0 + 120, rng)
     with writing(path) as store:
-        store.add([("a", old), ("a", new)])
-        store.add([("a", new)])
+        store.write_rows_and_events([("a", old), ("a", new)])
+        store.write_rows_and_events([("a", new)])
         assert thinned(store, math.inf) == 1
-        store.add([("a", again)])
+        store.write_rows_and_events([("a", again)])
     first, last = rows_in(path)
     assert (first.width_s, last.width_s) == (900, 60)
     for name in NAMES:
@@ -113,13 +113,13 @@ def test_a_bucket_that_comes_again_is_added_wherever_it_is_by_now(tmp_path: Path
 def test_devices_do_not_mix_and_spans_are_kept_to(tmp_path: Path) -> None:
     path, rng = tmp_path / "h.sqlite", np.random.default_rng(4)
     with writing(path) as store:
-        store.add([(device, row(T0 + 60 * i, rng)) for i in range(5) for device in ("a", "b")])
-        store.add([("c", row(T0, rng))])
+        store.write_rows_and_events([(device, row(T0 + 60 * i, rng)) for i in range(5) for device in ("a", "b")])
+        store.write_rows_and_events([("c", row(T0, rng))])
     with open_history(path) as reader:
-        assert reader.devices() == ("a", "b", "c")
+        assert reader.list_devices() == ("a", "b", "c")
         assert reader.stored_range("a") == (T0, T0 + 300)
         assert reader.stored_range("nobody") is None
-        assert list(reader.rows("nobody", ALL)) == []
+        assert list(reader.read_rows("nobody", ALL)) == []
     some = rows_in(path, "b", TimeRange(T0 + 61.0, T0 + 180.0, end_included=False))
     assert [one.start_s - T0 for one in some] == [60, 120]
 
@@ -129,22 +129,22 @@ def test_a_transaction_is_whole_or_has_not_happened(tmp_path: Path) -> None:
     broken = StoredEvent(T0, "moved", "x", sigma=object())  # type: ignore[arg-type]
     with writing(path) as store:
         with pytest.raises((RecordingError, sqlite3.Error)):
-            store.add([("new", row(T0, rng, names=("other",)))], [("new", broken)])
-        store.add([("a", row(T0, rng))])
+            store.write_rows_and_events([("new", row(T0, rng, names=("other",)))], [("new", broken)])
+        store.write_rows_and_events([("a", row(T0, rng))])
     with open_history(path) as reader:
-        assert reader.devices() == ("a",)
+        assert reader.list_devices() == ("a",)
 
 
 def test_a_reader_sees_one_moment_while_a_writer_goes_on(tmp_path: Path) -> None:
     path, rng = tmp_path / "h.sqlite", np.random.default_rng(6)
     with writing(path) as store:
-        store.add([("a", row(T0 + 60 * i, rng)) for i in range(15)])
+        store.write_rows_and_events([("a", row(T0 + 60 * i, rng)) for i in range(15)])
         with open_history(path) as reader:
             before = reader.stored_range("a")
-            store.add([("a", row(T0 + 30 * DAY_S, rng))])
+            store.write_rows_and_events([("a", row(T0 + 30 * DAY_S, rng))])
             assert thinned(store, math.inf) == 1
             assert reader.stored_range("a") == before
-            assert [one.width_s for one in reader.rows("a", ALL)] == [60] * 15
+            assert [one.width_s for one in reader.read_rows("a", ALL)] == [60] * 15
     assert [one.width_s for one in rows_in(path)] == [900, 60]
 
 
@@ -162,7 +162,7 @@ def test_two_writers_share_a_file(tmp_path: Path) -> None:
         with writing(path) as store:
             for i in range(30):
                 own = row(T0 + 60 * i, np.random.default_rng([seed, i]))
-                store.add([(device, own), ("both", row(T0, np.random.default_rng(i)))])
+                store.write_rows_and_events([(device, own), ("both", row(T0, np.random.default_rng(i)))])
 
     threads = [threading.Thread(target=write, args=(name, i)) for i, name in enumerate("ab")]
     for thread in threads:
@@ -183,7 +183,7 @@ def event(t_s: float, kind: str = "moved", sigma: float | None = None, axis: str
 
 def events_in(path: Path, span: TimeRange = ALL, at_most: int = 10_000_000) -> tuple[list[StoredEvent], int]:
     with open_history(path) as reader:
-        return reader.events("a", span, at_most)
+        return reader.read_events("a", span, at_most)
 
 
 def test_events_come_back_as_they_were(tmp_path: Path) -> None:
@@ -191,8 +191,8 @@ def test_events_come_back_as_they_were(tmp_path: Path) -> None:
     told = [event(T0 + i, sigma=float(i), axis="gz") for i in range(10)]
     odd = StoredEvent(T0 + 20.0, "limit_crossed", "∞ \n", None, {"N": {"limit": math.nan}}, None, None)
     with writing(path) as store:
-        store.add([], [("a", one) for one in (*told[::-1], odd)])
-        store.add([], [("b", told[0])])
+        store.write_rows_and_events([], [("a", one) for one in (*told[::-1], odd)])
+        store.write_rows_and_events([], [("b", told[0])])
     found, count = events_in(path)
     assert (found[:10], count) == (told, 11)
     assert math.isnan(found[10].what["N"]["limit"])
@@ -211,7 +211,7 @@ def test_too_many_events_leave_the_first_the_last_and_the_surest_and_are_counted
         for second in np.sort(rng.choice(DAY_S, 40, replace=False)).tolist()
     ]
     with writing(path) as store:
-        store.add([], [("a", one) for one in told])
+        store.write_rows_and_events([], [("a", one) for one in told])
         thinned(store, math.inf)
     found, _ = events_in(path)
     assert sum(one.represented_events for one in found) == len(told)
@@ -227,7 +227,7 @@ def test_a_flood_of_events_for_years_stays_bounded(tmp_path: Path, monkeypatch: 
     path = tmp_path / "h.sqlite"
     with writing(path) as store:
         for month in range(60):
-            store.add([], [("a", event(T0 + 30 * DAY_S * month + 3600 * i)) for i in range(100)])
+            store.write_rows_and_events([], [("a", event(T0 + 30 * DAY_S * month + 3600 * i)) for i in range(100)])
             store.merge_old_rows(math.inf)
     found, _ = events_in(path)
     assert len(found) <= 300
@@ -249,7 +249,7 @@ def test_what_is_not_a_history_is_said_and_left_alone(tmp_path: Path) -> None:
     with contextlib.closing(sqlite3.connect(other)) as db:
         db.execute("CREATE TABLE mine (x)")
     with writing(newer) as store:
-        store.add([("a", row(T0, np.random.default_rng(1)))])
+        store.write_rows_and_events([("a", row(T0, np.random.default_rng(1)))])
     with contextlib.closing(sqlite3.connect(newer)) as db:
         db.execute("PRAGMA user_version = 99")
     empty.touch()
@@ -271,16 +271,18 @@ def test_what_is_not_a_history_is_said_and_left_alone(tmp_path: Path) -> None:
 def test_damage_anywhere_is_a_line_or_does_not_matter(tmp_path: Path, seed: int) -> None:
     path, rng = tmp_path / "h.sqlite", np.random.default_rng(seed)
     with writing(path) as store:
-        store.add([("a", row(T0 + 60 * i, rng)) for i in range(200)], [("a", event(T0 + i)) for i in range(50)])
+        store.write_rows_and_events(
+            [("a", row(T0 + 60 * i, rng)) for i in range(200)], [("a", event(T0 + i)) for i in range(50)]
+        )
     data = bytearray(path.read_bytes())
     for at in rng.integers(0, len(data), 400).tolist():
         data[at] = int(rng.integers(0, 256))
     path.write_bytes(data[: int(rng.integers(len(data) // 2, len(data) + 1))])
     with contextlib.suppress(RecordingError), open_history(path) as reader:
-        list(reader.rows("a", ALL))
-        reader.events("a", ALL, 1000)
+        list(reader.read_rows("a", ALL))
+        reader.read_events("a", ALL, 1000)
     with contextlib.suppress(RecordingError, sqlite3.OperationalError), writing(path) as store:
-        store.add([("a", row(T0 + 60 * i, rng)) for i in range(200)], [("a", event(T0))])
+        store.write_rows_and_events([("a", row(T0 + 60 * i, rng)) for i in range(200)], [("a", event(T0))])
         store.merge_old_rows(math.inf)
 
 
@@ -289,7 +291,7 @@ def test_a_history_in_a_folder_that_cannot_be_written_is_read(tmp_path: Path) ->
     folder = tmp_path / "h"
     path = folder / "h.sqlite"
     with writing(path) as store:
-        store.add([("a", row(T0, np.random.default_rng(1)))])
+        store.write_rows_and_events([("a", row(T0, np.random.default_rng(1)))])
     before = sorted(folder.iterdir())
     os.chmod(path, 0o444)
     os.chmod(folder, 0o555)

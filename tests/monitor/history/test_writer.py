@@ -38,7 +38,7 @@ def started(path: Path) -> Iterator[HistoryWriter]:
 
 def count(path: Path) -> tuple[int, int]:
     with open_history(path) as reader:
-        return len(list(reader.rows("a", ALL))), reader.events("a", ALL, 1000)[1]
+        return len(list(reader.read_rows("a", ALL))), reader.read_events("a", ALL, 1000)[1]
 
 
 def fill(writer: HistoryWriter, n: int, first: int = 0) -> None:

@@ -59,7 +59,7 @@ def test_the_summary_has_first_last_extremes_and_what_happened() -> None:
     past = made()
     text = printed(history_text.print_history, past, AXES, ("N", "R"))
     assert "bench-1: 2025-11-21 00:00 to 2025-11-22 00:00 UTC, 44 rows of 30 min, 7,920,000 samples" in text
-    n = past.column("gz.N")
+    n = past.select_column("gz.N")
     unit = unit_of("N", "gz")
     (line,) = [line for line in text.splitlines() if line.startswith("gz N")]
     for number in (n.last[0], n.last[-1], n.low.min(), n.high.max()):
@@ -96,7 +96,7 @@ def test_a_file_has_every_number_with_its_unit(tmp_path: Path, suffix: str) -> N
     history_file.save_history(past, path)
     columns = history_file.history_columns(past)
     assert {"t (Unix s)", "gz.N (rad/sqrt(s))", "gz.N high (rad/sqrt(s))", "az.R.bound (m/s^3)"} <= set(columns)
-    np.testing.assert_array_equal(columns["gz.N high (rad/sqrt(s))"], past.column("gz.N").high)
+    np.testing.assert_array_equal(columns["gz.N high (rad/sqrt(s))"], past.select_column("gz.N").high)
     np.testing.assert_array_equal(columns["lost (samples)"], past.counts[:, 1])
     found = read_back(path, suffix)
     assert list(found) == list(columns)

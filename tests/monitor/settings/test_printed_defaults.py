@@ -11,7 +11,7 @@ from drivers import module_lookup as discovery
 from drivers.decoders.dbc.settings import SignalSettings
 from drivers.driver import AxisMap
 from drivers.errors import ConfigError
-from drivers.settings_model import SettingsModel, fields_by_key, find_model
+from drivers.settings_model import SettingsModel, fields_by_key, find_settings_model
 from monitor.commands.check import check_configuration
 from monitor.settings import printed_defaults
 from monitor.settings.driver_settings import FaultsTable, link_names, link_settings
@@ -73,7 +73,7 @@ def test_every_key_has_a_description_and_something_to_print(model: type[Settings
     for key, info in fields_by_key(model).items():
         assert info.description, key
         nothing = info.is_required() or info.default in (None, (), frozenset(), Path())
-        assert not nothing or info.examples or find_model(info.annotation), key
+        assert not nothing or info.examples or find_settings_model(info.annotation), key
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: f"{model.__module__}.{model.__name__}")
@@ -100,7 +100,7 @@ def test_the_file_is_a_valid_configuration(tmp_path: Path) -> None:
 def test_the_file_has_every_table_with_every_key() -> None:
     text = printed_defaults.format_defaults()
     for key, info in fields_by_key(ConfigFile).items():
-        model = find_model(info.annotation)
+        model = find_settings_model(info.annotation)
         assert model is not None
         block = next(one for one in uncommented(text).split("\n[") if one.lstrip("[").startswith(f"{key}]"))
         own = {"driver", "axes", "limit"} if model is Device else set()

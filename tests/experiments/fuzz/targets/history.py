@@ -44,7 +44,7 @@ def history_question(data: bytes) -> None:
     if asked.span is not None:
         assert not math.isnan(asked.span.start_s)
         assert asked.span.start_s <= asked.span.end_s
-    again = parse_query(asked.parameters(), NOW_S)
+    again = parse_query(asked.format_parameters(), NOW_S)
     assert (again.step_s, again.what, again.axes, again.symbols) == (
         asked.step_s,
         asked.what,

@@ -111,7 +111,7 @@ def samples_message(data: bytes) -> None:
     rows = batch.block
     assert (np.abs(rows.t_ns) < 1 << 62).all()
     if (np.diff(rows.t_ns) > 0).all():
-        again = decode_samples(encode_samples(batch.device, batch.samples, rows)).block
+        again = decode_samples(encode_samples(batch.device, batch.total_samples, rows)).block
         assert np.array_equal(again.values, rows.values, equal_nan=True)
         assert np.abs(again.t_ns - rows.t_ns).max() <= 1100, "times that came back as others"
 

@@ -144,15 +144,15 @@ def test_a_segment_that_is_packed_while_it_is_opened_is_read_whole(
     for first in range(0, 100, 10):
         writer.write_samples([rows(first, 10)], DaemonState())
     writer.close()
-    opened = segment.open_regular
+    opened = segment.open_regular_file
 
     def open_then_pack(name: Path) -> IO[bytes]:
         file = opened(name)
-        monkeypatch.setattr(segment, "open_regular", opened)
+        monkeypatch.setattr(segment, "open_regular_file", opened)
         list(segment.compress_segment(path))
         return file
 
-    monkeypatch.setattr(segment, "open_regular", open_then_pack)
+    monkeypatch.setattr(segment, "open_regular_file", open_then_pack)
     found = read(path)
     pieces = [found] if isinstance(found, segment.SegmentPiece) else list(found)  # type: ignore[call-overload]
     assert segment.read_metadata(path).packed

@@ -90,13 +90,15 @@ def test_what_is_read_is_what_was_kept() -> None:
     np.testing.assert_array_equal(found.counts, kept.counts)
     np.testing.assert_array_equal(found.state, kept.state)
     names = [f"{axis}.{letter}" for axis in AXES for letter in SYMBOLS]
-    for name in [*names, "rate", "memory", "temperature", *(f"gz.sigma.{tau}" for tau in kept.taus())]:
+    for name in [*names, "rate", "memory", "temperature", *(f"gz.sigma.{tau}" for tau in kept.list_tau_labels())]:
         for part in ("low", "high", "last"):
-            np.testing.assert_array_equal(getattr(found.column(name), part), getattr(kept.column(name), part), name)
+            np.testing.assert_array_equal(
+                getattr(found.select_column(name), part), getattr(kept.select_column(name), part), name
+            )
     for name in names:
-        np.testing.assert_array_equal(found.column(name).n, kept.column(name).n)
+        np.testing.assert_array_equal(found.select_column(name).n, kept.select_column(name).n)
         for end in (".lo", ".hi", ".bound"):
-            np.testing.assert_array_equal(found.column(name + end).last, kept.column(name + end).last)
+            np.testing.assert_array_equal(found.select_column(name + end).last, kept.select_column(name + end).last)
 
 
 def test_a_bound_within_a_bucket_of_estimates_is_not_shown_as_its_interval() -> None:

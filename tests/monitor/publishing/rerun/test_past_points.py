@@ -38,8 +38,8 @@ def made(values: list[tuple[float, float, float] | None]) -> HistoryTable:
 
 def test_an_extreme_within_the_interval_is_no_point_and_one_beyond_is() -> None:
     past = made([(0.98, 1.0, 1.02), (0.5, 1.0, 2.0), (1.0, 1.0, 1.0)])
-    course = past.column("gz.N")
-    at, values = history_points(past, course, past.column("gz.N.lo").last, past.column("gz.N.hi").last)
+    course = past.select_column("gz.N")
+    at, values = history_points(past, course, past.select_column("gz.N.lo").last, past.select_column("gz.N.hi").last)
     np.testing.assert_allclose(at - T0, [60, 80, 100, 120, 180, 180], atol=0.01)
     np.testing.assert_array_equal(values[:, 0], np.float32([1.0, 0.5, 2.0, 1.0, 1.0, np.nan]))
     np.testing.assert_allclose(values[:-1, 1:], [[0.9, 1.1]] * 5, rtol=1e-6)
@@ -48,7 +48,7 @@ def test_an_extreme_within_the_interval_is_no_point_and_one_beyond_is() -> None:
 def test_a_minute_without_anything_is_a_gap() -> None:
     past = made([(1.0, 1.0, 1.0), None, (1.0, 1.0, 1.0)])
     nothing = np.full(2, np.nan)
-    at, values = history_points(past, past.column("gz.N"), nothing, nothing)
+    at, values = history_points(past, past.select_column("gz.N"), nothing, nothing)
     np.testing.assert_allclose(at - T0, [60, 60, 180, 180], atol=0.01)
     np.testing.assert_array_equal(np.isnan(values[:, 0]), [False, True, False, True])
     assert np.isnan(values[:, 1:]).all()
