@@ -33,7 +33,7 @@ from monitor.cli import (
 )
 from monitor.cli import check as check_config
 from monitor.cli import simulate as simulate_recording
-from monitor.cli.shared.errors import DEBUG, INTERRUPTED, message_and_status
+from monitor.cli.shared.errors import DEBUG, INTERRUPTED, error_message_and_exit_status
 
 # This must precede the import of NumPy. The matrices are small, and the program has its own threads for the work.
 # Additional threads of the linear algebra libraries would only use processor time.
@@ -115,7 +115,7 @@ def main() -> None:
     except Exception as error:  # noqa: BLE001 - any other error is printed in one line, with a request to report it
         if debug:
             traceback.print_exc()
-        line, status = message_and_status(error)
+        line, status = error_message_and_exit_status(error)
         if isinstance(error, OSError):
             _discard_output()
         if not isinstance(error, BrokenPipeError):  # the reader of the output has gone, so a message is useless
@@ -142,7 +142,7 @@ def report_failed_thread(debug: bool, failed: threading.ExceptHookArgs) -> None:
         if debug:
             traceback.print_exception(error)
         thread = "a thread" if failed.thread is None else f'thread "{failed.thread.name}"'
-        print(f"imu-monitor: {thread} ended: {message_and_status(error)[0]}", file=sys.stderr, flush=True)  # noqa: T201
+        print(f"imu-monitor: {thread} ended: {error_message_and_exit_status(error)[0]}", file=sys.stderr, flush=True)  # noqa: T201
 
 
 def _ignore_impossible_width(environment: MutableMapping[str, str]) -> None:

@@ -36,24 +36,26 @@ def analyze(
     output.check_output_file("--plot", plot, ".png", ".html")
     window_s = options.parse_duration("--window", window)
     last_s = options.parse_duration("--last", last)
-    wanted = offline.Request(
+    wanted = offline.AnalysisRequest(
         recording, rate, options.parse_averaging_times(tau), window_s, rest, bool(json or plot), last_s
     )
     try:
-        with output.show_progress() as tell:
+        with output.show_progress_bar() as tell:
             output.compile_analysis_kernels(tell)
             results = offline.run_analysis(wanted, tell)
     except offline.TooFewSamples as error:
         if json is not None:
-            output.write_bytes("--json", json, FailedAnalysisMessage(error.samples, [str(error)]).encode() + b"\n")
+            output.write_file_or_stdout(
+                "--json", json, FailedAnalysisMessage(error.samples, [str(error)]).encode() + b"\n"
+            )
         raise
     if json is not None:
         message = AnalysisMessage.of(
             results.analysis, results.total, results.hadamard, results.dynamic, results.without_temperature
         )
-        output.write_bytes("--json", json, message.encode() + b"\n")
+        output.write_file_or_stdout("--json", json, message.encode() + b"\n")
     if plot is not None:
-        offline.draw_plots(results, plot, recording.name)
+        offline.save_plot_or_report(results, plot, recording.name)
     if json != Path("-"):
         output.print_analysis(results.analysis)
     if results.lacking:

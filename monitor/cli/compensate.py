@@ -44,12 +44,12 @@ def compensate(
             raise ConfigError(f"{option}: {place} is also the output file of --out; choose another name")
     service_in_terminal.exit_on_sigterm()
     last_s = options.parse_duration("--last", last)
-    wanted = compensating.Request(recording, out, method, rate, options.parse_arma_order(order), last_s)
-    with output.show_progress() as tell:
+    wanted = compensating.CompensationRequest(recording, out, method, rate, options.parse_arma_order(order), last_s)
+    with output.show_progress_bar() as tell:
         output.compile_analysis_kernels(tell)
         result = compensating.run_compensation(wanted, tell)
     if json is not None:
-        output.write_bytes("--json", json, text.encode_compensation(result) + b"\n")
+        output.write_file_or_stdout("--json", json, text.encode_compensation(result) + b"\n")
     if plot is not None:
         from monitor.publishing.plots.compensate_plot import save_compensation_plot
 

@@ -25,9 +25,11 @@ def doctor(
     from monitor.commands import doctor as checks
 
     output.check_output_file("--json", json)
-    findings = checks.examine(config)
+    findings = checks.examine_machine(config)
     if json is not None:
-        output.write_bytes("--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n")
+        output.write_file_or_stdout(
+            "--json", json, msgspec.json.encode({"schema": SCHEMA, "findings": findings}) + b"\n"
+        )
     if json != Path("-"):
         _print(findings)
     if checks.worst_mark(findings) == "wrong":

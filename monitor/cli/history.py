@@ -10,7 +10,7 @@ import typer
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
 from monitor.cli.shared import options, output
-from monitor.cli.shared.errors import name_option
+from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:
     from monitor.history.history_table import HistoryTable
@@ -70,7 +70,7 @@ def history(
     live = connect is not None or zenoh is not None
     if source is not None and live:
         raise ConfigError(f"{source}: give either a file or --connect, not both")
-    with name_option("--step"):
+    with name_option_in_config_errors("--step"):
         step_s = None if step is None else max(int(parse_duration_s(step)), 1)
     axes = AXES if axis is None else (axis,)
     asked = HistoryQuery(_span(since, until), step_s, PARTS, axes)
@@ -95,7 +95,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
     if json is not None:
         newest_s = float(past.end_s[-1]) if len(past) else past.span.end_s
         message = HistoryMessage.reply(past, asked, newest_s, int(past.counts[:, 0].sum()))
-        output.write_bytes("--json", json, message.encode() + b"\n")
+        output.write_file_or_stdout("--json", json, message.encode() + b"\n")
     if out is not None:
         history_file.save_history(past, out)
     if plot is not None:
@@ -115,22 +115,22 @@ def _from_file(source: Path | None, name: str | None) -> Get:
     with open_history(path) as reader:
         device = _select_device(name, list(reader.devices()), str(path))
 
-    def get(asked: "HistoryQuery") -> "HistoryTable":
+    def query_file(query: "HistoryQuery") -> "HistoryTable":
         with open_history(path) as reader:
-            return past.read_history(reader, device, asked.span, asked.selects, asked.step_s)
+            return past.read_history(reader, device, query.span, query.selects, query.step_s)
 
-    return get
+    return query_file
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
     """Return a function that queries the history of a running daemon over zenoh."""
     from monitor.publishing.zenoh.history_client import query_histories
 
-    def get(asked: "HistoryQuery") -> "HistoryTable":
-        found = {one.device: one for one in query_histories(endpoint, name or "*", asked.parameters(), prefix, file)}
+    def query_daemon(query: "HistoryQuery") -> "HistoryTable":
+        found = {one.device: one for one in query_histories(endpoint, name or "*", query.parameters(), prefix, file)}
         return found[_select_device(name, list(found), mask_secrets(endpoint or str(file)))]
 
-    return get
+    return query_daemon
 
 
 def _history_path(source: Path) -> Path:
@@ -179,9 +179,9 @@ def _span(since: str | None, until: str | None) -> "TimeRange | None":
     if since is None and until is None:
         return None
     now_s = time.time()
-    with name_option("--from"):
+    with name_option_in_config_errors("--from"):
         start_s = float("-inf") if since is None else parse_time(since, now_s)
-    with name_option("--to"):
+    with name_option_in_config_errors("--to"):
         end_s = float("inf") if until is None else parse_time(until, now_s)
     if end_s <= start_s:
         raise ConfigError(f"--to: {until} is not after --from {since}")

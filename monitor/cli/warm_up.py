@@ -25,15 +25,15 @@ def warm_up(from_stdin: Annotated[bool, typer.Option("--from-stdin", hidden=True
         )
     cold = [group for group in kernel_parts.GROUPS if not kernel_compilation.is_warm(group)]
     begun_s = time.monotonic()
-    with output.show_progress() as show:
+    with output.show_progress_bar() as show:
 
-        def tell(progress: kernel_compilation.Progress) -> None:
+        def report_progress(progress: kernel_compilation.Progress) -> None:
             show(str(progress), progress.share)
             if not sys.stderr.isatty():
                 typer.echo(progress, err=True)
 
         for group in cold:
-            for _ in kernel_compilation.prepare_kernels(group, tell):
+            for _ in kernel_compilation.prepare_kernels(group, report_progress):
                 pass
     parts = sum(len(group.parts) for group in cold)
     done = f"compiled {parts} parts in {time.monotonic() - begun_s:.0f} s" if cold else "nothing to compile"

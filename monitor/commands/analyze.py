@@ -20,7 +20,7 @@ from drivers.data_types import AXES, Ints, SampleBlock
 from drivers.errors import ConfigError, NotReady
 from drivers.recordings import iter_blocks, load_samples
 from monitor.commands.progress import ProgressCallback, ignore_progress
-from monitor.drift.thermal.temperature_removal import TemperatureRemoval, remove_temperature, temperature_varied
+from monitor.drift.thermal.temperature_removal import TemperatureRemoval, remove_temperature_effect, temperature_varied
 from monitor.estimation.allan.batch import TauGrid
 from monitor.estimation.allan.dynamic_allan import DynamicAllan, compute_dynamic_allan
 from monitor.estimation.allan.hadamard import HadamardCurve, hadamard_curve
@@ -49,7 +49,7 @@ class TooFewSamples(NotReady):
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class AnalysisRequest:
     """Recording to analyse and results to compute."""
 
     recording: Path
@@ -62,7 +62,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Results:
+class AnalysisResults:
     """Results of an analysis."""
 
     analysis: Analysis
@@ -75,14 +75,14 @@ class Results:
     )
 
 
-def run_analysis(request: Request, tell: ProgressCallback = ignore_progress) -> Results:
+def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = ignore_progress) -> AnalysisResults:
     """Read a recording and analyse it.
 
     Parameters
     ----------
-    request : Request
+    request : AnalysisRequest
         Recording to analyse and results to compute.
-    tell : callable, optional
+    report_progress : callable, optional
         Progress callback.
 
     Raises
@@ -94,7 +94,7 @@ def run_analysis(request: Request, tell: ProgressCallback = ignore_progress) -> 
         If the recording has too few samples for any result.
     """
     try:
-        return _make(request, tell)
+        return _make(request, report_progress)
     except MemoryError as error:
         raise ConfigError(
             f"{request.recording}: the analysis needs more memory than is free; use only the end with --last, or "
@@ -102,7 +102,7 @@ def run_analysis(request: Request, tell: ProgressCallback = ignore_progress) -> 
         ) from error
 
 
-def _make(request: Request, tell: ProgressCallback) -> Results:
+def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
     """Read a recording and analyse it, with a pool of threads."""
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
@@ -126,19 +126,19 @@ def _make(request: Request, tell: ProgressCallback) -> Results:
         found_all = replace(
             found_all,
             notes=(*found_all.notes, *said, *([lacking] if lacking else [])),
-            axes_of_temperature=() if without is None else without.axes_of_temperature,
+            axes_of_temperature=() if without is None else without.axes_explained_by_temperature,
         )
-        return Results(found_all, total, hadamard, courses, lacking, without)
+        return AnalysisResults(found_all, total, hadamard, courses, lacking, without)
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def draw_plots(results: Results, path: Path, title: str) -> None:
+def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> None:
     """Draw the results as a picture, or write them as a page if the file name ends in .html.
 
     Parameters
     ----------
-    results : Results
+    results : AnalysisResults
         Results to draw.
     path : Path
         File to write.
@@ -170,10 +170,12 @@ def _without_temperature(
     if not temperature_varied(np.concatenate([samples.temperature_c for samples in blocks])):
         return None
     _, temperature_c, _, _ = resample_with_temperature(blocks, rate_hz)
-    return remove_temperature(result, temperature_c)
+    return remove_temperature_effect(result, temperature_c)
 
 
-def _dynamic_curves(result: Analysis, request: Request, tell: ProgressCallback) -> tuple[DynamicAllan | None, str]:
+def _dynamic_curves(
+    result: Analysis, request: AnalysisRequest, tell: ProgressCallback
+) -> tuple[DynamicAllan | None, str]:
     """Return the dynamic curves if they are requested, or the reason why they are missing."""
     if request.window_s is None:
         return None, ""

@@ -35,7 +35,7 @@ BLOCK_ROWS: Final = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class CompensationRequest:
     """Recording to compensate and method to use."""
 
     recording: Path
@@ -46,14 +46,16 @@ class Request:
     last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
-def run_compensation(request: Request, tell: ProgressCallback = ignore_progress) -> CompensationResult:
+def run_compensation(
+    request: CompensationRequest, report_progress: ProgressCallback = ignore_progress
+) -> CompensationResult:
     """Compensate a recording and write the result.
 
     Parameters
     ----------
-    request : Request
+    request : CompensationRequest
         Recording to compensate and method to use.
-    tell : callable, optional
+    report_progress : callable, optional
         Progress callback.
 
     Returns
@@ -71,7 +73,7 @@ def run_compensation(request: Request, tell: ProgressCallback = ignore_progress)
     """
     if request.method not in METHODS:
         raise ConfigError(f'--method: unknown method "{request.method}"{format_suggestion(request.method, METHODS)}')
-    tell("reading", None)
+    report_progress("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     axes = tuple(axis for axis in GYROS if axis in found.axes)
     if not axes:
@@ -79,8 +81,8 @@ def run_compensation(request: Request, tell: ProgressCallback = ignore_progress)
     values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     orders = ORDERS if request.order is None else (request.order,)
     live = Compensator(rate_hz, adapts=request.method != "fixed", orders=orders)
-    out = _run(live, values, tell)
-    intervals = tuple(live.take_intervals())
+    out = _run(live, values, report_progress)
+    intervals = tuple(live.take_finished_intervals())
     rest = _at_rest(intervals, len(values), live.interval_samples)
     learned, judged = _split_learning(rest)
     if not judged.any():
@@ -89,13 +91,13 @@ def run_compensation(request: Request, tell: ProgressCallback = ignore_progress)
             "so the drift cannot be learned"
         )
     if request.method in REFERENCE_METHODS:
-        out = _compensate_offline(request.method, values, learned, axes, tell)
-    tell("evaluating", None)
+        out = _compensate_offline(request.method, values, learned, axes, report_progress)
+    report_progress("evaluating", None)
     judged_axes: dict[str, AxisCompensation] = {
         str(axis): _evaluate_axis(AXES.index(axis), values, out, learned, judged, live, intervals) for axis in axes
     }
     start_s = 0.0 if found.t_s is None else float(found.t_s[0])
-    _write(request.out, found.axes, start_s + np.arange(len(values)) / rate_hz, out, temperature_c, tell)
+    _write(request.out, found.axes, start_s + np.arange(len(values)) / rate_hz, out, temperature_c, report_progress)
     return CompensationResult(
         recording=request.recording.name,
         out=request.out,
@@ -167,7 +169,9 @@ def _evaluate_axis(
     return AxisCompensation(
         model=None
         if model is None
-        else fit_arma(*live.identification_means_and_variance(at), [model.order], intervals=True),
+        else fit_arma(
+            *live.means_and_noise_variance_for_identification(at), [model.order], with_confidence_intervals=True
+        ),
         uncompensated=score_at_rest(np.where(judged[:, at], before, np.nan)[first:], live.rate_hz),
         compensated=score_at_rest(np.where(judged[:, at], out[:, at], np.nan)[first:], live.rate_hz),
         rejected_intervals=int((became == REJECTED).sum()),

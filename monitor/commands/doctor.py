@@ -80,7 +80,7 @@ class Finding:
 _well, _doubt, _wrong = partial(Finding, "well"), partial(Finding, "doubt"), partial(Finding, "wrong")
 
 
-def examine(path: Path | None = None) -> list[Finding]:
+def examine_machine(config_path: Path | None = None) -> list[Finding]:
     """Check the machine, and the configuration if a path is given."""
     machine = [
         *check_library_versions(),
@@ -89,15 +89,15 @@ def examine(path: Path | None = None) -> list[Finding]:
         check_clock(),
         *_check_systemd_unit(),
     ]
-    if path is None:
+    if config_path is None:
         return machine
-    config, mistakes = check_configuration(path, pipe=True)
+    config, mistakes = check_configuration(config_path, pipe=True)
     found = [_wrong("configuration", line) for line in mistakes]
     if config is not None:
-        found.append(_well("configuration", f"{path}: {format_count(len(config.devices), 'device')}"))
+        found.append(_well("configuration", f"{config_path}: {format_count(len(config.devices), 'device')}"))
     found += machine
-    if path.is_file():
-        found.append(_check_permissions(path))
+    if config_path.is_file():
+        found.append(_check_permissions(config_path))
     if config is not None:
         found += _check_configured(config)
     return found
@@ -188,12 +188,12 @@ def _processes_using(port: Path) -> Iterator[str]:
                 yield f"{(process / 'comm').read_text().strip()} (pid {process.name})"
 
 
-def check_can_interface(about: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")) -> Finding:
+def check_can_interface(subject: str, interface: str, channel: str, sysfs: Path = Path("/sys/class/net")) -> Finding:
     """Check that the package for a CAN interface is installed, and that a socketcan interface exists and is up.
 
     Parameters
     ----------
-    about : str
+    subject : str
         Subject of the finding.
     interface : str
         Interface of python-can.
@@ -204,11 +204,11 @@ def check_can_interface(about: str, interface: str, channel: str, sysfs: Path = 
     """
     if missing := describe_missing_package(interface):
         text, _, command = missing.partition(": ")
-        return _wrong(about, text, command)
+        return _wrong(subject, text, command)
     if interface != "socketcan":
-        return _well(about, f"{interface} {channel}: not checked")
+        return _well(subject, f"{interface} {channel}: not checked")
     if not hasattr(socket, "AF_CAN"):
-        return _wrong(about, "this system has no socketcan", "use another interface of python-can")
+        return _wrong(subject, "this system has no socketcan", "use another interface of python-can")
     network = sysfs / channel
     up = f"sudo ip link set {channel} up type can bitrate 500000, with the bit rate of the bus"
     try:
@@ -216,12 +216,12 @@ def check_can_interface(about: str, interface: str, channel: str, sysfs: Path = 
     except OSError:
         types = [one for one in sysfs.glob("*/type") if os.access(one, os.R_OK) and one.read_text().strip() == CAN_TYPE]
         there = ", ".join(sorted(one.parent.name for one in types)) or "none"
-        return _wrong(about, f"{channel}: no such interface; existing CAN interfaces: {there}", up)
+        return _wrong(subject, f"{channel}: no such interface; existing CAN interfaces: {there}", up)
     if kind != CAN_TYPE:
-        return _wrong(about, f"{channel}: not a CAN interface", up)
+        return _wrong(subject, f"{channel}: not a CAN interface", up)
     if not flags & 1:  # IFF_UP
-        return _wrong(about, f"{channel}: is down", up)
-    return _well(about, f"{channel}: is up")
+        return _wrong(subject, f"{channel}: is down", up)
+    return _well(subject, f"{channel}: is up")
 
 
 # --- outputs
@@ -257,27 +257,27 @@ def _parse_endpoint(about: str, endpoint: str, failure: str) -> tuple[str, int] 
     return match[1], int(match[2])
 
 
-def check_port_free(about: str, endpoint: str) -> Finding:
+def check_port_free(subject: str, endpoint: str) -> Finding:
     """Check that a port is free, by listening on the port for a moment.
 
     Parameters
     ----------
-    about : str
+    subject : str
         Subject of the finding.
     endpoint : str
         Zenoh endpoint.
     """
-    address = _parse_endpoint(about, endpoint, "cannot listen")
+    address = _parse_endpoint(subject, endpoint, "cannot listen")
     if isinstance(address, Finding):
         return address
     try:
         with socket.create_server(address, family=socket.AF_INET6 if ":" in address[0] else socket.AF_INET):
-            return _well(about, f"{endpoint}: free")
+            return _well(subject, f"{endpoint}: free")
     except (OSError, UnicodeError) as error:
         if getattr(error, "errno", None) == errno.EADDRINUSE:
             do = "no problem if it is this service; otherwise end it, or choose another port"
-            return _doubt(about, f"{endpoint}: another program listens there", do)
-        return _wrong(about, f"{endpoint}: cannot listen: {getattr(error, 'strerror', None) or error}")
+            return _doubt(subject, f"{endpoint}: another program listens there", do)
+        return _wrong(subject, f"{endpoint}: cannot listen: {getattr(error, 'strerror', None) or error}")
 
 
 def _check_reachable(about: str, endpoint: str) -> Finding:
@@ -383,26 +383,32 @@ def recorded_bytes_per_day(config: Config) -> float | None:
     return None if len(known) < len(rates) else sum(known) * DAY_S * each
 
 
-def check_disk_space(own: Storage, a_day: float | None, total: int, available: int) -> Finding:
+def check_disk_space(storage: Storage, bytes_per_day: float | None, total_bytes: int, free_bytes: int) -> Finding:
     """Check that the disk has enough space for the data to be kept.
 
     Parameters
     ----------
-    own : Storage
+    storage : Storage
         Settings of the storage.
-    a_day : float or None
+    bytes_per_day : float or None
         Disk use per day in bytes; None if unknown.
-    total : int
+    total_bytes : int
         Size of the disk in bytes.
-    available : int
+    free_bytes : int
         Free space of the disk in bytes.
     """
-    allowed = available - (1.0 - own.disk_share) * total
-    if a_day is None:
-        text = f"{own.folder}: {_gb(available)} free; disk use per day unknown, since a device has no configured rate"
+    allowed = free_bytes - (1.0 - storage.disk_share) * total_bytes
+    if bytes_per_day is None:
+        text = (
+            f"{storage.folder}: {_gb(free_bytes)} free; disk use per day unknown, since a device has no configured rate"
+        )
         return _doubt("storage", text, "add rate to every device")
-    wanted, days = a_day * own.keep_s / DAY_S, max(allowed, 0.0) / a_day if a_day else float("inf")
-    text = f"{own.folder}: {_gb(available)} free, about {_gb(a_day)} per day, {_gb(wanted)} for the whole time of keep"
+    wanted = bytes_per_day * storage.keep_s / DAY_S
+    days = max(allowed, 0.0) / bytes_per_day if bytes_per_day else float("inf")
+    text = (
+        f"{storage.folder}: {_gb(free_bytes)} free, about {_gb(bytes_per_day)} per day, "
+        f"{_gb(wanted)} for the whole time of keep"
+    )
     if allowed <= 0.0 or days < 1.0:
         do = "free disk space, or record on another disk"
         return _wrong("storage", f"{text}: not enough for one day below disk_share", do)
@@ -450,14 +456,14 @@ def required_libraries() -> Iterator[tuple[str, str, bool]]:
             yield match[1], match[2].replace(" ", ""), extra is not None
 
 
-def version_satisfies(version: str, wanted: str) -> bool:
+def version_satisfies(version: str, bounds: str) -> bool:
     """Return True if a version is within bounds like ``>=0.41,<0.42``. Bounds of another kind are ignored.
 
     Parameters
     ----------
     version : str
         Version of the installed library.
-    wanted : str
+    bounds : str
         Bounds, separated by commas.
 
     Examples
@@ -466,8 +472,8 @@ def version_satisfies(version: str, wanted: str) -> bool:
     (True, False)
     """
     compare = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt, "==": operator.eq}
-    bounds = re.findall(r"(>=|<=|==|>|<)\s*([\d.]+)", wanted)
-    return all(compare[sign](_numbers(version), _numbers(bound)) for sign, bound in bounds)
+    pairs = re.findall(r"(>=|<=|==|>|<)\s*([\d.]+)", bounds)
+    return all(compare[sign](_numbers(version), _numbers(bound)) for sign, bound in pairs)
 
 
 def _check_shadowed_packages(module_path: Sequence[str]) -> list[Finding]:
@@ -527,26 +533,27 @@ def _check_systemd_unit() -> list[Finding]:
         said = subprocess.run(command, capture_output=True, text=True, timeout=10.0, check=False).stdout
     except (OSError, subprocess.TimeoutExpired) as error:
         return [_doubt("systemd", f"the state is unknown: {error}")]
-    return check_unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
+    return check_systemd_unit_state(dict(line.split("=", 1) for line in said.splitlines() if "=" in line))
 
 
-def check_unit_state(seen: Mapping[str, str]) -> list[Finding]:
+def check_systemd_unit_state(unit_properties: Mapping[str, str]) -> list[Finding]:
     """Return the findings for the output of ``systemctl show``; none if there is no such unit.
 
     Examples
     --------
-    >>> check_unit_state({"LoadState": "not-found"})
+    >>> check_systemd_unit_state({"LoadState": "not-found"})
     []
     """
-    if seen.get("LoadState") != "loaded":
+    if unit_properties.get("LoadState") != "loaded":
         return []
-    active, restarts = seen.get("ActiveState", ""), seen.get("NRestarts", "0")
-    text = f"{UNIT}: {active} ({seen.get('SubState', '')}), {restarts} restarts, {seen.get('UnitFileState', '')}"
-    if active == "failed":
+    state, restarts = unit_properties.get("ActiveState", ""), unit_properties.get("NRestarts", "0")
+    enabled = unit_properties.get("UnitFileState", "")
+    text = f"{UNIT}: {state} ({unit_properties.get('SubState', '')}), {restarts} restarts, {enabled}"
+    if state == "failed":
         return [_wrong("systemd", text, f"journalctl -u {UNIT} -e shows the reason")]
-    if active != "active" or restarts != "0":
+    if state != "active" or restarts != "0":
         return [_doubt("systemd", text, f"journalctl -u {UNIT} -e; systemctl enable --now {UNIT}")]
-    if seen.get("UnitFileState") != "enabled":
+    if enabled != "enabled":
         return [_doubt("systemd", text, f"systemctl enable {UNIT}; otherwise it does not start with the machine")]
     return [_well("systemd", text)]
 

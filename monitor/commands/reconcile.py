@@ -38,7 +38,7 @@ REPORT: Final = "report.json"
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class ReconciliationRequest:
     """Recording and model to compare."""
 
     recording: Path
@@ -62,14 +62,16 @@ class ComparisonRequest:
     last_s: float | None = None  # length of the end of each recording that is used; None for all
 
 
-def run_reconciliation(request: Request, tell: ProgressCallback = ignore_progress) -> Reconciliation:
+def run_reconciliation(
+    request: ReconciliationRequest, report_progress: ProgressCallback = ignore_progress
+) -> Reconciliation:
     """Compare one recording with a model and write the report.
 
     Parameters
     ----------
-    request : Request
+    request : ReconciliationRequest
         Recording and model to compare.
-    tell : callable, optional
+    report_progress : callable, optional
         Progress callback.
 
     Raises
@@ -79,30 +81,32 @@ def run_reconciliation(request: Request, tell: ProgressCallback = ignore_progres
     NotReady
         If the data do not support an answer. The report states the reason.
     """
-    tell("reading", None)
+    report_progress("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     create_report_folder(request.out)
     try:
         recording, notes = _to_regular_grid(found)
         with ThreadPoolExecutor(os.cpu_count()) as pool:
-            result = reconcile(recording, request.model, request.seed, pool.map, lambda what: tell(what, None))
+            result = reconcile(
+                recording, request.model, request.seed, pool.map, lambda what: report_progress(what, None)
+            )
     except NotReady as error:
         _write(request.out / REPORT, _encode_failure(str(error), len(found)))
         raise
     result = replace(result, notes=(*request.notes, *found.notes, *notes, *result.notes))
-    tell("writing", None)
+    report_progress("writing", None)
     _write_report(result, request.out, request.recording.name)
     return result
 
 
-def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = ignore_progress) -> Comparison:
+def compare_recordings(request: ComparisonRequest, report_progress: ProgressCallback = ignore_progress) -> Comparison:
     """Compare several recordings with a model and with each other, and write the reports.
 
     Parameters
     ----------
     request : ComparisonRequest
         Recordings and model to compare.
-    tell : callable, optional
+    report_progress : callable, optional
         Progress callback.
 
     Raises
@@ -122,9 +126,11 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = igno
         notes = (
             (f"The model under test consists of the five noise terms of {fitted_to}.",) if fitted_to and at > 1 else ()
         )
-        one = Request(path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s)
+        one = ReconciliationRequest(
+            path, model, request.out / name, request.seed, request.rate_hz, notes, request.last_s
+        )
         try:
-            result = run_reconciliation(one, _tell_for(tell, f"{name}, {at} of {len(named)}"))
+            result = run_reconciliation(one, _tell_for(report_progress, f"{name}, {at} of {len(named)}"))
         except NotReady as error:
             silent[name] = str(error)
             if model is None:
@@ -137,7 +143,7 @@ def compare_recordings(request: ComparisonRequest, tell: ProgressCallback = igno
         why = f"at least two recordings are needed for a comparison, but only {len(runs)} can be evaluated: {why}"
         _write(request.out / REPORT, _encode_failure(why, 0, comparison_report.SCHEMA))
         raise NotReady(why)
-    tell("writing", None)
+    report_progress("writing", None)
     comparison = compare_results(runs, fitted_to, silent)
     _write_comparison(comparison, request.out)
     return comparison

@@ -32,7 +32,7 @@ CHUNK_ROWS: Final = 1 << 16
 
 
 @dataclass(frozen=True, slots=True)
-class Request:
+class SimulationRequest:
     """Recording to simulate."""
 
     model: NoiseModel
@@ -46,7 +46,7 @@ class Request:
 
 
 @dataclass(frozen=True, slots=True)
-class Result:
+class SimulationResult:
     """Description of the written recording."""
 
     out: Path
@@ -58,16 +58,16 @@ class Result:
     truth: Path | None
 
     @property
-    def seconds(self) -> float:
+    def duration_s(self) -> float:
         """Length of the recording in seconds."""
         return self.samples / self.rate_hz
 
-    def text(self) -> str:
+    def describe_in_one_line(self) -> str:
         """Return the description in one line of text."""
         columns = " ".join([*self.axes, *(["temperature"] if self.temperature else [])])
         beside = f"; truth in {self.truth}" if self.truth else ""
         return (
-            f"{self.out}: {self.samples} samples at {self.rate_hz:g} Hz, {self.seconds:.6g} s, "
+            f"{self.out}: {self.samples} samples at {self.rate_hz:g} Hz, {self.duration_s:.6g} s, "
             f"seed {self.seed}: {columns}{beside}"
         )
 
@@ -79,7 +79,7 @@ class Result:
                 "out": str(self.out),
                 "samples": self.samples,
                 "rate": self.rate_hz,
-                "seconds": self.seconds,
+                "seconds": self.duration_s,
                 "seed": self.seed,
                 "axes": self.axes,
                 "temperature": self.temperature,
@@ -88,19 +88,19 @@ class Result:
         )
 
 
-def run_simulation(request: Request, tell: ProgressCallback = ignore_progress) -> Result:
+def run_simulation(request: SimulationRequest, report_progress: ProgressCallback = ignore_progress) -> SimulationResult:
     """Simulate a recording and write it.
 
     Parameters
     ----------
-    request : Request
+    request : SimulationRequest
         Recording to simulate.
-    tell : callable, optional
+    report_progress : callable, optional
         Progress callback.
 
     Returns
     -------
-    Result
+    SimulationResult
         Description of the written recording.
 
     Raises
@@ -119,7 +119,7 @@ def run_simulation(request: Request, tell: ProgressCallback = ignore_progress) -
     axes = tuple(axis for axis in AXES if axis in request.model.effects)
     if not axes:
         raise ConfigError(f"{request.name}: the model has no axis; possible are {' '.join(AXES)}")
-    tell("preparing", None)
+    report_progress("preparing", None)
     temperature_c = _temperature(request, rate_hz, n)
     try:
         stream = request.model.stream(rate_hz, request.seed, temperature_c)
@@ -128,17 +128,17 @@ def run_simulation(request: Request, tell: ProgressCallback = ignore_progress) -
     first = stream.draw_with_temperature(min(n, CHUNK_ROWS))
     temperature = not bool(np.isnan(first.temperature_c).all())
     truth = request.out.with_name(request.out.name + ".truth.json") if request.truth else None
-    result = Result(request.out, n, rate_hz, request.seed, axes, temperature, truth)
+    result = SimulationResult(request.out, n, rate_hz, request.seed, axes, temperature, truth)
     if truth is None:
-        _write(result, stream, first, tell)
+        _write(result, stream, first, report_progress)
     else:
         with atomic_write_path(truth) as part:
-            _write(result, stream, first, tell)
+            _write(result, stream, first, report_progress)
             part.write_bytes(_truth(result, request.model, stream))
     return result
 
 
-def _write(result: Result, stream: ModelStream, first: SimulatedSamples, tell: ProgressCallback) -> None:
+def _write(result: SimulationResult, stream: ModelStream, first: SimulatedSamples, tell: ProgressCallback) -> None:
     """Write the recording block by block."""
     with open_recording_writer(result.out, result.axes, result.temperature) as append:
         block, written = first, 0
@@ -152,7 +152,7 @@ def _write(result: Result, stream: ModelStream, first: SimulatedSamples, tell: P
         tell("finishing the file", None)  # some formats are compressed only at the end
 
 
-def _rate_hz(request: Request) -> float:
+def _rate_hz(request: SimulationRequest) -> float:
     """Return the requested sample rate, or else the rate of the model."""
     rate_hz = request.rate_hz or request.model.sample_rate_hz
     if rate_hz is None:
@@ -160,7 +160,7 @@ def _rate_hz(request: Request) -> float:
     return rate_hz
 
 
-def _temperature(request: Request, rate_hz: float, n: int) -> Floats | None:
+def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats | None:
     """Return the temperature of the recording at the times of the samples, [≤ n] in °C, by linear interpolation.
 
     None means that the temperature of the model is used.
@@ -188,7 +188,7 @@ def _load_recording(path: Path, rate_hz: float | None) -> Recording:
         return load_samples(path, rate_hz)
 
 
-def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:
+def _truth(result: SimulationResult, model: NoiseModel, stream: ModelStream) -> bytes:
     """Return the truth as JSON."""
     return msgspec.json.encode(
         {
@@ -197,7 +197,7 @@ def _truth(result: Result, model: NoiseModel, stream: ModelStream) -> bytes:
             "model": tomllib.loads(model.to_toml()),
             "seed": result.seed,
             "rate": result.rate_hz,
-            "seconds": result.seconds,
+            "seconds": result.duration_s,
             "samples": result.samples,
             "axes": result.axes,
             "drawn": stream.drawn_values(),

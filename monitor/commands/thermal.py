@@ -25,7 +25,7 @@ from monitor.drift.thermal.thermal_results import (
     ThermalFitReport,
     ThermalPredictionReport,
     choose_interval_s,
-    compare_with_means,
+    compare_model_with_means,
 )
 from monitor.estimation.regular_grid import resample_with_temperature
 
@@ -56,7 +56,7 @@ class _ModelFile(msgspec.Struct):
     axes: dict[str, _AxisModelRecord]
 
 
-def fit_recording(
+def fit_thermal_models(
     recording: Path, interval_s: float | None = None, rate_hz: float | None = None, last_s: float | None = None
 ) -> ThermalFitReport:
     """Fit a thermal model to each axis of a recording.
@@ -88,7 +88,7 @@ def fit_recording(
     return ThermalFitReport(recording.name, interval, means, fits, refused, notes)
 
 
-def predict_recording(
+def predict_bias_of_recording(
     recording: Path, models: Mapping[str, ThermalModel], rate_hz: float | None = None, last_s: float | None = None
 ) -> ThermalPredictionReport:
     """Predict the bias of a recording with thermal models of an earlier recording.
@@ -115,17 +115,17 @@ def predict_recording(
     for axis, one in means.items():
         if axis not in models:
             refused[axis] = "the model file has no model of this axis"
-        elif one.known.sum() < 2:
+        elif one.both_known.sum() < 2:
             refused[axis] = f"fewer than two intervals of {interval:g} s"
         else:
-            judged[axis] = compare_with_means(models[axis], one)
+            judged[axis] = compare_model_with_means(models[axis], one)
     return ThermalPredictionReport(recording.name, interval, means, judged, refused, notes)
 
 
-def encode_model_file(study: ThermalFitReport) -> bytes:
+def encode_model_file(report: ThermalFitReport) -> bytes:
     """Return the content of the model file with all axes that were fitted."""
-    rows = {axis: _row(one.model) for axis, one in study.fits.items()}
-    return msgspec.json.format(msgspec.json.encode(_ModelFile(SCHEMA, study.interval_s, rows)), indent=1)
+    rows = {axis: _row(one.model) for axis, one in report.fits.items()}
+    return msgspec.json.format(msgspec.json.encode(_ModelFile(SCHEMA, report.interval_s, rows)), indent=1)
 
 
 def read_model_file(path: Path) -> dict[str, ThermalModel]:

@@ -25,7 +25,7 @@ MAX_CAUSE_CHARACTERS: Final = 300
 
 
 @contextlib.contextmanager
-def name_option(option: str) -> Iterator[None]:
+def name_option_in_config_errors(option: str) -> Iterator[None]:
     """Put the name of an option in front of the message of a ConfigError."""
     try:
         yield
@@ -33,7 +33,7 @@ def name_option(option: str) -> Iterator[None]:
         raise ConfigError(f"{option}: {error}") from None
 
 
-def message_and_status(error: Exception) -> tuple[str, int]:
+def error_message_and_exit_status(error: Exception) -> tuple[str, int]:
     """Return the message and the exit status for an error that ended a command."""
     match error:
         case TyperException():

@@ -19,7 +19,7 @@ from drivers.number_ranges import (
     Number,
     NumberRange,
 )
-from monitor.cli.shared.errors import name_option
+from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:
     from monitor.drift.compensation.arma import Order
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 MAX_AVERAGING_TIMES: Final = 1000
 
 
-def range_callback(quantity: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
+def make_range_callback(allowed_range: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
     """Return a typer callback that checks the value of an option against the range of a quantity.
 
     Raises
@@ -38,13 +38,13 @@ def range_callback(quantity: NumberRange) -> Callable[[typer.CallbackParam, Numb
         If the value is outside the supported range. The message begins with the name of the option.
     """
 
-    def check(option: typer.CallbackParam, value: Number | None) -> Number | None:
+    def check_option_value(option: typer.CallbackParam, value: Number | None) -> Number | None:
         if value is not None:
-            with name_option(option.opts[0]):
-                quantity.check(value)
+            with name_option_in_config_errors(option.opts[0]):
+                allowed_range.check(value)
         return value
 
-    return check
+    return check_option_value
 
 
 Viewer = Annotated[
@@ -63,35 +63,37 @@ Rate = Annotated[
     typer.Option(
         metavar="HZ",
         help="Sample rate for a recording that has neither times nor a rate.",
-        callback=range_callback(RATE_HZ),
+        callback=make_range_callback(RATE_HZ),
     ),
 ]
 ModelRate = Annotated[
     float | None,
-    typer.Option(metavar="HZ", help="Sample rate; by default that of the model.", callback=range_callback(RATE_HZ)),
+    typer.Option(
+        metavar="HZ", help="Sample rate; by default that of the model.", callback=make_range_callback(RATE_HZ)
+    ),
 ]
 Seconds = Annotated[
-    float | None, typer.Option(metavar="S", help="Stop after S seconds.", callback=range_callback(RUN_TIME_S))
+    float | None, typer.Option(metavar="S", help="Stop after S seconds.", callback=make_range_callback(RUN_TIME_S))
 ]
 SimulationSeed = Annotated[
     int,
     typer.Option(
-        metavar="N", help="Seed of the random numbers: same seed, same recording.", callback=range_callback(SEED)
+        metavar="N", help="Seed of the random numbers: same seed, same recording.", callback=make_range_callback(SEED)
     ),
 ]
 ReportSeed = Annotated[
     int,
     typer.Option(
-        metavar="N", help="Seed of the random numbers: same seed, same report.", callback=range_callback(SEED)
+        metavar="N", help="Seed of the random numbers: same seed, same report.", callback=make_range_callback(SEED)
     ),
 ]
 Inflation = Annotated[
-    float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=range_callback(INFLATION))
+    float, typer.Option(metavar="F", help="Factor on N, B and K, 1 or more.", callback=make_range_callback(INFLATION))
 ]
 TimeStep = Annotated[
     float | None,
     typer.Option(
-        metavar="S", help="kalman: time step; by default the sample period.", callback=range_callback(DURATION_S)
+        metavar="S", help="kalman: time step; by default the sample period.", callback=make_range_callback(DURATION_S)
     ),
 ]
 CorrelationTime = Annotated[
@@ -99,7 +101,7 @@ CorrelationTime = Annotated[
     typer.Option(
         metavar="S",
         help="kalman: correlation time of the process that represents B.",
-        callback=range_callback(DURATION_S),
+        callback=make_range_callback(DURATION_S),
     ),
 ]
 Last = Annotated[
@@ -125,7 +127,7 @@ def parse_averaging_times(text: str) -> "TauGrid":
         ) from None
     if len(listed) > MAX_AVERAGING_TIMES:
         raise ConfigError(f"--tau: {len(listed)} averaging times; at most {MAX_AVERAGING_TIMES} are possible")
-    with name_option("--tau"):
+    with name_option_in_config_errors("--tau"):
         for tau_s in listed:
             AVERAGING_TIME_S.check(tau_s)
     return listed
@@ -156,7 +158,7 @@ def parse_duration(option: str, text: str | None) -> float | None:
 
     duration_s = None
     if text is not None:
-        with name_option(option):
+        with name_option_in_config_errors(option):
             duration_s = seconds(text)
     return duration_s
 

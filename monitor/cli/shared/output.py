@@ -38,7 +38,7 @@ def check_output_file(option: str, path: Path | None, *suffixes: str) -> None:
         raise ConfigError(f"{option}: {path}: cannot be written: there is no folder {path.parent}")
 
 
-def write_bytes(option: str, path: Path, data: bytes) -> None:
+def write_file_or_stdout(option: str, path: Path, data: bytes) -> None:
     """Write bytes to a file, or to standard output if the path is ``-``.
 
     Parameters
@@ -66,7 +66,7 @@ def write_bytes(option: str, path: Path, data: bytes) -> None:
 
 
 @contextlib.contextmanager
-def show_progress() -> Iterator[ProgressCallback]:
+def show_progress_bar() -> Iterator[ProgressCallback]:
     """Show a progress bar if the output is a terminal, and yield the callback that updates the bar."""
     from rich.console import Console
     from rich.progress import Progress
@@ -80,7 +80,7 @@ def show_progress() -> Iterator[ProgressCallback]:
         yield lambda what, share: bar.update(task, description=what, total=share and 1.0, completed=share or 0.0)
 
 
-def compile_analysis_kernels(tell: ProgressCallback) -> None:
+def compile_analysis_kernels(report_progress: ProgressCallback) -> None:
     """Compile the kernels for the analysis of recordings in parallel, if they are not in the cache on disk."""
     from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
@@ -88,7 +88,7 @@ def compile_analysis_kernels(tell: ProgressCallback) -> None:
         if not kernel_compilation.is_warm(group):
             with contextlib.suppress(OSError):  # without a cache on disk, each kernel is compiled at its first call
                 for _ in kernel_compilation.prepare_kernels(
-                    group, lambda progress: tell(str(progress), progress.share)
+                    group, lambda progress: report_progress(str(progress), progress.share)
                 ):
                     pass
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, TextIO, cast
 
 from drivers.credential_masking import mask_secrets
 from drivers.errors import ConfigError
-from monitor.cli.shared.errors import name_option
+from monitor.cli.shared.errors import name_option_in_config_errors
 
 if TYPE_CHECKING:
     from collections.abc import MutableMapping
@@ -28,7 +28,7 @@ STDOUT: Final = "standard output"
 STDERR: Final = "standard error"
 
 
-def run_service(config: "Config", seconds: float | None, viewer: str | None) -> None:
+def run_service(config: "Config", seconds: float | None, viewer_mode: str | None) -> None:
     """Run the service, with a live table in a terminal, or else with log lines and the final table at the end.
 
     Parameters
@@ -37,7 +37,7 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
         Configuration to run.
     seconds : float or None
         Duration in seconds. If None, the service runs until a signal or the end of all replays.
-    viewer : str or None
+    viewer_mode : str or None
         Viewer mode that replaces the mode of the configuration.
 
     Raises
@@ -60,7 +60,7 @@ def run_service(config: "Config", seconds: float | None, viewer: str | None) -> 
     from monitor.publishing.terminal.queued_writer import QueuedWriter
 
     unit = SystemdNotifier.from_environment(os.environ)
-    config = _with_viewer(config, viewer)
+    config = _with_viewer(config, viewer_mode)
     console, board, asked = Console(file=sys.stdout), DeviceStates(), threading.Event()
     table, terminal = LiveTable(console), console.is_terminal
     screen = QueuedWriter(sys.stdout, STDOUT, table.render, STATUS_INTERVAL_S if terminal else None, tell=_warn)
@@ -110,7 +110,12 @@ def _table_error(screen: "QueuedWriter", unread: bool) -> Exception | None:
 
 
 def run_fleet_viewer(
-    keyexpr: str, connect: Sequence[str], file: Path | None, detail: Sequence[str], mode: str, seconds: float | None
+    keyexpr: str,
+    connect: Sequence[str],
+    zenoh_file: Path | None,
+    detailed_devices: Sequence[str],
+    viewer_mode: str,
+    seconds: float | None,
 ) -> None:
     """Run the viewer of a fleet until a signal, and print its address and its errors on standard error.
 
@@ -120,11 +125,11 @@ def run_fleet_viewer(
         Zenoh key expression of the daemons.
     connect : sequence of str
         Zenoh endpoints to connect to.
-    file : Path or None
+    zenoh_file : Path or None
         Zenoh configuration file.
-    detail : sequence of str
+    detailed_devices : sequence of str
         Devices that are shown with samples and Allan deviations.
-    mode : str
+    viewer_mode : str
         Viewer mode.
     seconds : float or None
         Duration in seconds. If None, the viewer runs until a signal.
@@ -143,11 +148,11 @@ def run_fleet_viewer(
     from monitor.publishing.zenoh.subscriber import ZenohSubscriber
     from monitor.settings import loading
 
-    with name_option("--viewer"):
-        loading.check_viewer_mode(mode)
-    keys = tuple(dict.fromkeys(full_device_key(device, keyexpr) for device in detail))
-    arriving = ZenohSubscriber(keyexpr, connect, file, keys)
-    rerun = RerunView(ViewerSettings(mode=mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
+    with name_option_in_config_errors("--viewer"):
+        loading.check_viewer_mode(viewer_mode)
+    keys = tuple(dict.fromkeys(full_device_key(device, keyexpr) for device in detailed_devices))
+    arriving = ZenohSubscriber(keyexpr, connect, zenoh_file, keys)
+    rerun = RerunView(ViewerSettings(mode=viewer_mode), [DeviceInfo(key, "over zenoh") for key in keys], fleet=True)
     stop = threading.Event()
     install_signal_handlers(stop.set)
 
@@ -161,7 +166,7 @@ def run_fleet_viewer(
         FleetView(arriving, rerun, keys).run(stop, say, seconds)
 
 
-def with_history_span(config: "Config", history_s: float | None) -> "Config":
+def with_viewer_history_length(config: "Config", history_s: float | None) -> "Config":
     """Return the configuration with another length of the history in the viewer.
 
     Parameters
@@ -193,7 +198,7 @@ def _with_viewer(config: "Config", viewer: str | None) -> "Config":
 
     if viewer is None:
         return config
-    with name_option("--viewer"):
+    with name_option_in_config_errors("--viewer"):
         loading.check_viewer_mode(viewer)
     return dataclasses.replace(config, viewer=config.viewer.model_copy(update={"mode": viewer}))
 
@@ -276,29 +281,29 @@ def _without_secrets(_logger: Any, _method: str, line: "MutableMapping[str, Any]
     return {key: mask_secrets(value) if isinstance(value, str) else value for key, value in line.items()}
 
 
-def install_signal_handlers(stop: Callable[[], None], hung_up: Callable[[], None] | None = None) -> None:
+def install_signal_handlers(stop: Callable[[], None], on_hangup: Callable[[], None] | None = None) -> None:
     """Install the signal handlers of a session.
 
-    The first SIGINT or SIGTERM calls ``stop``. A second SIGINT ends the process at once. SIGHUP calls ``hung_up``.
+    The first SIGINT or SIGTERM calls ``stop``. A second SIGINT ends the process at once. SIGHUP calls ``on_hangup``.
 
     Parameters
     ----------
     stop : callable
         Starts an orderly stop.
-    hung_up : callable, optional
+    on_hangup : callable, optional
         Handles SIGHUP. By default SIGHUP keeps its present handler.
     """
     import threading
 
-    def first(number: int, _frame: Any) -> None:
+    def handle_first_signal(number: int, _frame: Any) -> None:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
         # a separate thread is needed, because the main thread may hold the lock of the event that stop sets
         threading.Thread(target=stop, name="stop", daemon=True).start()
 
-    signal.signal(signal.SIGINT, first)
-    signal.signal(signal.SIGTERM, first)
-    if hung_up is not None:
-        call = hung_up  # runs in a thread for the same reason
+    signal.signal(signal.SIGINT, handle_first_signal)
+    signal.signal(signal.SIGTERM, handle_first_signal)
+    if on_hangup is not None:
+        call = on_hangup  # runs in a thread for the same reason
         signal.signal(signal.SIGHUP, lambda *_: threading.Thread(target=call, name="hung up", daemon=True).start())
 
 

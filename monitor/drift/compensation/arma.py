@@ -58,7 +58,7 @@ START_VARIANCE_SHARES: Final = (1e-3, 0.03, 0.5)
 class ArmaModel:
     """Parameters of one identified ARMA process.
 
-    >>> ArmaModel((0.5, 0.3), -0.2, 1.0).green
+    >>> ArmaModel((0.5, 0.3), -0.2, 1.0).green_function_values
     (1.0, 0.3)
     """
 
@@ -76,7 +76,7 @@ class ArmaModel:
     count: int = 0  # number of values used for the identification
 
     @property
-    def green(self) -> tuple[float, float]:
+    def green_function_values(self) -> tuple[float, float]:
         """Return the first two values G0 and G1 of Green's function."""
         return 1.0, self.phi[0] + self.theta
 
@@ -86,18 +86,23 @@ class ArmaModel:
         return f"ARMA({self.order[0]}, {self.order[1]})" if self.order != (0, 0) else "constant"
 
 
-def fit_arma(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS, intervals: bool = False) -> ArmaModel:
+def fit_arma(
+    interval_means: Floats,
+    white_variance: float = 0.0,
+    orders: Sequence[Order] = ORDERS,
+    with_confidence_intervals: bool = False,
+) -> ArmaModel:
     """Return the model of the order with the least BIC (Schwarz 1978).
 
     Parameters
     ----------
-    z : ndarray, shape (n,)
+    interval_means : ndarray, shape (n,)
         Interval means in rad/s; NaN = missing.
-    white : float
+    white_variance : float
         Variance of the white noise v of a mean, (rad/s)².
     orders : sequence of (p, q)
         Orders to choose from.
-    intervals : bool
+    with_confidence_intervals : bool
         True if the confidence intervals of the coefficients are computed too. This takes ten times as long.
 
     Raises
@@ -105,17 +110,17 @@ def fit_arma(z: Floats, white: float = 0.0, orders: Sequence[Order] = ORDERS, in
     NotReady
         If fewer than MIN_VALUES values are known, or if all values are equal.
     """
-    known = z[np.isfinite(z)]
+    known = interval_means[np.isfinite(interval_means)]
     if known.size < MIN_VALUES:
         raise NotReady(f"{known.size} values; at least {MIN_VALUES} are needed to identify a drift")
     origin, scale = float(np.median(known)), float(known.std())
     if not scale > 0.0:
         raise NotReady("all values are equal")
-    unit = (z - origin) / scale
-    share = white / scale**2
+    unit = (interval_means - origin) / scale
+    share = white_variance / scale**2
     best = min((_fit_order(unit, share, order) for order in orders), key=lambda one: one[0])
     found = _to_model(unit, share, origin, scale, best)
-    if not intervals:
+    if not with_confidence_intervals:
         return found
     lo, hi = _confidence_intervals(unit, share, *best[1:])
     return replace(found, lo=lo, hi=hi)
@@ -151,20 +156,20 @@ def stationary_covariance(phi1: float, phi2: float, theta: float) -> _Triple:
 
 
 @compiled
-def run_kalman_filter(
-    z: Floats, phi1: float, phi2: float, theta: float, variance: float, white: float
+def compute_likelihood_sums(
+    values: Floats, phi1: float, phi2: float, theta: float, innovation_variance: float, white_variance: float
 ) -> tuple[int, float, float, float]:
     """Run the exact Kalman filter, and return the sums from which the likelihood follows.
 
     Parameters
     ----------
-    z : ndarray, shape (n,)
+    values : ndarray, shape (n,)
         Values; NaN = missing.
     phi1, phi2, theta : float
         Coefficients φ1, φ2 and θ1.
-    variance : float
+    innovation_variance : float
         Variance of a, in the squared unit of z.
-    white : float
+    white_variance : float
         Variance of v, in the squared unit of z.
 
     Returns
@@ -180,22 +185,22 @@ def run_kalman_filter(
     """
     g1 = phi1 + theta
     p11, p12, p22 = stationary_covariance(phi1, phi2, theta)
-    p11, p12, p22 = p11 * variance, p12 * variance, p22 * variance
+    p11, p12, p22 = p11 * innovation_variance, p12 * innovation_variance, p22 * innovation_variance
     x1 = x2 = o1 = o2 = 0.0  # The filter runs on z and on a series of ones. Both together give the mean.
     count, logs, zz, zo, oo = 0, 0.0, 0.0, 0.0, 0.0
-    for k in range(z.size):
-        if z[k] == z[k]:
-            s = p11 + white
+    for k in range(values.size):
+        if values[k] == values[k]:
+            s = p11 + white_variance
             gain1, gain2 = p11 / s, p12 / s
-            e, o = z[k] - x1, 1.0 - o1
+            e, o = values[k] - x1, 1.0 - o1
             logs += np.log(s)
             zz, zo, oo, count = zz + e * e / s, zo + e * o / s, oo + o * o / s, count + 1
             x1, x2, o1, o2 = x1 + gain1 * e, x2 + gain2 * e, o1 + gain1 * o, o2 + gain2 * o
             p22 = p22 - gain2 * p12
-            p11, p12 = white * gain1, white * gain2
+            p11, p12 = white_variance * gain1, white_variance * gain2
         x1, x2 = x2, phi2 * x1 + phi1 * x2
         o1, o2 = o2, phi2 * o1 + phi1 * o2
-        p11, p12, p22 = _propagate_covariance(p11, p12, p22, phi1, phi2, g1, variance)
+        p11, p12, p22 = _propagate_covariance(p11, p12, p22, phi1, phi2, g1, innovation_variance)
     mean = zo / oo if oo > 0.0 else 0.0
     return count, logs, zz - mean * zo, mean
 
@@ -239,7 +244,7 @@ def _start_parameters(white: float, order: Order) -> list[Floats]:
 def _log_likelihood(z: Floats, white: float, order: Order, u: Floats) -> float:
     """Return the log-likelihood, maximised over the mean and, without white noise, over the innovation variance."""
     phi1, phi2, theta, variance = _model_coefficients(order, u, white)
-    count, logs, square, _ = run_kalman_filter(z, phi1, phi2, theta, variance, white)
+    count, logs, square, _ = compute_likelihood_sums(z, phi1, phi2, theta, variance, white)
     if white > 0.0 and order != (0, 0):
         return float(-0.5 * (count * log(2.0 * pi) + logs + square))
     size = max(square / count, 1e-300)
@@ -267,7 +272,7 @@ def _to_model(z: Floats, white: float, origin: float, scale: float, best: _Order
     bic, order, u = best
     phi1, phi2, theta, variance = _model_coefficients(order, u, white)
     seen = white if order != (0, 0) else 0.0
-    count, _, square, mean = run_kalman_filter(z, phi1, phi2, theta, variance, seen)
+    count, _, square, mean = compute_likelihood_sums(z, phi1, phi2, theta, variance, seen)
     if seen == 0.0:
         variance = square / count
     nothing = order == (0, 0) and white > 0.0
@@ -364,7 +369,7 @@ def _profile_likelihood(
 ) -> tuple[float, Floats]:
     """Return the log likelihood with one coefficient fixed, maximised over the others, and the place of the maximum."""
 
-    def full(free: Floats) -> Floats:
+    def insert_fixed_coefficient(free: Floats) -> Floats:
         u = np.insert(free, order[0] if which == 2 else which, 0.0)
         if which == 2:
             u[order[0]] = atanh(value)
@@ -384,6 +389,8 @@ def _profile_likelihood(
         return u
 
     if not near.size:
-        return _log_likelihood(z, white, order, full(near)), near
-    least, place = minimize_bfgs(lambda free: -_log_likelihood(z, white, order, full(free)), near, 1e-2)
+        return _log_likelihood(z, white, order, insert_fixed_coefficient(near)), near
+    least, place = minimize_bfgs(
+        lambda free: -_log_likelihood(z, white, order, insert_fixed_coefficient(free)), near, 1e-2
+    )
     return -least, place

@@ -49,25 +49,25 @@ AGE, EXCEEDANCES = range(2)
 """Columns of ``ages``: samples since the reset of a filter, and successive samples beyond the gate."""
 
 
-def filter_memories(rate_hz: float) -> Ints:
+def choose_memory_lengths(rate_hz: float) -> Ints:
     """Return the filter memories in samples: 2, 4, 8, … up to about MAX_MEMORY_S.
 
-    >>> filter_memories(4.0).tolist()
+    >>> choose_memory_lengths(4.0).tolist()
     [2, 4, 8, 16, 32]
     """
     return np.asarray(2 ** np.arange(1, max(round(log2(MAX_MEMORY_S * rate_hz)), 1) + 1), dtype=np.int64)
 
 
-def process_noise_intensity(memory: int) -> float:
-    """Return the noise intensity 2ασ_a² of a filter that reduces the noise variance by the factor ``memory``.
+def process_noise_intensity(memory_samples: int) -> float:
+    """Return the noise intensity 2ασ_a² of a filter that reduces the noise variance by the factor ``memory_samples``.
 
     Time is measured in samples, and the noise of the measured rate has unit variance. For the intensity q, the steady
     gain is about √2 q^¼, and the variance of the output is 3/4 of the gain.
     """
-    return (4.0 / (3.0 * memory) / sqrt(2.0)) ** 4
+    return (4.0 / (3.0 * memory_samples) / sqrt(2.0)) ** 4
 
 
-def gain_table(memories: Ints) -> tuple[Floats, Ints]:
+def compute_gain_table(memories: Ints) -> tuple[Floats, Ints]:
     """Return one table with the gains of all filters, and the first row of each filter.
 
     The table [rows, 2] has the gains of ω and ω̇, with one row for each age of a filter in samples. The last row of a
@@ -95,27 +95,34 @@ def _gains(q: float, rows: int) -> Floats:
 
 
 @inlined
-def filter_sample(
-    z: float, bank: Floats, ages: Ints, table: Floats, first: Ints, sums: Floats, feedback: Floats, keep: float
+def filter_rate_sample(
+    unbiased_rate: float,
+    bank: Floats,
+    ages: Ints,
+    gains: Floats,
+    first_gain_rows: Ints,
+    square_sums: Floats,
+    feedback: Floats,
+    feedback_share: float,
 ) -> float:
     """Process one sample of one axis, and return the filtered rate.
 
     Parameters
     ----------
-    z : float
+    unbiased_rate : float
         Measured rate minus the bias, rad/s.
     bank : ndarray, shape (filters + 1, 5)
         State of the filters. It is updated in place.
     ages : ndarray, shape (filters, 2), int64
         Ages and gate exceedances of the filters. They are updated in place.
-    table, first : ndarray
-        Gains and first rows as ``gain_table`` returns them.
-    sums : ndarray, shape (filters + 1, 2)
+    gains, first_gain_rows : ndarray
+        Gains and first rows as ``compute_gain_table`` returns them.
+    square_sums : ndarray, shape (filters + 1, 2)
         Sums of the squares of estimate and residual. They are updated in place, and used later if the sample was at
         rest.
     feedback : ndarray, shape (1,)
         Accumulated difference of input and output, in rad/s times samples. It is updated in place.
-    keep : float
+    feedback_share : float
         Share of the feedback that is added to the output in each sample.
 
     Returns
@@ -123,40 +130,40 @@ def filter_sample(
     float
         Filtered rate, rad/s.
     """
-    least, rate = bank[0, NOISE], z
-    sums[0, 0] += z * z
+    least, rate = bank[0, NOISE], unbiased_rate
+    square_sums[0, 0] += unbiased_rate * unbiased_rate
     for j in range(ages.shape[0]):
-        at = min(first[j] + ages[j, AGE], first[j + 1] - 1)
+        at = min(first_gain_rows[j] + ages[j, AGE], first_gain_rows[j + 1] - 1)
         ages[j, AGE] += 1
         ahead = bank[j + 1, RATE] + bank[j + 1, SLOPE]
-        new = z - ahead
-        now = ahead + table[at, 0] * new
+        new = unbiased_rate - ahead
+        now = ahead + gains[at, 0] * new
         bank[j + 1, RATE] = now
-        bank[j + 1, SLOPE] += table[at, 1] * new
-        square = (now - z) * (now - z)
+        bank[j + 1, SLOPE] += gains[at, 1] * new
+        square = (now - unbiased_rate) * (now - unbiased_rate)
         usual = bank[j + 1, REST_RESIDUAL]
         gate = GATE * GATE * usual if usual > 0.0 else inf
         bounded = min(square, gate)
         recent = bank[j + 1, RESIDUAL] + (bounded - bank[j + 1, RESIDUAL]) / RESIDUAL_MEMORY
         bank[j + 1, RESIDUAL] = recent
-        sums[j + 1, 0] += now * now
-        sums[j + 1, 1] += bounded
+        square_sums[j + 1, 0] += now * now
+        square_sums[j + 1, 1] += bounded
         if square > gate:
             ages[j, EXCEEDANCES] += 1
             if ages[j, EXCEEDANCES] >= MAX_GATE_EXCEEDANCES:
-                bank[j + 1, RATE], bank[j + 1, SLOPE], ages[j, AGE], ages[j, EXCEEDANCES] = z, 0.0, 1, 0
+                bank[j + 1, RATE], bank[j + 1, SLOPE], ages[j, AGE], ages[j, EXCEEDANCES] = unbiased_rate, 0.0, 1, 0
             continue
         ages[j, EXCEEDANCES] = 0
         error = bank[j + 1, NOISE] + recent - usual
         if error < least:
             least, rate = error, now
-    rate += keep * feedback[0]
-    feedback[0] += z - rate
+    rate += feedback_share * feedback[0]
+    feedback[0] += unbiased_rate - rate
     return float(rate)
 
 
 @compiled
-def predict_over_gap(bank: Floats, ages: Ints, samples: int) -> None:
+def predict_over_gap(bank: Floats, ages: Ints, missing_samples: int) -> None:
     """Advance the filters over missing samples.
 
     Filters predict along their slopes. Filters with a memory shorter than the gap are reset.
@@ -167,48 +174,48 @@ def predict_over_gap(bank: Floats, ages: Ints, samples: int) -> None:
         State of the filters. It is updated in place.
     ages : ndarray, shape (filters, 2), int64
         Ages and gate exceedances of the filters. They are updated in place.
-    samples : int
+    missing_samples : int
         Number of missing samples.
     """
     for j in range(ages.shape[0]):
-        if samples >= 2 << j:
+        if missing_samples >= 2 << j:
             ages[j, AGE] = ages[j, EXCEEDANCES] = 0
             bank[j + 1, SLOPE] = 0.0
         else:
-            bank[j + 1, RATE] += samples * bank[j + 1, SLOPE]
+            bank[j + 1, RATE] += missing_samples * bank[j + 1, SLOPE]
 
 
 @compiled
-def shift_bias(bank: Floats, by: float) -> None:
+def apply_bias_change(bank: Floats, bias_change: float) -> None:
     """Correct the filters after the estimate of the bias has changed.
 
     Parameters
     ----------
     bank : ndarray, shape (filters + 1, 5)
         State of the filters. It is updated in place.
-    by : float
+    bias_change : float
         Increase of the bias, rad/s.
     """
     for j in range(1, bank.shape[0]):
-        bank[j, RATE] -= by
+        bank[j, RATE] -= bias_change
 
 
 @compiled
-def update_rest_noise(bank: Floats, sums: Floats, count: float, intervals: int) -> None:
+def update_rest_noise(bank: Floats, square_sums: Floats, sample_count: float, rest_intervals: int) -> None:
     """Update the noise at rest with an interval that was at rest.
 
     Parameters
     ----------
     bank : ndarray, shape (filters + 1, 5)
         State of the filters. It is updated in place.
-    sums : ndarray, shape (filters + 1, 2)
-        Sums of ``filter_sample`` over the samples of the interval.
-    count : float
+    square_sums : ndarray, shape (filters + 1, 2)
+        Sums of ``filter_rate_sample`` over the samples of the interval.
+    sample_count : float
         Number of these samples.
-    intervals : int
+    rest_intervals : int
         Number of intervals at rest so far, including this one.
     """
-    share = max(1.0 / NOISE_MEMORY_INTERVALS, 1.0 / intervals)
+    share = max(1.0 / NOISE_MEMORY_INTERVALS, 1.0 / rest_intervals)
     for j in range(bank.shape[0]):
-        bank[j, NOISE] += share * (sums[j, 0] / count - bank[j, NOISE])
-        bank[j, REST_RESIDUAL] += share * (sums[j, 1] / count - bank[j, REST_RESIDUAL])
+        bank[j, NOISE] += share * (square_sums[j, 0] / sample_count - bank[j, NOISE])
+        bank[j, REST_RESIDUAL] += share * (square_sums[j, 1] / sample_count - bank[j, REST_RESIDUAL])

@@ -30,23 +30,23 @@ class RestScore:
     allan: Floats  # [k] overlapping Allan deviation
 
 
-def score_at_rest(rate: Floats, rate_hz: float) -> RestScore:
+def score_at_rest(angular_rate: Floats, rate_hz: float) -> RestScore:
     """Return the quality of a rate whose true value is zero.
 
     Parameters
     ----------
-    rate : ndarray, shape (n,)
+    angular_rate : ndarray, shape (n,)
         Rate in rad/s; NaN = missing, or not at rest.
     rate_hz : float
         Sample rate in Hz.
     """
-    sizes: Ints = cluster_sizes(rate.size, rate_hz)
-    allan, _ = overlapping_avar_axis(rate, sizes)
-    minutes = _span_means(rate**2, round(MINUTE_S * rate_hz))
+    sizes: Ints = cluster_sizes(angular_rate.size, rate_hz)
+    allan, _ = overlapping_avar_axis(angular_rate, sizes)
+    minutes = _span_means(angular_rate**2, round(MINUTE_S * rate_hz))
     return RestScore(
-        rms=_rms(rate),
+        rms=_rms(angular_rate),
         worst_minute=float(np.sqrt(minutes.max())) if minutes.size else np.nan,
-        drift=tuple(_rms(_span_means(rate, round(span * rate_hz))) for span in SPANS_S),
+        drift=tuple(_rms(_span_means(angular_rate, round(span * rate_hz))) for span in SPANS_S),
         tau_s=sizes / rate_hz,
         allan=np.sqrt(allan),
     )

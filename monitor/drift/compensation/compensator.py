@@ -24,11 +24,11 @@ from monitor.drift.compensation import sage_husa
 from monitor.drift.compensation.arma import ORDERS, ArmaModel, Order, fit_arma
 from monitor.drift.compensation.carrier_rate_filter_bank import (
     MIN_REST_INTERVALS,
-    filter_memories,
-    filter_sample,
-    gain_table,
+    apply_bias_change,
+    choose_memory_lengths,
+    compute_gain_table,
+    filter_rate_sample,
     predict_over_gap,
-    shift_bias,
     update_rest_noise,
 )
 from monitor.estimation.detection import motion_kernel
@@ -82,9 +82,9 @@ class CompensatorState(NamedTuple):
     ages: Ints  # [3, filters, 2] columns as in ``carrier_rate_filter_bank``
     feedback: Floats  # [3, 1] difference of input and output that is still to be fed back
     waiting: Floats  # [MAX_PENDING_BLOCKS, 6, 5] sums of the blocks that wait for a rest decision
-    sums: Floats  # [MAX_PENDING_BLOCKS, 3, filters + 1, 2] sums of ``filter_sample`` for each of these blocks
+    sums: Floats  # [MAX_PENDING_BLOCKS, 3, filters + 1, 2] sums of ``filter_rate_sample`` for each of these blocks
     means: Floats  # [3, BLOCKS_PER_INTERVAL] rad/s, means of the blocks of the interval; NaN = not at rest
-    followed: Floats  # [3, filters + 1, 2] sums of ``filter_sample`` over the blocks at rest
+    followed: Floats  # [3, filters + 1, 2] sums of ``filter_rate_sample`` over the blocks at rest
     samples: Floats  # [3] number of samples in these blocks
     table: Floats  # [rows, 2] gains of all filters
     first: Ints  # [filters + 1] first row of each filter in the table
@@ -162,7 +162,7 @@ class Compensator:
     @property
     def bias_standard_error(self) -> Floats:
         """Return the standard error [3] of the bias in rad/s; NaN = not known yet."""
-        known = [sage_husa.expected_bias(drift)[1] ** 0.5 for drift in self._state.drift]
+        known = [sage_husa.expected_bias_and_variance(drift)[1] ** 0.5 for drift in self._state.drift]
         return np.where(np.isnan(self._state.bias), np.nan, known)
 
     def compensate(self, values: Floats, lost: int = 0) -> Floats:
@@ -198,7 +198,7 @@ class Compensator:
             self._record_interval(outcomes[k])
         return out
 
-    def take_intervals(self) -> list[DriftInterval]:
+    def take_finished_intervals(self) -> list[DriftInterval]:
         """Return the results of the intervals that have ended since the last call."""
         outcomes, self._finished_intervals = self._finished_intervals, []
         return outcomes
@@ -215,11 +215,11 @@ class Compensator:
         return self.interval_samples - self.sample_count % self.interval_samples
 
     @property
-    def axes_due(self) -> tuple[int, ...]:
+    def axes_due_for_identification(self) -> tuple[int, ...]:
         """Return the indices of the axes that have enough new intervals to identify a model."""
         return tuple(np.flatnonzero(self._at_rest >= self._next_identification).tolist())
 
-    def identification_means_and_variance(self, axis: int) -> tuple[Floats, float]:
+    def means_and_noise_variance_for_identification(self, axis: int) -> tuple[Floats, float]:
         """Return the interval means from which the model of an axis is to be identified.
 
         Parameters
@@ -238,36 +238,38 @@ class Compensator:
         white = float(np.nanmean(scatter)) if np.isfinite(scatter).any() else 0.0
         return z, white
 
-    def set_model(self, axis: int, model: ArmaModel | None) -> None:
+    def apply_identification_result(self, axis: int, identified_model: ArmaModel | None) -> None:
         """Use a new model for an axis, and run the filter with the new model over all stored intervals.
 
         Parameters
         ----------
         axis : int
             Index of the gyro axis, 0 to 2.
-        model : ArmaModel or None
+        identified_model : ArmaModel or None
             The identified model. None means that no model was found, so the identification is repeated later.
         """
         self._next_identification[axis] = self._at_rest[axis] + min(
             max(self._at_rest[axis], MIN_IDENTIFICATION_INTERVALS) // 2, HISTORY_INTERVALS
         )
-        if model is None:
+        if identified_model is None:
             return
-        self.models[axis] = model
+        self.models[axis] = identified_model
         drift = self._state.drift[axis]
         count = drift["rest_count"]
-        sage_husa.set_model(drift, model)
+        sage_husa.restart_with_model(drift, identified_model)
         sage_husa.refilter_history(drift, *self._history(axis), _min_variance(self._state.rest.open, axis))
         drift["rest_count"] = count  # The repeated intervals are not counted a second time.
         _update_bias(axis, self._state.drift, self._state.bias, self._state.bank)
 
     def identify_due_models(self) -> None:
         """Identify the models of all axes that are due."""
-        for axis in self.axes_due:
+        for axis in self.axes_due_for_identification:
             try:
-                self.set_model(axis, fit_arma(*self.identification_means_and_variance(axis), self._orders))
+                self.apply_identification_result(
+                    axis, fit_arma(*self.means_and_noise_variance_for_identification(axis), self._orders)
+                )
             except NotReady:  # There are too few means, or all means are equal. The identification is repeated later.
-                self.set_model(axis, None)
+                self.apply_identification_result(axis, None)
 
     # --- results of intervals
 
@@ -295,8 +297,8 @@ class Compensator:
 
 def _initial_state(rate_hz: float, adapts: bool) -> CompensatorState:
     """Return the state before the first sample."""
-    each = filter_memories(rate_hz)
-    table, first = gain_table(each)
+    each = choose_memory_lengths(rate_hz)
+    table, first = compute_gain_table(each)
     filters = each.size
     drift = np.zeros(GYROS, sage_husa.DRIFT_FILTER)
     drift["adaptive"] = adapts
@@ -368,7 +370,7 @@ def _subtract_drift(z: Floats, axis: int, sums: Floats, s: CompensatorState, kee
             predict_over_gap(bank, ages, 1)
             out[k] = z[k]
             continue
-        rate = filter_sample(z[k] - bias, bank, ages, s.table, s.first, sums, feedback, keep)
+        rate = filter_rate_sample(z[k] - bias, bank, ages, s.table, s.first, sums, feedback, keep)
         if not trusted:
             rate, feedback[0] = z[k] - bias, 0.0
         out[k] = rate
@@ -439,7 +441,7 @@ def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
             outcome[column] = np.nan
         outcome[EXPECTED], outcome[OUTCOME] = s.bias[a], sage_husa.NOT_AT_REST
         if known:
-            outcome[EXPECTED_ERROR] = np.sqrt(sage_husa.expected_bias(s.drift[a])[1])
+            outcome[EXPECTED_ERROR] = np.sqrt(sage_husa.expected_bias_and_variance(s.drift[a])[1])
         count, mean, scatter = _interval_mean(s.means[a])
         if count >= MIN_REST_BLOCKS:
             variance, became = sage_husa.update_with_interval(s.drift[a], mean, scatter, _min_variance(s.rest.open, a))
@@ -453,7 +455,7 @@ def _finish_interval(s: CompensatorState, outcomes: Floats) -> None:
                 s.learned[a] += 1
                 update_rest_noise(s.bank[a], s.followed[a], s.samples[a], s.learned[a])
         else:
-            sage_husa.skip_interval(s.drift[a])
+            sage_husa.process_interval_in_motion(s.drift[a])
         _predict_next_interval(a, s)
         for b in range(BLOCKS_PER_INTERVAL):
             s.means[a, b] = np.nan
@@ -495,7 +497,7 @@ def _predict_next_interval(axis: int, s: CompensatorState) -> None:
 @compiled
 def _update_bias(axis: int, drifts: np.ndarray, biases: Floats, banks: Floats) -> None:
     """Use the predicted drift as the bias, and shift the filters by the change of the bias."""
-    now = sage_husa.expected_bias(drifts[axis])[0]
+    now = sage_husa.expected_bias_and_variance(drifts[axis])[0]
     before = biases[axis] if biases[axis] == biases[axis] else 0.0
-    shift_bias(banks[axis], now - before)
+    apply_bias_change(banks[axis], now - before)
     biases[axis] = now

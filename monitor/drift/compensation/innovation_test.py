@@ -27,14 +27,14 @@ class InnovationTest:
         self._exceeded = False
 
     @property
-    def mean_square(self) -> float:
+    def mean_square_innovation(self) -> float:
         """Return the mean of ε²/S over the last INTERVALS intervals; NaN if there are fewer."""
         return sum(self._squares) / INTERVALS if len(self._squares) == INTERVALS else float("nan")
 
-    def update(self, innovation: float) -> bool:
+    def detect_new_misfit(self, innovation: float) -> bool:
         """Add a normalised innovation ε/√S, and return True if the model has just ceased to fit."""
         self._squares.append(innovation**2)
-        now = self.mean_square
+        now = self.mean_square_innovation
         if self._exceeded and now < RESET_LIMIT:
             self._exceeded = False
         if self._exceeded or not now > LIMIT:

@@ -1,8 +1,8 @@
 """Live drift compensation of one device: removes the gyro drift from a stream of samples.
 
 Each interval produces a ``DriftUpdate``. An event reports a model that no longer fits, or a step of the bias. An
-identification takes about 50 ms, so the caller runs it in another thread. ``Compensator.axes_due`` lists the axes to
-identify, and ``set_model`` receives an identified model.
+identification takes about 50 ms, so the caller runs it in another thread. ``Compensator.axes_due_for_identification``
+lists the axes to identify, and ``apply_identification_result`` receives an identified model.
 """
 
 from dataclasses import dataclass
@@ -49,16 +49,16 @@ class LiveCompensation:
         self._updates: list[DriftUpdate] = []
         self._reset()
 
-    def update(self, samples: SampleBlock) -> SampleBlock:
+    def compensate_block(self, samples: SampleBlock) -> SampleBlock:
         """Return the block with the drift of its gyros removed; times, temperature and accelerations stay the same."""
         values = self.compensator.compensate(samples.values, samples.lost)
         newest_ns = int(samples.t_ns[-1])
-        for interval in self.compensator.take_intervals():
+        for interval in self.compensator.take_finished_intervals():
             t_ns = newest_ns - round((self.compensator.sample_count - interval.end) / self._rate_hz * 1e9)
             self._publish(interval, t_ns)
         return make_block(samples.t_ns, values, samples.temperature_c, samples.ticks, samples.lost)
 
-    def take_updates(self) -> list[DriftUpdate]:
+    def take_drift_updates(self) -> list[DriftUpdate]:
         """Return the results of the intervals that have ended since the last call."""
         updates, self._updates = self._updates, []
         return updates
@@ -68,18 +68,18 @@ class LiveCompensation:
         events, self._events = self._events, []
         return events
 
-    def set_model(self, axis: int, model: ArmaModel | None) -> None:
+    def apply_identification_result(self, axis: int, identified_model: ArmaModel | None) -> None:
         """Use a newly identified model for an axis.
 
         Parameters
         ----------
         axis : int
             Index of the gyro axis, 0 to 2.
-        model : ArmaModel or None
+        identified_model : ArmaModel or None
             The identified model. None means that no model was found.
         """
-        self.compensator.set_model(axis, model)
-        if model is not None:
+        self.compensator.apply_identification_result(axis, identified_model)
+        if identified_model is not None:
             self._innovations[axis].forget_innovations()
 
     def set_rate(self, rate_hz: float) -> None:
@@ -117,9 +117,11 @@ class LiveCompensation:
                 self._events.append(_step_event(AXES[at], float(interval.mean[at] - interval.expected[at]), t_ns))
                 continue
             known = used[at] and np.isfinite(interval.expected[at])
-            if known and self._innovations[at].update(float(interval.innovation[at])):
+            if known and self._innovations[at].detect_new_misfit(float(interval.innovation[at])):
                 since_ns = t_ns - round(INTERVALS * self.compensator.interval_s * 1e9)
-                self._events.append(_misfit_event(AXES[at], self._innovations[at].mean_square, t_ns, since_ns))
+                self._events.append(
+                    _misfit_event(AXES[at], self._innovations[at].mean_square_innovation, t_ns, since_ns)
+                )
 
 
 def _step_event(axis: str, size: float, t_ns: int) -> Event:

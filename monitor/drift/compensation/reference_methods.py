@@ -33,16 +33,16 @@ ReferenceMethod = Callable[[Floats, Floats], Floats]
 mean at rest."""
 
 
-def apply_reference_method(x: Floats, learned: Floats, variant: ReferenceMethod) -> Floats:
+def apply_reference_method(rate: Floats, rest_samples: Floats, method: ReferenceMethod) -> Floats:
     """Return the rate of one axis without drift and noise.
 
     Parameters
     ----------
-    x : ndarray, shape (n,)
+    rate : ndarray, shape (n,)
         Rate in rad/s; NaN = missing. Missing samples stay missing.
-    learned : ndarray, shape (m,)
+    rest_samples : ndarray, shape (m,)
         Rate at rest in rad/s, in the order of time.
-    variant : callable
+    method : callable
         One of the REFERENCE_METHODS.
 
     Returns
@@ -55,13 +55,13 @@ def apply_reference_method(x: Floats, learned: Floats, variant: ReferenceMethod)
     NotReady
         If there are too few samples at rest.
     """
-    rest = learned[np.isfinite(learned)]
+    rest = rest_samples[np.isfinite(rest_samples)]
     if rest.size < MIN_REST_SAMPLES:
         raise NotReady(f"{rest.size} samples at rest; at least {MIN_REST_SAMPLES} are needed for learning")
     mean = float(rest.mean())
-    there = np.isfinite(x)
-    whole = np.interp(np.arange(x.size), np.flatnonzero(there), x[there]) - mean
-    out = variant(whole, rest - mean)
+    there = np.isfinite(rate)
+    whole = np.interp(np.arange(rate.size), np.flatnonzero(there), rate[there]) - mean
+    out = method(whole, rest - mean)
     return np.where(there, out, np.nan)
 
 

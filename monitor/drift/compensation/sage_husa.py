@@ -78,36 +78,36 @@ NOT_AT_REST, USED, REJECTED, STEPPED = range(4)
 """Outcomes of an interval: not at rest, used, rejected, or used as a step of the bias."""
 
 
-def set_model(drift: np.void, arma: ArmaModel) -> None:
+def restart_with_model(drift_filter: np.void, model: ArmaModel) -> None:
     """Set a new model. The state becomes unknown, and the noise is that of the identification.
 
     Parameters
     ----------
-    drift : record of DRIFT_FILTER
+    drift_filter : record of DRIFT_FILTER
         Filter of one axis. It is updated in place.
-    arma : ArmaModel
+    model : ArmaModel
         Identified model, in rad/s.
     """
-    phi1, phi2 = arma.phi
-    p11, p12, p22 = stationary_covariance(phi1, phi2, arma.theta)
-    drift["state"] = 0.0, 0.0, arma.mean
-    drift["covariance"] = arma.variance * np.array([[p11, p12, 0.0], [p12, p22, 0.0], [0.0, 0.0, 0.0]])
-    drift["phi1"], drift["phi2"], drift["g1"] = phi1, phi2, phi1 + arma.theta
-    drift["identified_variance"] = drift["variance"] = arma.variance
-    drift["white_variance"] = arma.white_variance
+    phi1, phi2 = model.phi
+    p11, p12, p22 = stationary_covariance(phi1, phi2, model.theta)
+    drift_filter["state"] = 0.0, 0.0, model.mean
+    drift_filter["covariance"] = model.variance * np.array([[p11, p12, 0.0], [p12, p22, 0.0], [0.0, 0.0, 0.0]])
+    drift_filter["phi1"], drift_filter["phi2"], drift_filter["g1"] = phi1, phi2, phi1 + model.theta
+    drift_filter["identified_variance"] = drift_filter["variance"] = model.variance
+    drift_filter["white_variance"] = model.white_variance
     # Spectral density of x + v at zero frequency.
-    slow = arma.white_variance + arma.variance * ((1.0 + arma.theta) / (1.0 - phi1 - phi2)) ** 2
-    drift["level_variance"] = slow / min(max(arma.count / 3.0, MIN_LEVEL_MEMORY), MAX_LEVEL_MEMORY) ** 2
-    drift["covariance"][2, 2] = slow / arma.count
-    drift["outlier_run"] = drift["guard_left"] = 0.0
-    drift["identified"] = True
+    slow = model.white_variance + model.variance * ((1.0 + model.theta) / (1.0 - phi1 - phi2)) ** 2
+    drift_filter["level_variance"] = slow / min(max(model.count / 3.0, MIN_LEVEL_MEMORY), MAX_LEVEL_MEMORY) ** 2
+    drift_filter["covariance"][2, 2] = slow / model.count
+    drift_filter["outlier_run"] = drift_filter["guard_left"] = 0.0
+    drift_filter["identified"] = True
 
 
 @compiled
-def predict_next_interval(drift: np.void) -> None:
+def predict_next_interval(drift_filter: np.void) -> None:
     """Predict the state of the next interval."""
-    phi1, phi2, g1, s = drift["phi1"], drift["phi2"], drift["g1"], drift["variance"]
-    x, p = drift["state"], drift["covariance"]
+    phi1, phi2, g1, s = drift_filter["phi1"], drift_filter["phi2"], drift_filter["g1"], drift_filter["variance"]
+    x, p = drift_filter["state"], drift_filter["covariance"]
     x[0], x[1] = x[1], phi2 * x[0] + phi1 * x[1]
     p00, p01, p02, p11, p12 = p[0, 0], p[0, 1], p[0, 2], p[1, 1], p[1, 2]
     p[0, 0] = p11 + s
@@ -115,36 +115,38 @@ def predict_next_interval(drift: np.void) -> None:
     p[1, 1] = phi2 * phi2 * p00 + 2.0 * phi1 * phi2 * p01 + phi1 * phi1 * p11 + g1 * g1 * s
     p[0, 2] = p[2, 0] = p12
     p[1, 2] = p[2, 1] = phi2 * p02 + phi1 * p12
-    p[2, 2] += drift["level_variance"]
+    p[2, 2] += drift_filter["level_variance"]
 
 
 @compiled
-def skip_interval(drift: np.void) -> None:
+def process_interval_in_motion(drift_filter: np.void) -> None:
     """Process an interval in motion."""
-    if drift["rest_count"] < MIN_CONFIRMED_INTERVALS:
-        drift["rest_count"] = 0.0
+    if drift_filter["rest_count"] < MIN_CONFIRMED_INTERVALS:
+        drift_filter["rest_count"] = 0.0
 
 
 @compiled
-def expected_bias(drift: np.void) -> tuple[float, float]:
+def expected_bias_and_variance(drift_filter: np.void) -> tuple[float, float]:
     """Return the expected bias of the interval in rad/s and its variance in (rad/s)²."""
-    x, p = drift["state"], drift["covariance"]
+    x, p = drift_filter["state"], drift_filter["covariance"]
     return x[0] + x[2], p[0, 0] + 2.0 * p[0, 2] + p[2, 2]
 
 
 @compiled
-def update_with_interval(drift: np.void, z: float, scatter: float, least: float) -> tuple[float, int]:
+def update_with_interval(
+    drift_filter: np.void, interval_mean: float, scatter_variance: float, min_variance: float
+) -> tuple[float, int]:
     """Process the mean of an interval at rest.
 
     Parameters
     ----------
-    drift : record of DRIFT_FILTER
+    drift_filter : record of DRIFT_FILTER
         Filter of one axis. It is updated in place.
-    z : float
+    interval_mean : float
         Mean of the interval, rad/s.
-    scatter : float
+    scatter_variance : float
         Variance of the mean from the scatter within the interval, (rad/s)²; NaN = not known.
-    least : float
+    min_variance : float
         Smallest variance of the mean, (rad/s)².
 
     Returns
@@ -154,27 +156,27 @@ def update_with_interval(drift: np.void, z: float, scatter: float, least: float)
     outcome : int
         USED, REJECTED or STEPPED.
     """
-    loud = _update_scatter(drift, scatter, least)
-    if not drift["identified"]:
-        _model_level_only(drift, z, least)
-    drift["white_variance"] = max(drift["white_variance"], least)
-    expected, known = expected_bias(drift)
-    e, total = z - expected, known + drift["white_variance"]
+    loud = _update_scatter(drift_filter, scatter_variance, min_variance)
+    if not drift_filter["identified"]:
+        _model_level_only(drift_filter, interval_mean, min_variance)
+    drift_filter["white_variance"] = max(drift_filter["white_variance"], min_variance)
+    expected, known = expected_bias_and_variance(drift_filter)
+    e, total = interval_mean - expected, known + drift_filter["white_variance"]
     outcome = USED
     if loud or e * e > OUTLIER_SIGMAS * OUTLIER_SIGMAS * total:
-        outcome = _process_outlier(drift, z, e)
+        outcome = _process_outlier(drift_filter, interval_mean, e)
         if outcome == REJECTED:
             return total, REJECTED
-    drift["outlier_run"] = 0.0
-    if drift["guard_left"] > 0.0:
-        agrees = _agree(drift, z, AGREEMENT_SIGMAS)
-        drift["guard_left"] = drift["guard_left"] - 1.0 if agrees else GUARD_INTERVALS
-        drift["last_outlier"] = z
+    drift_filter["outlier_run"] = 0.0
+    if drift_filter["guard_left"] > 0.0:
+        agrees = _agree(drift_filter, interval_mean, AGREEMENT_SIGMAS)
+        drift_filter["guard_left"] = drift_filter["guard_left"] - 1.0 if agrees else GUARD_INTERVALS
+        drift_filter["last_outlier"] = interval_mean
         return total, REJECTED
-    drift["rest_count"] += 1.0
-    _correct(drift, e)
-    if drift["adaptive"] and drift["identified"] and outcome == USED:
-        _adapt_noise(drift, e, total, least)
+    drift_filter["rest_count"] += 1.0
+    _correct(drift_filter, e)
+    if drift_filter["adaptive"] and drift_filter["identified"] and outcome == USED:
+        _adapt_noise(drift_filter, e, total, min_variance)
     return total, outcome
 
 
@@ -227,7 +229,7 @@ def _adapt_noise(drift: np.void, e: float, total: float, least: float) -> None:
     d = (1.0 - FORGETTING_FACTOR) / (1.0 - FORGETTING_FACTOR ** (drift["rest_count"] + 1.0))
     r = drift["white_variance"]
     left = r / total  # 1 − H K
-    r = (1.0 - d) * r + d * (left * left * e * e + expected_bias(drift)[1])
+    r = (1.0 - d) * r + d * (left * left * e * e + expected_bias_and_variance(drift)[1])
     drift["white_variance"] = max(r, 0.5 * drift["scatter"], least)
     s = drift["variance"]
     s += d * s * s * (e * e - total) / (total * total)
@@ -248,21 +250,23 @@ def _correct(drift: np.void, e: float) -> None:
 
 
 @compiled
-def refilter_history(drift: np.void, z: Floats, scatter: Floats, least: float) -> None:
-    """Run the filter over all stored intervals after ``set_model``.
+def refilter_history(
+    drift_filter: np.void, interval_means: Floats, scatter_variances: Floats, min_variance: float
+) -> None:
+    """Run the filter over all stored intervals after ``restart_with_model``.
 
     Parameters
     ----------
-    drift : record of DRIFT_FILTER
+    drift_filter : record of DRIFT_FILTER
         Filter of one axis. It is updated in place.
-    z : ndarray, shape (n,)
+    interval_means : ndarray, shape (n,)
         Interval means in rad/s, oldest first; NaN = not at rest.
-    scatter : ndarray, shape (n,)
+    scatter_variances : ndarray, shape (n,)
         Variances of the means from the scatter within the intervals, (rad/s)².
-    least : float
+    min_variance : float
         Smallest variance of a mean, (rad/s)².
     """
-    for k in range(z.size):
-        if z[k] == z[k]:
-            update_with_interval(drift, z[k], scatter[k], least)
-        predict_next_interval(drift)
+    for k in range(interval_means.size):
+        if interval_means[k] == interval_means[k]:
+            update_with_interval(drift_filter, interval_means[k], scatter_variances[k], min_variance)
+        predict_next_interval(drift_filter)

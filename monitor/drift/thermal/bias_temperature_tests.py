@@ -9,7 +9,7 @@ within MAX_LIKELIHOOD_LOSS of the best. The result is the largest p-value of all
 positive rates are in
 docs/thermal-measurements.md.
 
-``find_dependence`` tests a cubic polynomial in temperature, alone and with each description of hysteresis.
+``find_temperature_dependence`` tests a cubic polynomial in temperature, alone and with each description of hysteresis.
 ``find_hysteresis`` tests the descriptions of hysteresis in addition to a polynomial of order 5. The descriptions are:
 
 - differences between heating and cooling that vanish at the ends of the temperature range;
@@ -31,8 +31,8 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.common.distributions import incomplete_beta
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.thermal_model import interpolate_gaps
-from monitor.drift.thermal.thermal_response import first_order_lag
+from monitor.drift.thermal.thermal_model import interpolate_missing_temperatures
+from monitor.drift.thermal.thermal_response import apply_first_order_lag
 
 SIGNIFICANCE: Final = 0.01
 """Largest p-value of a dependence or a hysteresis that is reported, after Bonferroni's correction."""
@@ -80,7 +80,7 @@ class TemperatureDependence:
     interval_s: float
 
     @property
-    def explains_most(self) -> bool:
+    def explains_most_variance(self) -> bool:
         """True if temperature explains the greater part of the slow variance."""
         return self.share >= MAIN_SHARE
 
@@ -153,7 +153,7 @@ def heating_direction(temperature_c: Floats) -> Floats:
     return direction
 
 
-def find_dependence(means: IntervalMeans) -> TemperatureDependence | None:
+def find_temperature_dependence(means: IntervalMeans) -> TemperatureDependence | None:
     """Test whether the bias depends on temperature.
 
     Parameters
@@ -167,7 +167,7 @@ def find_dependence(means: IntervalMeans) -> TemperatureDependence | None:
         The dependence with the largest share among the significant ones, or None if noise explains the bias.
     """
     pooled = _pooled(means)
-    known, y = pooled.known, pooled.bias
+    known, y = pooled.both_known, pooled.bias
     x, direction = _scaled(pooled)
     one_way = not _rose_and_fell(direction)
     curve = _polynomial(x, CURVE_ORDER)
@@ -209,18 +209,18 @@ def find_hysteresis(means: IntervalMeans) -> Hysteresis | None:
     # A single lag or play operator is also tested, because it leaves more degrees of freedom than all four together.
     candidates = [*loops.values(), *loops["lag"].T[:, :, None], *loops["play"].T[:, :, None]]
 
-    def regress(nuisance: Floats) -> list[_Regression]:
-        tested = (_regression(pooled.bias, nuisance, each, pooled.known) for each in candidates)
+    def test_candidates(nuisance: Floats) -> list[_Regression]:
+        tested = (_regression(pooled.bias, nuisance, each, pooled.both_known) for each in candidates)
         return [one for one in tested if one is not None]
 
-    tests = regress(np.hstack([_linear_drift(x.size), curve]))
+    tests = test_candidates(np.hstack([_linear_drift(x.size), curve]))
     # Within one temperature cycle, a drift and hysteresis are nearly collinear, so the size comes from a fit without a
     # drift.
-    fits = regress(curve)
+    fits = test_candidates(curve)
     if not tests or not fits:
         return None
     best = max(fits, key=lambda one: one.likelihood)
-    size = _loop_width(best.smooth, x[pooled.known], direction[pooled.known])
+    size = _loop_width(best.smooth, x[pooled.both_known], direction[pooled.both_known])
     return Hysteresis(size, min(len(tests) * min(one.p_value for one in tests), 1.0))
 
 
@@ -230,12 +230,14 @@ def _pooled(means: IntervalMeans) -> IntervalMeans:
     if group == 1:
         return means
     count = means.bias.size // group
-    known = means.known[: count * group].reshape(count, group)
+    known = means.both_known[: count * group].reshape(count, group)
     rows = (np.where(known, part[: count * group].reshape(count, group), 0.0) for part in (means.bias, means.error))
     bias, error = (part.sum(axis=1) for part in rows)
     there = np.maximum(known.sum(axis=1), 1)
     enough = 2 * known.sum(axis=1) >= group
-    temperature_c = interpolate_gaps(means.temperature_c)[: count * group].reshape(count, group).mean(axis=1)
+    temperature_c = (
+        interpolate_missing_temperatures(means.temperature_c)[: count * group].reshape(count, group).mean(axis=1)
+    )
     return IntervalMeans(
         group * means.interval_s,
         np.where(enough, bias / there, np.nan),
@@ -246,7 +248,7 @@ def _pooled(means: IntervalMeans) -> IntervalMeans:
 
 def _scaled(means: IntervalMeans) -> tuple[Floats, Floats]:
     """Return temperature scaled to -1 … 1, and the direction of its change."""
-    temperature_c = interpolate_gaps(means.temperature_c)
+    temperature_c = interpolate_missing_temperatures(means.temperature_c)
     lowest, swing = float(temperature_c.min()), float(np.ptp(temperature_c))
     return 2.0 * (temperature_c - lowest) / swing - 1.0, heating_direction(temperature_c)
 
@@ -270,7 +272,9 @@ def _hysteresis_regressors(x: Floats, direction: Floats) -> Mapping[str, Floats]
     """Return the regressors [n, k] of each description of hysteresis."""
     return {
         "direction": np.stack([direction * (1.0 - x**2) * x**power for power in range(LOOP_POWERS)], axis=1),
-        "lag": np.stack([first_order_lag(x, float(np.exp(-1.0 / constant))) - x for constant in LAG_INTERVALS], axis=1),
+        "lag": np.stack(
+            [apply_first_order_lag(x, float(np.exp(-1.0 / constant))) - x for constant in LAG_INTERVALS], axis=1
+        ),
         "play": np.stack([_play(x, 2.0 * width) - x for width in PLAY_WIDTHS], axis=1),
     }
 

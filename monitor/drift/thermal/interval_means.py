@@ -22,7 +22,7 @@ class IntervalMeans:
     temperature_c: Floats  # [n] °C; NaN if too few samples are known
 
     @property
-    def known(self) -> np.ndarray:
+    def both_known(self) -> np.ndarray:
         """True [n] where bias and temperature are both known."""
         return np.isfinite(self.bias) & np.isfinite(self.temperature_c)
 
@@ -73,23 +73,23 @@ def _row_means(rows: Floats) -> tuple[Floats, Floats]:
         shape = (count.size, PARTS_PER_INTERVAL, size)
         inside = known_samples[:, : PARTS_PER_INTERVAL * size].reshape(shape).sum(axis=2)
         differences = np.where(known_samples, rows - mean[:, None], 0.0)[:, : PARTS_PER_INTERVAL * size]
-        error = standard_error(differences.reshape(shape).sum(axis=2).T, inside.T)
+        error = standard_error_from_parts(differences.reshape(shape).sum(axis=2).T, inside.T)
     mean[too_few], error[too_few] = np.nan, np.nan
     return mean, error
 
 
-def standard_error(sums: Floats, counts: Ints) -> Floats:
+def standard_error_from_parts(part_sums: Floats, part_counts: Ints) -> Floats:
     """Return the standard errors [n] of interval means, as described in ``compute_interval_means``.
 
     Parameters
     ----------
-    sums : ndarray, shape (PARTS_PER_INTERVAL, n)
+    part_sums : ndarray, shape (PARTS_PER_INTERVAL, n)
         Sum of the known samples of each part.
-    counts : ndarray, shape (PARTS_PER_INTERVAL, n)
+    part_counts : ndarray, shape (PARTS_PER_INTERVAL, n)
         Number of known samples of each part.
     """
     with np.errstate(invalid="ignore", divide="ignore"):
-        differences = np.diff(sums / counts, axis=0)
+        differences = np.diff(part_sums / part_counts, axis=0)
         known = np.isfinite(differences)
         square = np.where(known, differences, 0.0) ** 2
         return np.asarray(np.sqrt(0.5 * square.sum(axis=0) / known.sum(axis=0) / PARTS_PER_INTERVAL))

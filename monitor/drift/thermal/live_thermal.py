@@ -4,8 +4,8 @@ The input consists of blocks of samples in order, with NaN for samples in motion
 ``ThermalIntervalResult`` holds the measured and the predicted mean of each axis. Changes that temperature does not
 explain are reported as events. Nothing is stored or computed before the first temperature has been received.
 
-``update`` takes a few milliseconds at the end of an interval. ``step`` selects models in short steps between the
-intervals.
+``process_block`` takes a few milliseconds at the end of an interval. ``run_selection_step`` selects models in short
+steps between the intervals.
 """
 
 from collections.abc import Mapping
@@ -35,7 +35,7 @@ class ThermalIntervalResult:
     axes: Mapping[str, PredictedAxisInterval]  # axis -> result, in the order of AXES
 
 
-class LiveThermal:
+class LiveThermalModels:
     """Interval means and thermal models of one device.
 
     Parameters
@@ -54,7 +54,7 @@ class LiveThermal:
         self._sample_count = 0  # samples since the first temperature, including missing ones
         self._reset()
 
-    def update(self, samples: SampleBlock) -> list[ThermalIntervalResult]:
+    def process_block(self, samples: SampleBlock) -> list[ThermalIntervalResult]:
         """Add samples, and return the results of the intervals that ended and have a known temperature."""
         # Samples that are missing before the first temperature belong to no interval.
         lost = samples.lost if self._has_temperature else 0
@@ -62,19 +62,19 @@ class LiveThermal:
         if not self._has_temperature:
             return []
         self._sample_count += lost + len(samples)
-        over = self._means.update(samples.values, samples.temperature_c, lost)
+        over = self._means.add_samples(samples.values, samples.temperature_c, lost)
         updates = [self._process_interval(one, int(samples.t_ns[-1])) for one in over]
         return [update for update in updates if np.isfinite(update.temperature_c) and update.axes]
 
     @property
-    def choosing(self) -> bool:
-        """True if a model selection is active, so that ``step`` has work to do."""
-        return any(one.choosing for one in self._axes.values())
+    def is_selecting_model(self) -> bool:
+        """True if a model selection is active, so that ``run_selection_step`` has work to do."""
+        return any(one.is_selecting_model for one in self._axes.values())
 
-    def step(self) -> bool:
+    def run_selection_step(self) -> bool:
         """Run one step of the model selection, which takes about 1 ms. Return False if no selection is active."""
         for axis, one in self._axes.items():
-            if one.step():
+            if one.run_selection_step():
                 self._events += [self._event(axis, found) for found in one.take_unexplained_changes()]
                 return True
         return False
@@ -86,7 +86,7 @@ class LiveThermal:
 
     def learn_new_offset(self) -> None:
         """Learn new offsets after the sensor was moved or restarted, and discard the current interval."""
-        self._means.forget_sensor_values()
+        self._means.forget_current_sensor_values()
         for one in self._axes.values():
             one.learn_new_offset()
 
@@ -119,7 +119,7 @@ class LiveThermal:
                 if not np.isfinite(bias):
                     continue  # The axis has not been measured yet.
                 self._axes[axis] = OnlineThermalModel(self._interval_s)
-            axes[axis] = self._axes[axis].update(bias, error, interval.temperature_c)
+            axes[axis] = self._axes[axis].predict_and_add_interval(bias, error, interval.temperature_c)
         self._t_ns = t_ns
         return ThermalIntervalResult(t_ns, self._interval_s, interval.temperature_c, axes)
 

@@ -3,8 +3,8 @@
 The model that was fitted to the earlier intervals predicts each new interval. A multi-step prediction uses the
 temperature only, and a one-step prediction also uses the previous bias. After the prediction, ``RecursiveThermalFit``
 updates the coefficients with the interval. The terms and time constants of the model are selected again when the number
-of known intervals has grown by the factor REFIT_GROWTH. A selection takes up to a second. ``step`` therefore runs one
-short step at a time, on the intervals that were known at the start of the selection.
+of known intervals has grown by the factor REFIT_GROWTH. A selection takes up to a second. ``run_selection_step``
+therefore runs one short step at a time, on the intervals that were known at the start of the selection.
 
 If several intervals lie outside their prediction intervals, ``residual_alarm`` suspects a change of the bias. During a
 suspicion, no regular model selection starts, because a new model could fit the change and hide it. Intervals far
@@ -28,7 +28,7 @@ from drivers.errors import NotReady
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.recursive_thermal_fit import PredictionInterval, RecursiveThermalFit
 from monitor.drift.thermal.residual_alarm import ResidualAlarm, UnexplainedChange
-from monitor.drift.thermal.thermal_fit import StepwiseWork, fit_in_steps
+from monitor.drift.thermal.thermal_fit import StepwiseWork, fit_thermal_model_stepwise
 from monitor.drift.thermal.thermal_model import ThermalModel
 
 MAX_INTERVALS: Final = 1000
@@ -94,49 +94,60 @@ class OnlineThermalModel:
         self._settled: list[UnexplainedChange] = []
         self._missing_reason = ""  # reason why there is no model
 
-    def update(self, bias: float, error: float, temperature_c: float) -> PredictedAxisInterval:
+    def predict_and_add_interval(
+        self, bias: float, standard_error: float, temperature_c: float
+    ) -> PredictedAxisInterval:
         """Add an interval, and return it with its prediction.
 
         Parameters
         ----------
         bias : float
             Mean of the interval in rad/s or m/s²; NaN = not measured.
-        error : float
+        standard_error : float
             Standard error of ``bias``.
         temperature_c : float
             Mean temperature of the interval in °C; NaN = not measured.
         """
-        row = _Row(bias, error, temperature_c)
+        row = _Row(bias, standard_error, temperature_c)
         self._interval_count += 1
         self._known_count += row.has_bias_and_temperature
         self._rows.append(row)
         if self._recursion is None:
             if self._work is None:
                 self._start_work(self._choose_model())
-            return PredictedAxisInterval(bias, error, None, None, "", np.nan, self._missing_reason)
+            return PredictedAxisInterval(bias, standard_error, None, None, "", np.nan, self._missing_reason)
         multi_step, one_step = self._recursion.predict_multi_and_one_step(temperature_c)
         model = self._recursion.model
         if self._offset_differences is not None:
-            self._recursion.update(temperature_c, np.nan)
+            self._recursion.add_interval(temperature_c, np.nan)
             if row.has_bias_and_temperature:
                 self._add_offset_difference(self._offset_differences, bias - multi_step.bias)
-            return PredictedAxisInterval(bias, error, None, None, model.shape.name, model.mean_slope, NEW_OFFSET)
-        found = self._suspicion.update(bias if row.has_bias_and_temperature else np.nan, multi_step, one_step)
-        self._recursion.update(
-            temperature_c, np.nan if row.has_bias_and_temperature and self._suspicion.is_unfit_for_update else bias
+            return PredictedAxisInterval(
+                bias, standard_error, None, None, model.shape.name, model.mean_bias_slope, NEW_OFFSET
+            )
+        found = self._suspicion.check_interval(bias if row.has_bias_and_temperature else np.nan, multi_step, one_step)
+        self._recursion.add_interval(
+            temperature_c,
+            np.nan if row.has_bias_and_temperature and self._suspicion.last_interval_is_far_outside else bias,
         )
         if found is not None:
             self._start_work(self._test_for_step(found))
-        elif self._known_count >= self._next_choice and self._work is None and self._suspicion.is_within_prediction:
+        elif (
+            self._known_count >= self._next_choice
+            and self._work is None
+            and self._suspicion.recent_intervals_fit_prediction
+        ):
             self._start_work(self._choose_model())
-        return PredictedAxisInterval(bias, error, multi_step, one_step, model.shape.name, model.mean_slope, "")
+        return PredictedAxisInterval(
+            bias, standard_error, multi_step, one_step, model.shape.name, model.mean_bias_slope, ""
+        )
 
     @property
-    def choosing(self) -> bool:
-        """True if a model selection is active, so that ``step`` has work to do."""
+    def is_selecting_model(self) -> bool:
+        """True if a model selection is active, so that ``run_selection_step`` has work to do."""
         return self._work is not None
 
-    def step(self) -> bool:
+    def run_selection_step(self) -> bool:
         """Run one step of the model selection, which takes about 1 ms. Return False if no selection is active."""
         if self._work is None:
             return False
@@ -163,14 +174,14 @@ class OnlineThermalModel:
     def _start_work(self, work: StepwiseWork[None]) -> None:
         """Start new work. Unfinished earlier work is discarded, because it used fewer intervals."""
         self._work = work
-        self.step()
+        self.run_selection_step()
 
     def _choose_model(self) -> StepwiseWork[None]:
         """Select the model again. The present model is kept if there are too few intervals."""
         self._next_choice = ceil(REFIT_GROWTH * self._known_count)
         self._missing_reason = "the model is being selected"
         try:
-            chosen = yield from fit_in_steps(self._means())
+            chosen = yield from fit_thermal_model_stepwise(self._means())
         except NotReady as error:
             self._missing_reason = str(error)
         else:
@@ -182,8 +193,8 @@ class OnlineThermalModel:
         self._next_choice = ceil(REFIT_GROWTH * self._known_count)
         size, model = doubt.size, None
         try:
-            without = yield from fit_in_steps(means, lags=True)
-            stepped = yield from fit_in_steps(means, since, lags=True)
+            without = yield from fit_thermal_model_stepwise(means, always_try_lags=True)
+            stepped = yield from fit_thermal_model_stepwise(means, since, always_try_lags=True)
         except NotReady:
             pass  # There are too few intervals to select a model. The present model is kept.
         else:
@@ -205,7 +216,7 @@ class OnlineThermalModel:
         """Determine the new offset by a fit to all intervals, or by the mean residual if a fit is not possible."""
         model = None
         try:
-            stepped = yield from fit_in_steps(
+            stepped = yield from fit_thermal_model_stepwise(
                 self._means(), len(self._rows) - (self._interval_count - self._new_offset_at)
             )
         except NotReady:

@@ -18,17 +18,17 @@ import numpy as np
 from drivers.data_types import Floats
 from monitor.common.distributions import student_quantile
 from monitor.drift.thermal.interval_means import IntervalMeans
-from monitor.drift.thermal.thermal_fit import whiten
+from monitor.drift.thermal.thermal_fit import whiten_regression
 from monitor.drift.thermal.thermal_model import (
     LOG_TIME_CONSTANT_STEP,
     ThermalModel,
-    bias_derivatives_by_time_constant,
     coefficient_covariance,
-    interpolate_gaps,
-    predict_with_variance,
+    combine_regressor_derivatives,
+    interpolate_missing_temperatures,
+    predict_bias_and_variance,
     regressor_derivatives,
 )
-from monitor.drift.thermal.thermal_response import ThermalModelForm, regressors
+from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +39,7 @@ class PredictionInterval:
     lo: float
     hi: float
 
-    def side_of(self, bias: float) -> int:
+    def side_of_interval(self, bias: float) -> int:
         """Return 1 if the bias lies above the interval, −1 if below, and 0 if inside or not measured."""
         return int(bias > self.hi) - int(bias < self.lo)
 
@@ -60,8 +60,8 @@ class RecursiveThermalFit:
         shape = model.shape
         k = self._k = shape.difference_equation_order
         self._terms = 1 + shape.powers + k
-        excess = interpolate_gaps(means.temperature_c) - model.reference_c
-        columns = regressors(shape, excess, model.interval_s, began=True)
+        excess = interpolate_missing_temperatures(means.temperature_c) - model.reference_c
+        columns = build_regressors(shape, excess, model.interval_s, with_initial_state=True)
         rows = np.hstack([columns, regressor_derivatives(shape, excess, model.interval_s)])
         near = np.multiply.outer(
             np.exp([-LOG_TIME_CONSTANT_STEP, 0.0, LOG_TIME_CONSTANT_STEP]), np.asarray(shape.constants_s)
@@ -69,15 +69,16 @@ class RecursiveThermalFit:
         # [3, k] for slightly shorter, exact and slightly longer time constants
         self._decays = np.exp(-model.interval_s / near)
         moved = [
-            regressors(ThermalModelForm(0, tuple(one)), excess, model.interval_s, began=True)[-1, 1:] for one in near
+            build_regressors(ThermalModelForm(0, tuple(one)), excess, model.interval_s, with_initial_state=True)[-1, 1:]
+            for one in near
         ]
         # each [3, k], after the last interval
         self._lags, self._initial_responses = np.hsplit(np.array(moved).reshape(3, 2 * k), 2)
         self._excess = float(excess[-1])
-        self._row, self._bias = rows[-1], float(means.bias[-1]) if means.known[-1] else np.nan
-        white, z, _ = whiten(rows, np.where(means.known, means.bias, 0.0), means.known, model.phi)
+        self._row, self._bias = rows[-1], float(means.bias[-1]) if means.both_known[-1] else np.nan
+        white, z, _ = whiten_regression(rows, np.where(means.both_known, means.bias, 0.0), means.both_known, model.phi)
         self._triangle = _upper_triangle(np.hstack([white, z[:, None]]))
-        self._count = int(means.known.sum())
+        self._count = int(means.both_known.sum())
         self.model = self._with_current_coefficients(
             float(np.nanmin(means.temperature_c)), float(np.nanmax(means.temperature_c))
         )
@@ -101,16 +102,16 @@ class RecursiveThermalFit:
         rows = np.stack([self._row, row])
         sizes = np.concatenate([model.coefficients, model.initial_state])
         own = sizes.size
-        bends = bias_derivatives_by_time_constant(model.shape, rows[:, own:], sizes)
+        bends = combine_regressor_derivatives(model.shape, rows[:, own:], sizes)
         wide = student_quantile(self.degrees_of_freedom, 0.975)
         both = []
         for measured in (None, np.array([self._bias, np.nan])):
-            bias, variance = predict_with_variance(model, excess, rows[:, :own], sizes, bends, measured)
+            bias, variance = predict_bias_and_variance(model, excess, rows[:, :own], sizes, bends, measured)
             at, half = float(bias[1]), wide * float(variance[1]) ** 0.5
             both.append(PredictionInterval(at, at - half, at + half))
         return both[0], both[1]
 
-    def update(self, temperature_c: float, bias: float) -> None:
+    def add_interval(self, temperature_c: float, bias: float) -> None:
         """Add an interval.
 
         Parameters
@@ -143,7 +144,7 @@ class RecursiveThermalFit:
         lags = self._decays * self._lags + (1.0 - self._decays) * excess
         left = self._initial_responses * self._decays
         shape = replace(self._model.shape, constants_s=())
-        first = regressors(shape, np.array([excess]), self._model.interval_s, ends=ends)[0]
+        first = build_regressors(shape, np.array([excess]), self._model.interval_s, range_c=ends)[0]
         by = [(one[2] - one[0]) / (2.0 * LOG_TIME_CONSTANT_STEP) for one in (lags, left)]
         return np.concatenate([first, lags[1], left[1], *by]), lags, left
 
@@ -155,7 +156,7 @@ class RecursiveThermalFit:
         sizes = np.linalg.lstsq(x / scale, z, rcond=1e-10)[0] / scale
         square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
         sigma = (square / self.degrees_of_freedom) ** 0.5
-        bends = bias_derivatives_by_time_constant(self._model.shape, self._triangle[:, own:-1], sizes)
+        bends = combine_regressor_derivatives(self._model.shape, self._triangle[:, own:-1], sizes)
         return replace(
             self._model,
             coefficients=sizes[: self._terms],

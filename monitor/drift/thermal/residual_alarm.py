@@ -54,7 +54,7 @@ class ResidualAlarm:
         self._interval_count = 0
 
     @property
-    def is_within_prediction(self) -> bool:
+    def recent_intervals_fit_prediction(self) -> bool:
         """True if the last interval was inside its prediction, and at most one recent interval was above and one below.
 
         The intervals may then be used to select a model.
@@ -62,11 +62,11 @@ class ResidualAlarm:
         return not (self._recent and self._recent[-1].side) and all(self._count_outside(side) < 2 for side in (-1, 1))
 
     @property
-    def is_unfit_for_update(self) -> bool:
+    def last_interval_is_far_outside(self) -> bool:
         """True if the last interval was so far outside its prediction that it must not be used for the fit yet."""
         return bool(self._recent) and abs(self._recent[-1].z) > FAR_HALF_WIDTHS * Z95
 
-    def update(
+    def check_interval(
         self, bias: float, multi_step: PredictionInterval, one_step: PredictionInterval
     ) -> UnexplainedChange | None:
         """Add an interval with its predictions, and return the change if one is now suspected.
@@ -83,7 +83,7 @@ class ResidualAlarm:
             return None
         half = max(0.5 * (one_step.hi - one_step.lo), 1e-300)
         z = Z95 * (bias - one_step.bias) / half
-        self._recent.append(_Residual(self._interval_count, one_step.side_of(bias), bias - multi_step.bias, z))
+        self._recent.append(_Residual(self._interval_count, one_step.side_of_interval(bias), bias - multi_step.bias, z))
         side = self._recent[-1].side
         if not side or self._count_outside(side) < MIN_OUTSIDE:
             return None

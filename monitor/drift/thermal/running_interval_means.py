@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from drivers.data_types import AXES, Floats
-from monitor.drift.thermal.interval_means import MIN_KNOWN_SHARE, PARTS_PER_INTERVAL, standard_error
+from monitor.drift.thermal.interval_means import MIN_KNOWN_SHARE, PARTS_PER_INTERVAL, standard_error_from_parts
 
 BUFFER_ROWS: Final = 1024
 TEMPERATURE_COLUMN: Final = len(AXES)
@@ -42,7 +42,7 @@ class RunningIntervalMeans:
     --------
     >>> means = RunningIntervalMeans(50)
     >>> ramp = np.repeat(np.arange(100.0)[:, None], 6, axis=1)
-    >>> [(one.bias[0].item(), one.temperature_c) for one in means.update(ramp, np.full(100, 25.0), 0)]
+    >>> [(one.bias[0].item(), one.temperature_c) for one in means.add_samples(ramp, np.full(100, 25.0), 0)]
     [(24.5, 25.0), (74.5, 25.0)]
     """
 
@@ -59,7 +59,7 @@ class RunningIntervalMeans:
         self._end = 0  # end of the last finished interval, in samples
         self._begin()
 
-    def update(self, values: Floats, temperature_c: Floats, lost: int) -> list[IntervalMean]:
+    def add_samples(self, values: Floats, temperature_c: Floats, lost: int) -> list[IntervalMean]:
         """Add samples and return the intervals that have ended.
 
         Parameters
@@ -83,7 +83,7 @@ class RunningIntervalMeans:
             finished += self._advance(count)
         return finished
 
-    def forget_sensor_values(self) -> None:
+    def forget_current_sensor_values(self) -> None:
         """Discard the sensor values of the current interval, and keep the temperatures of the interval."""
         self._rows[: self._buffered, :TEMPERATURE_COLUMN] = np.nan
         self._sum[:, :TEMPERATURE_COLUMN], self._count[:, :TEMPERATURE_COLUMN] = 0.0, 0
@@ -146,6 +146,6 @@ class RunningIntervalMeans:
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = self._origin + self._sum.sum(axis=0) / count
         parts = np.s_[:PARTS_PER_INTERVAL, :TEMPERATURE_COLUMN]
-        error = standard_error(self._sum[parts], self._count[parts])
+        error = standard_error_from_parts(self._sum[parts], self._count[parts])
         mean[too_few], error[too_few[:TEMPERATURE_COLUMN]] = np.nan, np.nan
         return IntervalMean(mean[:TEMPERATURE_COLUMN], error, float(mean[TEMPERATURE_COLUMN]), self._end)

@@ -9,7 +9,8 @@ record are each predicted from the other parts. A model that predicts the parts 
 because slow heating leaves one end of a polynomial unconstrained. A model with lags, or with powers above the third, is
 selected only if its AICc is better by a margin.
 
-The search takes between 50 ms and 1 s. ``fit_in_steps`` divides the search into steps of less than a millisecond.
+The search takes between 50 ms and 1 s. ``fit_thermal_model_stepwise`` divides the search into steps of less than a
+millisecond.
 
 The method follows Wang et al., who modelled the bias of MEMS gyroscopes under small temperature changes, with 72 means
 of 1 h. The constant term and the evaluation with own outputs are not part of their paper.
@@ -30,11 +31,11 @@ from monitor.drift.thermal.bias_temperature_tests import find_hysteresis, temper
 from monitor.drift.thermal.interval_means import IntervalMeans
 from monitor.drift.thermal.thermal_model import (
     ThermalModel,
+    bias_derivatives_by_time_constant,
     coefficient_covariance,
-    interpolate_gaps,
-    time_constant_derivatives,
+    interpolate_missing_temperatures,
 )
-from monitor.drift.thermal.thermal_response import ThermalModelForm, least_squares, regressors
+from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regressors, solve_least_squares
 
 MIN_INTERVALS: Final = 12
 MAX_POWER: Final = 5
@@ -74,7 +75,7 @@ GOLDEN_RATIO: Final = 0.6180339887498949
 
 
 @dataclass(frozen=True, slots=True)
-class Candidate:
+class CandidateModel:
     """Fitted model that was a candidate for the selection."""
 
     shape: ThermalModelForm
@@ -88,7 +89,7 @@ class ThermalFit:
     """Model of one axis, and the candidates from which it was chosen."""
 
     model: ThermalModel
-    candidates: tuple[Candidate, ...]  # the chosen form first, then the others by AICc
+    candidates: tuple[CandidateModel, ...]  # the chosen form first, then the others by AICc
     temperature_rose_and_fell: bool  # True if temperature rose and fell
     explained: float  # explained share of the variance of the means
     aicc: float  # only differences between fits of the same means are meaningful
@@ -111,7 +112,7 @@ def fit_thermal_model(means: IntervalMeans) -> ThermalFit:
     NotReady
         If there are too few intervals, or if temperature hardly changed.
     """
-    found = _run_all_steps(fit_in_steps(means))
+    found = _run_all_steps(fit_thermal_model_stepwise(means))
     loop = find_hysteresis(means) if found.temperature_rose_and_fell else None
     if loop is None:
         return found
@@ -128,16 +129,18 @@ def _run_all_steps(pieces: StepwiseWork[T]) -> T:
         return made
 
 
-def fit_in_steps(means: IntervalMeans, since: int | None = None, lags: bool = False) -> StepwiseWork[ThermalFit]:
+def fit_thermal_model_stepwise(
+    means: IntervalMeans, first_after_step: int | None = None, always_try_lags: bool = False
+) -> StepwiseWork[ThermalFit]:
     """Select and fit a model. Each ``next`` runs one least-squares fit.
 
     Parameters
     ----------
     means : IntervalMeans
         Interval means of bias (rad/s or m/s²) and temperature (°C).
-    since : int or None
+    first_after_step : int or None
         Index of the first interval after a possible step of the bias. The step is one more coefficient.
-    lags : bool
+    always_try_lags : bool
         True if lags are fitted even if temperature moved in one direction only.
 
     Raises
@@ -145,26 +148,26 @@ def fit_in_steps(means: IntervalMeans, since: int | None = None, lags: bool = Fa
     NotReady
         If there are too few intervals, or if temperature hardly changed. The first step raises the error.
     """
-    check_means_suffice(means)
+    check_means_suffice_for_fit(means)
     excess, reference_c = _temperature_difference(means)
     temperature_rose_and_fell = _both_ways(means.temperature_c)
     tried = []
-    for shape in _shapes(means, temperature_rose_and_fell or lags):
-        tried.append((yield from _fit_shape(means, excess, shape, since)))
+    for shape in _shapes(means, temperature_rose_and_fell or always_try_lags):
+        tried.append((yield from _fit_shape(means, excess, shape, first_after_step)))
     tried.sort(key=lambda one: one.aicc + _aicc_margin(one.shape))
     errors = []
     for one in tried:
         yield
-        errors.append(_cross_validated_error(_without_step(means, since, one.step), excess, one))
+        errors.append(_cross_validated_error(_without_step(means, first_after_step, one.step), excess, one))
     alone = next(error for one, error in zip(tried, errors, strict=True) if one.shape == ThermalModelForm(0, ()))
     at = next(i for i, error in enumerate(errors) if error <= MAX_ERROR_RATIO * alone)
     best = tried.pop(at)
     kept = [(best, errors.pop(at)), *zip(tried, errors, strict=True)]
-    candidates = tuple(Candidate(one.shape, one.aicc - best.aicc, one.rms, error) for one, error in kept)
+    candidates = tuple(CandidateModel(one.shape, one.aicc - best.aicc, one.rms, error) for one, error in kept)
     yield
-    means = _without_step(means, since, best.step)
+    means = _without_step(means, first_after_step, best.step)
     model = _to_model(means, excess, reference_c, best)
-    known = means.known
+    known = means.both_known
     left = means.bias[known] - (best.columns @ best.sizes)[known]
     explained = 1.0 - float(np.var(left) / np.var(means.bias[known]))
     return ThermalFit(model, candidates, temperature_rose_and_fell, explained, best.aicc, best.step)
@@ -184,7 +187,7 @@ class _ShapeFit:
     step: float
 
 
-def check_means_suffice(means: IntervalMeans) -> None:
+def check_means_suffice_for_fit(means: IntervalMeans) -> None:
     """Check that the means suffice for a fit.
 
     Raises
@@ -192,13 +195,13 @@ def check_means_suffice(means: IntervalMeans) -> None:
     NotReady
         If there are too few means, if temperature hardly changed, or if the bias is constant.
     """
-    count = int(means.known.sum())
+    count = int(means.both_known.sum())
     if count < MIN_INTERVALS:
         raise NotReady(
             f"{count} intervals of {means.interval_s:g} s with bias and temperature; at least {MIN_INTERVALS} are "
             f"needed: record longer, or use a shorter interval"
         )
-    known_temperature_c = means.temperature_c[means.known]
+    known_temperature_c = means.temperature_c[means.both_known]
     swing = float(np.ptp(known_temperature_c))
     least = max(MIN_SWING_C, MIN_SWING_SIGMAS * temperature_noise_c(known_temperature_c))
     if swing < least:
@@ -206,7 +209,7 @@ def check_means_suffice(means: IntervalMeans) -> None:
             f"temperature hardly changed: by {swing:.2g} °C in {count * means.interval_s / HOUR_S:.3g} h; "
             f"at least {least:.2g} °C are needed"
         )
-    if not np.ptp(means.bias[means.known]) > 0.0:
+    if not np.ptp(means.bias[means.both_known]) > 0.0:
         raise NotReady("the bias is the same in all intervals")
 
 
@@ -219,14 +222,16 @@ def _aicc_margin(shape: ThermalModelForm) -> float:
 
 def _temperature_difference(means: IntervalMeans) -> tuple[Floats, float]:
     """Return temperature minus the reference [n] and the reference, in °C."""
-    known = interpolate_gaps(means.temperature_c)
+    known = interpolate_missing_temperatures(means.temperature_c)
     reference_c = round(float(known.mean()), 2)
     return known - reference_c, reference_c
 
 
 def _both_ways(temperature_c: Floats) -> bool:
     """Return True if temperature, smoothed over three intervals, rose and fell by more than MIN_REVERSE_SHARE."""
-    smooth = np.convolve(np.pad(interpolate_gaps(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid")
+    smooth = np.convolve(
+        np.pad(interpolate_missing_temperatures(temperature_c), 1, mode="edge"), np.full(3, 1.0 / 3.0), mode="valid"
+    )
     moved = np.diff(smooth)
     up, down = float(moved[moved > 0.0].sum()), float(-moved[moved < 0.0].sum())
     return min(up, down) > MIN_REVERSE_SHARE * (up + down)
@@ -234,7 +239,7 @@ def _both_ways(temperature_c: Floats) -> bool:
 
 def _shapes(means: IntervalMeans, lags: bool) -> Iterator[ThermalModelForm]:
     """Yield the model forms that the number of intervals allows."""
-    count = int(means.known.sum())
+    count = int(means.both_known.sum())
     for powers in range(MAX_POWER + 1):
         if powers + 3 < count / 2:
             yield ThermalModelForm(powers, ())
@@ -248,9 +253,9 @@ def _fit_shape(
     means: IntervalMeans, excess: Floats, shape: ThermalModelForm, since: int | None
 ) -> StepwiseWork[_ShapeFit]:
     """Fit a model with the best time constants and the best correlation φ of the residuals."""
-    best = yield from _TimeConstantSearch(means, excess, shape, PHI_VALUES[0], since).run()
+    best = yield from _TimeConstantSearch(means, excess, shape, PHI_VALUES[0], since).find_best_time_constants()
     for phi in PHI_VALUES[1:]:
-        other = yield from _TimeConstantSearch(means, excess, shape, phi, since).run()
+        other = yield from _TimeConstantSearch(means, excess, shape, phi, since).find_best_time_constants()
         best = min(best, other, key=lambda one: one.aicc)
     return best
 
@@ -270,7 +275,7 @@ class _TimeConstantSearch:
         self._grid = np.geomspace(self._fastest, self._slowest, GRID_POINTS)
         self._constants: tuple[float, ...] = ()
 
-    def run(self) -> StepwiseWork[_ShapeFit]:
+    def find_best_time_constants(self) -> StepwiseWork[_ShapeFit]:
         """Fit the model with the best time constants."""
         k = self._shape.difference_equation_order
         for _ in range(k):
@@ -324,14 +329,14 @@ def _fit_sizes(
     means: IntervalMeans, excess: Floats, shape: ThermalModelForm, phi: float, since: int | None = None
 ) -> _ShapeFit:
     """Fit the coefficients by least squares on the whitened rows."""
-    known = means.known
-    columns = regressors(shape, excess, means.interval_s, began=True)
+    known = means.both_known
+    columns = build_regressors(shape, excess, means.interval_s, with_initial_state=True)
     own = columns.shape[1]
     if since is not None:
         columns = np.hstack([columns, (np.arange(excess.size) >= since)[:, None]])
     y = np.where(known, means.bias, 0.0)
-    x, z, fresh = whiten(columns, y, known, phi)
-    sizes = least_squares(x, z)
+    x, z, fresh = whiten_regression(columns, y, known, phi)
+    sizes = solve_least_squares(x, z)
     count = x.shape[0]
     square = max(float(((z - x @ sizes) ** 2).sum()), 1e-300)
     free = sizes.size + shape.difference_equation_order + (phi > 0.0) + 1
@@ -350,7 +355,7 @@ def _without_step(means: IntervalMeans, since: int | None, step: float) -> Inter
     return replace(means, bias=means.bias - step * (np.arange(means.bias.size) >= since))
 
 
-def whiten(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
+def whiten_regression(regressors: Floats, values: Floats, known: np.ndarray, phi: float) -> tuple[Floats, Floats, int]:
     """Return rows and values with the correlation φ of the residuals removed.
 
     Each row is reduced by φ times the row before, if that row is known. The first row after a gap is scaled to the same
@@ -358,9 +363,9 @@ def whiten(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[F
 
     Parameters
     ----------
-    columns : ndarray, shape (n, m)
+    regressors : ndarray, shape (n, m)
         Regressors.
-    y : ndarray, shape (n,)
+    values : ndarray, shape (n,)
         Values in rad/s or m/s².
     known : ndarray, shape (n,), bool
         True where the value is known.
@@ -369,17 +374,17 @@ def whiten(columns: Floats, y: Floats, known: np.ndarray, phi: float) -> tuple[F
 
     Returns
     -------
-    columns : ndarray, shape (known, m)
+    regressors : ndarray, shape (known, m)
         Whitened regressors of the known rows.
-    y : ndarray, shape (known,)
+    values : ndarray, shape (known,)
         Whitened values.
     fresh : int
         Number of rows without a known row before.
     """
     follows = known[1:] & known[:-1]
-    x, z = columns.copy(), y.copy()
-    x[1:] -= phi * follows[:, None] * columns[:-1]
-    z[1:] -= phi * follows * y[:-1]
+    x, z = regressors.copy(), values.copy()
+    x[1:] -= phi * follows[:, None] * regressors[:-1]
+    z[1:] -= phi * follows * values[:-1]
     first = known.copy()
     first[1:] &= ~follows
     weight = np.where(first, (1.0 - phi**2) ** 0.5, 1.0)
@@ -395,13 +400,13 @@ def _cross_validated_error(means: IntervalMeans, excess: Floats, one: _ShapeFit)
     edges = np.linspace(0, excess.size, FOLDS + 1).astype(np.int64)
     square = 0.0
     for lo, hi in pairwise(edges.tolist()):
-        used = means.known.copy()
+        used = means.both_known.copy()
         used[lo:hi] = False
-        columns = one.columns if lo else regressors(one.shape, excess, means.interval_s)
-        x, z, _ = whiten(columns, np.where(used, means.bias, 0.0), used, one.phi)
-        differences = (means.bias - columns @ least_squares(x, z))[lo:hi]
-        square += float((differences[means.known[lo:hi]] ** 2).sum())
-    return float((square / means.known.sum()) ** 0.5)
+        columns = one.columns if lo else build_regressors(one.shape, excess, means.interval_s)
+        x, z, _ = whiten_regression(columns, np.where(used, means.bias, 0.0), used, one.phi)
+        differences = (means.bias - columns @ solve_least_squares(x, z))[lo:hi]
+        square += float((differences[means.both_known[lo:hi]] ** 2).sum())
+    return float((square / means.both_known.sum()) ** 0.5)
 
 
 def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _ShapeFit) -> ThermalModel:
@@ -420,6 +425,6 @@ def _to_model(means: IntervalMeans, excess: Floats, reference_c: float, one: _Sh
         lowest_c=float(np.nanmin(means.temperature_c)),
         highest_c=float(np.nanmax(means.temperature_c)),
     )
-    rows = np.hstack([one.columns, time_constant_derivatives(model, excess, one.sizes)])
-    x, _, _ = whiten(rows, np.zeros(excess.size), means.known, one.phi)
+    rows = np.hstack([one.columns, bias_derivatives_by_time_constant(model, excess, one.sizes)])
+    x, _, _ = whiten_regression(rows, np.zeros(excess.size), means.both_known, one.phi)
     return replace(model, covariance=coefficient_covariance(x, one.sigma))

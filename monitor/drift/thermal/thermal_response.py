@@ -60,12 +60,12 @@ def compute_lag_roots(shape: ThermalModelForm, interval_s: float) -> Floats:
     return np.exp(-interval_s / np.asarray(shape.constants_s, dtype=np.float64))
 
 
-def regressors(
+def build_regressors(
     shape: ThermalModelForm,
     excess_c: Floats,
     interval_s: float,
-    began: bool = False,
-    ends: tuple[float, float] | None = None,
+    with_initial_state: bool = False,
+    range_c: tuple[float, float] | None = None,
 ) -> Floats:
     """Return the regressors [n, terms]: one, powers of T − reference, lags, and initial-state responses.
 
@@ -77,38 +77,38 @@ def regressors(
         T − reference, °C, without gaps.
     interval_s : float
         Length of an interval, s.
-    began : bool
+    with_initial_state : bool
         True if each lag has a regressor for its initial state, because the earlier temperature is unknown. False if
         temperature is assumed to have been constant before the first interval.
-    ends : (float, float) or None
+    range_c : (float, float) or None
         Lowest and highest T − reference of the fit, °C. Outside this range, powers continue as straight lines.
 
     Examples
     --------
-    >>> regressors(ThermalModelForm(1, ()), np.array([0.0, 2.0]), 60.0).tolist()
+    >>> build_regressors(ThermalModelForm(1, ()), np.array([0.0, 2.0]), 60.0).tolist()
     [[1.0, 0.0], [1.0, 2.0]]
     """
     n = excess_c.size
     columns = [np.ones(n)]
-    columns += [_power(excess_c, power, ends) for power in range(1, shape.powers + 1)]
+    columns += [_power(excess_c, power, range_c) for power in range(1, shape.powers + 1)]
     p = compute_lag_roots(shape, interval_s)
-    columns += [first_order_lag(excess_c, one) for one in p]
-    if began:
+    columns += [apply_first_order_lag(excess_c, one) for one in p]
+    if with_initial_state:
         columns += [one ** np.arange(n, dtype=np.float64) for one in p]
     return np.stack(columns, axis=1)
 
 
-def excess_beyond_range(excess_c: Floats, ends: tuple[float, float]) -> Floats:
+def temperature_beyond_range(excess_c: Floats, range_c: tuple[float, float]) -> Floats:
     """Return the signed distance of each temperature from the range of the fit in °C; 0 inside.
 
     Parameters
     ----------
     excess_c : ndarray, shape (n,)
         T − reference, °C.
-    ends : (float, float)
+    range_c : (float, float)
         Lowest and highest T − reference of the fit, °C.
     """
-    return excess_c - np.clip(excess_c, *ends)
+    return excess_c - np.clip(excess_c, *range_c)
 
 
 def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
@@ -116,70 +116,71 @@ def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
     if ends is None or ends[1] <= ends[0]:
         return np.asarray(x**power)
     chord = (ends[1] ** power - ends[0] ** power) / (ends[1] - ends[0])
-    return np.asarray(np.clip(x, *ends) ** power + chord * excess_beyond_range(x, ends))
+    return np.asarray(np.clip(x, *ends) ** power + chord * temperature_beyond_range(x, ends))
 
 
 @compiled
-def first_order_lag(x: Floats, p: float) -> Floats:
+def apply_first_order_lag(values: Floats, root: float) -> Floats:
     """Return a first-order lag of x, L_n = p L_{n−1} + (1 − p) x_n, settled at the first value.
 
     Parameters
     ----------
-    x : ndarray, shape (n,)
+    values : ndarray, shape (n,)
         Input.
-    p : float
+    root : float
         Root of the lag, 0 < p < 1.
     """
-    out = np.empty(x.size)
-    level = x[0]
-    for k in range(x.size):
-        level = p * level + (1.0 - p) * x[k]
+    out = np.empty(values.size)
+    level = values[0]
+    for k in range(values.size):
+        level = root * level + (1.0 - root) * values[k]
         out[k] = level
     return out
 
 
-def least_squares(columns: Floats, y: Floats) -> Floats:
+def solve_least_squares(regressors: Floats, values: Floats) -> Floats:
     """Return the least-squares coefficients [terms].
 
     The columns are scaled, so that their units have no effect.
 
     Parameters
     ----------
-    columns : ndarray, shape (n, terms)
+    regressors : ndarray, shape (n, terms)
         Regressors.
-    y : ndarray, shape (n,)
+    values : ndarray, shape (n,)
         Values.
     """
-    scale = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-    found = np.linalg.lstsq(columns / scale, y, rcond=1e-10)[0]
+    scale = np.maximum(np.linalg.norm(regressors, axis=0), 1e-300)
+    found = np.linalg.lstsq(regressors / scale, values, rcond=1e-10)[0]
     return np.asarray(found / scale)
 
 
-def difference_equation(shape: ThermalModelForm, sizes: Floats, interval_s: float) -> tuple[Floats, Floats, float]:
+def difference_equation_coefficients(
+    shape: ThermalModelForm, coefficients: Floats, interval_s: float
+) -> tuple[Floats, Floats, float]:
     """Return the coefficients a [k], b [m + 1] and c of the difference equation in T − reference.
 
     Parameters
     ----------
     shape : ThermalModelForm
         Form of the model.
-    sizes : ndarray, shape (terms,)
+    coefficients : ndarray, shape (terms,)
         Coefficients of constant, powers and lags.
     interval_s : float
         Length of an interval, s.
 
     Examples
     --------
-    >>> a, b, c = difference_equation(ThermalModelForm(0, (1.0 / np.log(2.0),)), np.array([3.0, 10.0]), 1.0)
-    >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12)
-    ([-0.5], [5.0], 1.5)
+    >>> a, b, c = difference_equation_coefficients(ThermalModelForm(0, (1.0 / np.log(2.0),)), np.array([3.0, 10.0]),
+    1.0) >>> a.round(12).tolist(), b.round(12).tolist(), round(c, 12) ([-0.5], [5.0], 1.5)
     """
     p = compute_lag_roots(shape, interval_s)
     whole = np.poly(p) if p.size else np.ones(1)  # [k + 1] 1, followed by a
     b = np.zeros(whole.size)
     if shape.powers:
-        b += sizes[1] * whole
+        b += coefficients[1] * whole
     for i, one in enumerate(p):
         rest = np.poly(np.delete(p, i)) if p.size > 1 else np.ones(1)
-        b[: rest.size] += sizes[1 + shape.powers + i] * (1.0 - one) * rest
+        b[: rest.size] += coefficients[1 + shape.powers + i] * (1.0 - one) * rest
     last = b.size if shape.powers else b.size - 1
-    return np.asarray(whole[1:], dtype=np.float64), b[: max(last, 1)], float(sizes[0] * whole.sum())
+    return np.asarray(whole[1:], dtype=np.float64), b[: max(last, 1)], float(coefficients[0] * whole.sum())

@@ -589,7 +589,7 @@ def follow_temperature(rig, seconds, begin_s=0.0):
 def test_bias_is_held_against_temperature():
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 30.0)
-    while rig.station.pipeline.thermal.step():  # until the models are chosen
+    while rig.station.pipeline.thermal.run_selection_step():  # until the models are chosen
         pass
     follow_temperature(rig, 3.0, 100.0)
     assert len(rig.caught.thermals) >= 31
@@ -605,7 +605,7 @@ def test_choosing_a_model_holds_no_round_up(monkeypatch):
     monkeypatch.setattr(device_worker, "MODEL_SELECTION_S", 0.0)  # a step each time, however fast the machine is
     rig = Rig(thermal_s=1.0)
     follow_temperature(rig, 14.0)
-    assert rig.station.pipeline.thermal.choosing
+    assert rig.station.pipeline.thermal.is_selecting_model
     for i in range(50):
         rig.work(100.0 + i)
     assert rig.station._can_take()  # a sensor never waits
@@ -621,7 +621,7 @@ def test_a_recording_waits_for_its_model(monkeypatch):
     with monkeypatch.context() as slow:
         slow.setattr(device_worker, "MODEL_SELECTION_REPLAY_S", 0.0)  # a step each time, however fast the machine is
         rig.work(1000.0)
-    assert rig.station.pipeline.thermal.choosing
+    assert rig.station.pipeline.thermal.is_selecting_model
     assert 12 <= len(rig.caught.thermals) <= 20
     assert not rig.station._can_take()
     for i in range(2000):
