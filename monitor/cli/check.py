@@ -42,7 +42,6 @@ def check(
 
 
 def _defaults(link: str | None, decoder: str | None) -> str:
-    """Return a configuration file with all keys and defaults, or only with the keys of a link and a decoder."""
     from monitor.settings import printed_defaults
 
     texts = []

@@ -1,4 +1,4 @@
-"""Command ``doctor``: prints the findings as a table or writes them as JSON."""
+"""Command ``doctor``: prints the findings about a machine and a configuration as a table or as JSON."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -37,7 +37,6 @@ def doctor(
 
 
 def _print(findings: list) -> None:  # type: ignore[type-arg]
-    """Print the findings as a table."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table

@@ -1,4 +1,4 @@
-"""Command ``history``: prints past results from the file of a daemon or from a running daemon."""
+"""Command ``history``: prints stored results from the history file or from a running daemon."""
 
 import time
 from collections.abc import Callable
@@ -88,7 +88,6 @@ def history(
 
 
 def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: Path | None, plot: Path | None) -> None:
-    """Write the results to the requested files."""
     from monitor.publishing.messages.history import HistoryMessage
     from monitor.publishing.reports import history_file
 
@@ -105,7 +104,7 @@ def _save(past: "HistoryTable", asked: "HistoryQuery", json: Path | None, out: P
 
 
 def _from_file(source: Path | None, name: str | None) -> Get:
-    """Return a function that reads results from a history file. A daemon may write to the file at the same time."""
+    """Return a function that reads the history file, even while a daemon writes to the file."""
     from monitor.history import history_table as past
     from monitor.history.sqlite_store import open_history
 
@@ -123,7 +122,6 @@ def _from_file(source: Path | None, name: str | None) -> Get:
 
 
 def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str | None) -> Get:
-    """Return a function that queries the history of a running daemon over zenoh."""
     from monitor.publishing.zenoh.history_client import query_histories
 
     def query_daemon(query: "HistoryQuery") -> "HistoryTable":
@@ -134,7 +132,7 @@ def _from_daemon(endpoint: str | None, file: Path | None, prefix: str, name: str
 
 
 def _history_path(source: Path) -> Path:
-    """Return the path of the history file for a configuration, a folder or the file itself."""
+    """Return the path of the history file for a configuration file, a storage folder or a history file."""
     from monitor.history.sqlite_store import FILE_NAME
     from monitor.settings import loading
 
@@ -149,7 +147,7 @@ def _history_path(source: Path) -> Path:
 
 
 def _select_device(name: str | None, there: list[str], where: str) -> str:
-    """Return the name of the requested device, or of the only device.
+    """Return the name of the requested device, or of the only device if no name is given.
 
     Raises
     ------
@@ -173,7 +171,7 @@ def _select_device(name: str | None, there: list[str], where: str) -> str:
 
 
 def _span(since: str | None, until: str | None) -> "TimeRange | None":
-    """Return the requested time range; None if neither end is given."""
+    """Return the time range of the options ``--from`` and ``--to``, or None if both options are missing."""
     from monitor.history.time_ranges import TimeRange, parse_time
 
     if since is None and until is None:

@@ -1,4 +1,4 @@
-"""Commands ``thermal fit`` and ``thermal predict``: model the bias as a function of temperature."""
+"""Commands ``thermal fit`` and ``thermal predict``: describe the bias as a function of temperature."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""Command ``warm-up``: compiles the numerical kernels before they are needed."""
+"""Command ``warm-up``: compiles the numerical kernels in advance."""
 
 import sys
 import time

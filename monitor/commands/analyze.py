@@ -1,11 +1,7 @@
-"""Command ``analyze``: reads a recording and computes all requested results, in several threads.
+"""Command ``analyze``: reads a recording and computes Allan deviations, noise coefficients, motion and noise changes.
 
-Allan deviations, noise coefficients, motion and changes of the noise are always determined. Total and Hadamard
-deviations take four times as long as Allan deviations, so they are computed only if they are drawn or written. Allan
-deviations over time are computed if a window is given.
-
-Independent axes and results are computed in parallel threads, because kernels release the GIL. Allan deviations over
-time are computed in the calling thread, so that Ctrl-C ends the computation at once.
+Total and Hadamard deviations take four times as long as Allan deviations, so they are computed only on request.
+Independent axes and results are computed in parallel threads, because the numerical kernels release the GIL.
 """
 
 import os
@@ -55,9 +51,9 @@ class AnalysisRequest:
     recording: Path
     rate_hz: float | None = None
     tau: TauGrid = "octave"
-    window_s: float | None = None  # window of dynamic curves; None for no dynamic curves
-    exclude_motion: bool = False  # True if motion is excluded
-    total_and_hadamard: bool = False  # True if total and Hadamard deviations are computed
+    window_s: float | None = None  # window length of dynamic Allan deviations; None = not computed
+    exclude_motion: bool = False  # True if samples in motion are excluded
+    total_and_hadamard: bool = False  # True to compute total and Hadamard deviations
     last_s: float | None = None  # length of the end of the recording that is used; None for all
 
 
@@ -69,7 +65,7 @@ class AnalysisResults:
     total: TotalCurve | None = None
     hadamard: HadamardCurve | None = None
     dynamic: DynamicAllan | None = None
-    lacking: str = ""  # reason why requested dynamic curves are missing
+    lacking: str = ""  # reason why dynamic Allan deviations are missing
     without_temperature: TemperatureRemoval | None = (
         None  # coefficients without the effect of temperature, if it explains any axis
     )
@@ -88,8 +84,8 @@ def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = i
     Raises
     ------
     RecordingError, ConfigError
-        If the recording cannot be read, if it is too short for a requested τ or window, or if there is not enough
-        memory.
+        If the recording cannot be read, or is too short for a requested averaging time or window, or if there is not
+        enough memory.
     TooFewSamples
         If the recording has too few samples for any result.
     """
@@ -103,7 +99,6 @@ def run_analysis(request: AnalysisRequest, report_progress: ProgressCallback = i
 
 
 def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
-    """Read a recording and analyse it, with a pool of threads."""
     tell("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
     blocks = list(iter_blocks(found))
@@ -134,12 +129,12 @@ def _make(request: AnalysisRequest, tell: ProgressCallback) -> AnalysisResults:
 
 
 def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> None:
-    """Draw the results as a picture, or write them as a page if the file name ends in .html.
+    """Save the results as a picture, or as an HTML page if the file name ends in ``.html``.
 
     Parameters
     ----------
     results : AnalysisResults
-        Results to draw.
+        Results of the analysis.
     path : Path
         File to write.
     title : str
@@ -166,7 +161,7 @@ def save_plot_or_report(results: AnalysisResults, path: Path, title: str) -> Non
 def _without_temperature(
     result: Analysis, blocks: Sequence[SampleBlock], rate_hz: float | None
 ) -> TemperatureRemoval | None:
-    """Return the coefficients without the effect of temperature; None if the temperature is missing or constant."""
+    """Return the coefficients without the effect of temperature, or None if the temperature is missing or constant."""
     if not temperature_varied(np.concatenate([samples.temperature_c for samples in blocks])):
         return None
     _, temperature_c, _, _ = resample_with_temperature(blocks, rate_hz)
@@ -176,7 +171,6 @@ def _without_temperature(
 def _dynamic_curves(
     result: Analysis, request: AnalysisRequest, tell: ProgressCallback
 ) -> tuple[DynamicAllan | None, str]:
-    """Return the dynamic curves if they are requested, or the reason why they are missing."""
     if request.window_s is None:
         return None, ""
     rate_hz = result.estimate.rate_hz
@@ -190,7 +184,7 @@ def _dynamic_curves(
 
 
 def _total_and_hadamard(result: Analysis, tau: TauGrid) -> tuple[TotalCurve, HadamardCurve | None]:
-    """Return total and Hadamard deviations at octaves, or at the listed τ if the recording is long enough."""
+    """Return the total and Hadamard deviations at octaves, or at the requested averaging times."""
     values, rate_hz, theta = result.values, result.estimate.rate_hz, np.where(result.fit.entered, result.fit.theta, 0.0)
     listed = None if isinstance(tau, str) else result.estimate.curve.factors
     short: Ints | None = None if listed is None else listed[3 * listed <= len(values)]

@@ -1,9 +1,8 @@
-"""Command ``compensate``: writes a recording without the drift of its gyroscopes, and measures the improvement.
+"""Command ``compensate``: removes the gyro drift from a recording and measures the improvement.
 
-The method ``adaptive`` processes the samples one by one, as the daemon does. The method ``fixed`` differs from
-``adaptive`` in that the noise of the drift is not adapted. The other methods are published methods for finished
-recordings. All methods are evaluated on the same samples at rest. The first third of the samples at rest is excluded,
-because some methods use it for learning.
+The method ``adaptive`` processes the samples one by one, as the daemon does. The method ``fixed`` does not adapt the
+estimated noise of the drift. All methods are evaluated on the same samples at rest. The first third of the samples at
+rest is not evaluated, because some methods use the first third for learning.
 """
 
 from dataclasses import dataclass
@@ -60,13 +59,13 @@ def run_compensation(
 
     Returns
     -------
-    Result
-        Quality of the uncompensated and the compensated rate of each gyroscope axis.
+    CompensationResult
+        Quality of the uncompensated and the compensated rate of each gyro axis.
 
     Raises
     ------
     ConfigError, RecordingError
-        If the method is unknown, if the recording cannot be read or has no gyroscope axis, or if the result cannot be
+        If the method is unknown, if the recording cannot be read or has no gyro axis, or if the result cannot be
         written.
     NotReady
         If the sensor was never at rest for long enough. No file is written.
@@ -114,7 +113,7 @@ def run_compensation(
 
 
 def _run(live: Compensator, values: Floats, tell: ProgressCallback) -> Floats:
-    """Compensate as the daemon does, except that a model is identified at once when it is due."""
+    """Compensate the drift as the daemon does, but identify each drift model without delay."""
     out = np.empty_like(values)
     size = live.interval_samples
     for start in range(0, len(values), size):
@@ -126,7 +125,7 @@ def _run(live: Compensator, values: Floats, tell: ProgressCallback) -> Floats:
 
 
 def _at_rest(intervals: tuple[DriftInterval, ...], n: int, size: int) -> NDArray[np.bool_]:
-    """Return a mask [n, 3] that is True for samples of the intervals that updated a known bias."""
+    """Return a mask [n, 3] that is True for samples of intervals at rest with a known bias."""
     mask = np.zeros((n, len(GYROS)), dtype=bool)
     for one in intervals:
         mask[one.end - size : one.end] = (one.outcome == USED) & np.isfinite(one.expected)
@@ -134,7 +133,7 @@ def _at_rest(intervals: tuple[DriftInterval, ...], n: int, size: int) -> NDArray
 
 
 def _split_learning(rest: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return two masks for the samples at rest of each axis: the first third, and the remaining samples."""
+    """Return two masks for the samples at rest: the first third for learning, and the rest for the evaluation."""
     count = np.cumsum(rest, axis=0)
     first = count <= LEARNING_SHARE * count[-1]
     return rest & first, rest & ~first
@@ -143,7 +142,6 @@ def _split_learning(rest: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDArray
 def _compensate_offline(
     method: str, values: Floats, learned: NDArray[np.bool_], axes: tuple[str, ...], tell: ProgressCallback
 ) -> Floats:
-    """Compensate each axis with a method for finished recordings."""
     out = values.copy()
     for axis in axes:
         at = AXES.index(axis)
@@ -161,7 +159,6 @@ def _evaluate_axis(
     live: Compensator,
     intervals: tuple[DriftInterval, ...],
 ) -> AxisCompensation:
-    """Return the quality of one axis before and after compensation."""
     before = values[:, at] - np.nanmean(values[learned[:, at], at])
     first = int(np.argmax(judged[:, at]))
     model = live.models[at]
@@ -182,7 +179,6 @@ def _evaluate_axis(
 def _write(
     path: Path, axes: tuple[str, ...], t_s: Floats, out: Floats, temperature_c: Floats, tell: ProgressCallback
 ) -> None:
-    """Write all recorded rows at their times on the regular grid."""
     there = np.flatnonzero(np.isfinite(out).any(axis=1))
     warm = bool(np.isfinite(temperature_c).any())
     with open_recording_writer(path, axes, warm) as append:

@@ -1,11 +1,8 @@
-"""Command ``reconcile``: compares recordings with a noise model, in several threads, and writes the report.
+"""Command ``reconcile``: compares recordings with a noise model and writes the report.
 
-``DIR/`` receives ``report.html``, ``report.json``, ``model.toml`` and ``reconcile.rrd``. Each file is written
-completely or not at all. If the data do not support an answer, only ``report.json`` is written, and it states the
-reason. Kernels and transforms release the GIL, so that axes and simulated recordings are processed in parallel.
-
-Several recordings are compared with one model, one after the other. The report of each recording is written to a
-subfolder of ``DIR/``. The common results and the differences are written to ``DIR/`` itself.
+The report consists of ``report.html``, ``report.json``, ``model.toml`` and ``reconcile.rrd``. If the data do not
+support an answer, only ``report.json`` is written, with the reason. If several recordings are compared, the report of
+each recording is written to a subfolder.
 """
 
 import os
@@ -39,10 +36,10 @@ REPORT: Final = "report.json"
 
 @dataclass(frozen=True, slots=True)
 class ReconciliationRequest:
-    """Recording and model to compare."""
+    """Recording, noise model and options of the command ``reconcile``."""
 
     recording: Path
-    model: NoiseModel | None  # None: the five noise terms are fitted to the recording
+    model: NoiseModel | None  # None fits the five noise terms to the recording
     out: Path
     seed: int = 1
     rate_hz: float | None = None
@@ -52,10 +49,10 @@ class ReconciliationRequest:
 
 @dataclass(frozen=True, slots=True)
 class ComparisonRequest:
-    """Several recordings of one sensor, and the model to compare them with."""
+    """Several recordings of one sensor, the noise model, and the options of the command ``reconcile``."""
 
     recordings: tuple[Path, ...]
-    model: NoiseModel | None  # None: the five noise terms are fitted to the first recording
+    model: NoiseModel | None  # None fits the five noise terms to the first recording
     out: Path
     seed: int = 1
     rate_hz: float | None = None
@@ -65,12 +62,12 @@ class ComparisonRequest:
 def run_reconciliation(
     request: ReconciliationRequest, report_progress: ProgressCallback = ignore_progress
 ) -> Reconciliation:
-    """Compare one recording with a model and write the report.
+    """Compare a recording with a noise model and write the report.
 
     Parameters
     ----------
     request : ReconciliationRequest
-        Recording and model to compare.
+        Recording, noise model and options.
     report_progress : callable, optional
         Progress callback.
 
@@ -79,7 +76,7 @@ def run_reconciliation(
     RecordingError, ConfigError
         If the recording cannot be read, or if the folder cannot be written.
     NotReady
-        If the data do not support an answer. The report states the reason.
+        If the data do not support an answer.
     """
     report_progress("reading", None)
     found = load_samples(request.recording, request.rate_hz, request.last_s)
@@ -100,12 +97,12 @@ def run_reconciliation(
 
 
 def compare_recordings(request: ComparisonRequest, report_progress: ProgressCallback = ignore_progress) -> Comparison:
-    """Compare several recordings with a model and with each other, and write the reports.
+    """Compare several recordings with a noise model and with each other, and write the reports.
 
     Parameters
     ----------
     request : ComparisonRequest
-        Recordings and model to compare.
+        Recordings, noise model and options.
     report_progress : callable, optional
         Progress callback.
 
@@ -114,8 +111,7 @@ def compare_recordings(request: ComparisonRequest, report_progress: ProgressCall
     RecordingError, ConfigError
         If a recording cannot be read or is given twice, or if the folder cannot be written.
     NotReady
-        If fewer than two recordings can be evaluated, or if no model is given and the first recording cannot be
-        evaluated.
+        If fewer than two recordings can be evaluated.
     """
     named = unique_recording_names(request.recordings)
     _check_recordings(named, request.out)
@@ -150,7 +146,6 @@ def compare_recordings(request: ComparisonRequest, report_progress: ProgressCall
 
 
 def _write_comparison(result: Comparison, folder: Path) -> None:
-    """Write the report on all recordings together."""
     from monitor.publishing.reports.comparison_page import render_page
 
     _write(folder / REPORT, comparison_report.encode_comparison(result))
@@ -159,7 +154,9 @@ def _write_comparison(result: Comparison, folder: Path) -> None:
 
 
 def unique_recording_names(recordings: Sequence[Path]) -> dict[str, Path]:
-    """Return a unique name for each recording: the file name without its suffix, and a number if names are equal.
+    """Return a unique name for each recording.
+
+    The name is the file name without the suffix. A number is added if two file names are equal.
 
     Raises
     ------
@@ -184,7 +181,7 @@ def unique_recording_names(recordings: Sequence[Path]) -> dict[str, Path]:
 
 
 def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
-    """Check before the work begins that all recordings exist and that no report would overwrite a recording."""
+    """Check that all recordings exist and that no report would overwrite a recording."""
     for path in named.values():
         if not path.exists():
             raise RecordingError(f"{path}: cannot be read: there is no such file or folder")
@@ -195,12 +192,11 @@ def _check_recordings(named: Mapping[str, Path], out: Path) -> None:
 
 
 def _tell_for(tell: ProgressCallback, which: str) -> ProgressCallback:
-    """Return a progress callback that adds the name of a recording."""
+    """Return a progress callback that adds the name of a recording to each message."""
     return lambda what, share: tell(f"{which}: {what}", share)
 
 
 def _write_report(result: Reconciliation, folder: Path, title: str) -> None:
-    """Write the four files of a report."""
     from monitor.publishing.reports.reconcile_page import render_page
 
     _write(folder / REPORT, encode_report(result))
@@ -215,7 +211,7 @@ def _write_report(result: Reconciliation, folder: Path, title: str) -> None:
 
 
 def _encode_failure(why: str, samples: int, schema: str = SCHEMA) -> bytes:
-    """Return the content of ``report.json`` for data that do not support an answer."""
+    """Return the content of ``report.json`` if the data do not support an answer."""
     return msgspec.json.encode({"schema": schema, "verdict": None, "why": why, "samples": samples})
 
 
@@ -234,13 +230,12 @@ def create_report_folder(folder: Path) -> None:
 
 
 def _to_regular_grid(found: Samples) -> tuple[Recording, list[str]]:
-    """Return the axes of the recording on a regular time grid, and notes about the resampling."""
+    """Return the recording on a regular time grid, and notes about the resampling."""
     values, temperature_c, rate_hz, notes = resample_with_temperature(list(iter_blocks(found)), found.rate_hz)
     columns = {axis: np.ascontiguousarray(values[:, AXES.index(axis)], np.float64) for axis in found.axes}
     return Recording(columns, rate_hz, temperature_c), notes
 
 
 def _write(path: Path, data: bytes) -> None:
-    """Write a file completely or not at all."""
     with atomic_write_path(path) as place:
         place.write_bytes(data)

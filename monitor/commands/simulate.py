@@ -1,11 +1,8 @@
 """Command ``simulate``: writes a recording of a noise model.
 
-The time series is drawn and written block by block, so that the memory does not grow with the length. The file has the
-column ``t`` (seconds from 0, at the nominal rate) and the axes that the model names. Other axes are absent, not zero.
-The column ``temperature`` is present if the model or a recording provides it.
-
-Recording and truth file are each written completely or not at all. The truth file contains the model, the seed, and
-random values such as the times of events.
+The samples are simulated and written in blocks, so that the required memory does not depend on the length. The
+recording contains only the axes of the noise model. The truth file contains the noise model, the seed, and random
+values such as the times of events.
 """
 
 import tomllib
@@ -33,21 +30,21 @@ CHUNK_ROWS: Final = 1 << 16
 
 @dataclass(frozen=True, slots=True)
 class SimulationRequest:
-    """Recording to simulate."""
+    """Noise model, output file and options of the command ``simulate``."""
 
     model: NoiseModel
     out: Path
     seconds: float
     seed: int
     rate_hz: float | None = None  # None for the rate of the model
-    temperature_from: Path | None = None  # recording whose temperature replaces that of the model
-    truth: bool = False  # True if a file with the drawn random values is also written
+    temperature_from: Path | None = None  # recording from which the temperature is taken
+    truth: bool = False  # True to write a file with the drawn random values
     name: str = "the model"  # name of the model in messages
 
 
 @dataclass(frozen=True, slots=True)
 class SimulationResult:
-    """Description of the written recording."""
+    """Description of the simulated recording."""
 
     out: Path
     samples: int
@@ -59,11 +56,11 @@ class SimulationResult:
 
     @property
     def duration_s(self) -> float:
-        """Length of the recording in seconds."""
+        """Return the length of the recording in seconds."""
         return self.samples / self.rate_hz
 
     def describe_in_one_line(self) -> str:
-        """Return the description in one line of text."""
+        """Return a description of the recording in one line."""
         columns = " ".join([*self.axes, *(["temperature"] if self.temperature else [])])
         beside = f"; truth in {self.truth}" if self.truth else ""
         return (
@@ -72,7 +69,7 @@ class SimulationResult:
         )
 
     def to_json(self) -> bytes:
-        """Return the description as JSON."""
+        """Return the description of the recording as JSON."""
         return msgspec.json.encode(
             {
                 "schema": RESULT_SCHEMA,
@@ -89,12 +86,12 @@ class SimulationResult:
 
 
 def run_simulation(request: SimulationRequest, report_progress: ProgressCallback = ignore_progress) -> SimulationResult:
-    """Simulate a recording and write it.
+    """Simulate a recording and write the recording to a file.
 
     Parameters
     ----------
     request : SimulationRequest
-        Recording to simulate.
+        Noise model, output file and options.
     report_progress : callable, optional
         Progress callback.
 
@@ -106,7 +103,7 @@ def run_simulation(request: SimulationRequest, report_progress: ProgressCallback
     Raises
     ------
     ConfigError
-        If there is no rate or no axis, if the model cannot be simulated at this rate, or if the file cannot be written.
+        If the sample rate is unknown, if the noise model cannot be simulated, or if the file cannot be written.
     RecordingError
         If the recording with the temperature cannot be read.
     """
@@ -139,7 +136,6 @@ def run_simulation(request: SimulationRequest, report_progress: ProgressCallback
 
 
 def _write(result: SimulationResult, stream: ModelStream, first: SimulatedSamples, tell: ProgressCallback) -> None:
-    """Write the recording block by block."""
     with open_recording_writer(result.out, result.axes, result.temperature) as append:
         block, written = first, 0
         while True:
@@ -153,7 +149,6 @@ def _write(result: SimulationResult, stream: ModelStream, first: SimulatedSample
 
 
 def _rate_hz(request: SimulationRequest) -> float:
-    """Return the requested sample rate, or else the rate of the model."""
     rate_hz = request.rate_hz or request.model.sample_rate_hz
     if rate_hz is None:
         raise ConfigError(f"{request.name}: the model has no sample_rate; set the rate with --rate HZ")
@@ -161,9 +156,9 @@ def _rate_hz(request: SimulationRequest) -> float:
 
 
 def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats | None:
-    """Return the temperature of the recording at the times of the samples, [≤ n] in °C, by linear interpolation.
+    """Return the temperature [≤ n] in °C, interpolated to the times of the simulated samples.
 
-    None means that the temperature of the model is used.
+    The result is None if no recording with a temperature is given.
     """
     if request.temperature_from is None:
         return None
@@ -179,7 +174,7 @@ def _temperature(request: SimulationRequest, rate_hz: float, n: int) -> Floats |
 
 
 def _load_recording(path: Path, rate_hz: float | None) -> Recording:
-    """Load the recording with the temperature. If it has no rate, its rows are assumed to have the requested rate."""
+    """Load the recording of the temperature. The requested sample rate is used if the recording has none."""
     try:
         return load_samples(path)
     except ConfigError:
@@ -189,7 +184,6 @@ def _load_recording(path: Path, rate_hz: float | None) -> Recording:
 
 
 def _truth(result: SimulationResult, model: NoiseModel, stream: ModelStream) -> bytes:
-    """Return the truth as JSON."""
     return msgspec.json.encode(
         {
             "schema": TRUTH_SCHEMA,
@@ -206,7 +200,6 @@ def _truth(result: SimulationResult, model: NoiseModel, stream: ModelStream) -> 
 
 
 def _version() -> str | None:
-    """Return the version of this program; None if it runs from a folder without installation."""
     try:
         return version("imu-monitor")
     except PackageNotFoundError:

@@ -1,5 +1,4 @@
-"""Command-line options that several commands share, and parsers for option values such as durations. Error messages
-name the option."""
+"""Command-line options that several commands share, and functions that parse the values of options."""
 
 import sys
 from collections.abc import Callable
@@ -30,12 +29,12 @@ MAX_AVERAGING_TIMES: Final = 1000
 
 
 def make_range_callback(allowed_range: NumberRange) -> Callable[[typer.CallbackParam, Number | None], Number | None]:
-    """Return a typer callback that checks the value of an option against the range of a quantity.
+    """Return a typer callback that checks whether the value of an option is within the allowed range.
 
     Raises
     ------
     ConfigError
-        If the value is outside the supported range. The message begins with the name of the option.
+        If the value of the option is outside the supported range.
     """
 
     def check_option_value(option: typer.CallbackParam, value: Number | None) -> Number | None:
@@ -110,7 +109,7 @@ Last = Annotated[
 
 
 def parse_averaging_times(text: str) -> "TauGrid":
-    """Parse averaging times: the name of a grid, or a list of seconds.
+    """Parse the averaging times of the option ``--tau``: the name of a grid, or a list of times in seconds.
 
     Raises
     ------
@@ -140,14 +139,14 @@ def parse_duration(option: str, text: None) -> None: ...
 @overload
 def parse_duration(option: str, text: str | None) -> float | None: ...
 def parse_duration(option: str, text: str | None) -> float | None:
-    """Parse a duration such as "90", "30min" or "1h", and return seconds.
+    """Parse a duration such as "90", "30min" or "1h", and return the duration in seconds.
 
     Parameters
     ----------
     option : str
         Name of the option, for the message.
     text : str or None
-        Duration. None is returned as None.
+        Text of the duration. If None, the function returns None.
 
     Raises
     ------
@@ -164,7 +163,7 @@ def parse_duration(option: str, text: str | None) -> float | None:
 
 
 def parse_arma_order(text: str | None) -> "Order | None":
-    """Parse the orders p and q of an ARMA model.
+    """Parse the orders p and q of an ARMA model, for example "2,1".
 
     Raises
     ------
