@@ -30,6 +30,8 @@ STDERR: Final = "standard error"
 def run_service(config: "Config", seconds: float | None, viewer_mode: str | None) -> None:
     """Run the service with a live table in a terminal, or with log lines if standard output is not a terminal.
 
+    Without a terminal, the final table is printed when the service ends.
+
     Parameters
     ----------
     config : Config
@@ -206,7 +208,7 @@ def _with_viewer(config: "Config", viewer: str | None) -> "Config":
 def _stderr_through(writer: "QueuedWriter") -> Iterator[None]:
     """Redirect standard error to a writer thread.
 
-    If the thread is still blocked at the end, standard error is closed, so that the process can end.
+    If the writer thread is still blocked at the end, standard error is redirected to the null device.
     """
     from monitor.publishing.terminal.queued_writer import (
         QueuedLines,

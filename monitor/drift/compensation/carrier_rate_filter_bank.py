@@ -1,19 +1,16 @@
-"""Rate of a carrier that may move at any time: a bank of filters with the "current" statistical model.
+"""Estimation of the angular rate of a moving carrier with a bank of Kalman filters.
 
-Each filter follows Zhou & Kumar 1984, with the one-step prediction as the mean of the acceleration (Yuan et al. 2010).
-The state is [ω, ω̇] with the transition matrix [[1, T], [0, 1]]. For αT ≪ 1, the process noise is white noise of
-intensity 2ασ_a² in ω̈. The manoeuvre frequency α and the variance σ_a² appear only in this product. If time is measured
-in samples and the noise of the measured rate has unit variance, the product is a single number q. The number q
-determines the gains and the memory of the filter.
+Each filter uses the "current" statistical model of Zhou & Kumar (1984) with the mean acceleration of Yuan et al.
+(2010). The filter state consists of the rate ω and its derivative, with the transition matrix [[1, T], [0, 1]]. For αT
+≪ 1, the process noise is white noise of intensity q = 2ασ_a², where α is the manoeuvre frequency and σ_a² is the
+acceleration variance. The intensity q determines the gains and the memory of a filter.
 
-σ_a² adapts to the motion. Filters with memories of 2, 4, 8, … samples run in parallel. At every sample the output comes
-from the filter with the least estimated error, or from the measured rate itself. The mean square error of a filter is
-the noise variance of its output plus the increase of its mean square residual (Mallows' C_p, Technometrics 15, 1973).
-The noise variance and the usual residual are learned at rest, where the rate is zero. The method therefore assumes
-neither white noise nor any other noise model. A residual beyond GATE standard deviations excludes a filter immediately,
-and resets the filter if it persists.
+Filters with memories of 2, 4, 8, … samples run in parallel, and the filter with the least estimated error determines
+the output. The mean square error of a filter is the noise variance of the filter output plus the increase of the mean
+square residual (Mallows' C_p, Technometrics 15, 1973). The noise variance and the normal residual are measured at rest,
+so no noise model is needed. A filter is not used while the residual exceeds GATE standard deviations.
 
-A change between filters would cause an error of the integrated angle. The difference between input and output is
+Switching between filters would cause an error of the integrated angle. The difference between input and output is
 therefore accumulated and slowly added to the output.
 """
 
@@ -31,26 +28,25 @@ RESIDUAL_MEMORY: Final = 64.0
 GATE: Final = 5.0
 """Largest residual, in standard deviations at rest."""
 MAX_GATE_EXCEEDANCES: Final = 3
-"""Successive samples beyond the gate after which a filter is reset."""
+"""Number of successive samples beyond GATE after which a filter is reset."""
 SETTLING_SAMPLES: Final = (6, 48)
-"""Age after a reset at which a filter has reached the steady gains: a multiple of its memory, and a minimum in
-samples."""
+"""Age at which a filter uses the steady-state gains: a multiple of the filter memory, and a minimum in samples."""
 MIN_REST_INTERVALS: Final = 5
-"""Intervals at rest before the output of the filters is used."""
+"""Number of intervals at rest before the output of the filters is used."""
 NOISE_MEMORY_INTERVALS: Final = 60
 """Time constant of the exponential average of the noise, in intervals at rest."""
 DIFFUSE_VARIANCE: Final = 1e12
 """Variance of an unknown state, relative to the variance of a sample."""
 
 RATE, SLOPE, RESIDUAL, NOISE, REST_RESIDUAL = range(5)
-"""Columns of ``bank``: ω, ω̇ per sample, recent mean square residual, variance of the estimate at rest, and mean square
-residual at rest. The first row describes the measured rate itself, of which only NOISE is used."""
+"""Columns of ``bank``: ω, change of ω per sample, recent mean square residual, variance of the estimate at rest, and
+mean square residual at rest. The first row of ``bank`` describes the measured rate."""
 AGE, EXCEEDANCES = range(2)
 """Columns of ``ages``: samples since the reset of a filter, and successive samples beyond the gate."""
 
 
 def choose_memory_lengths(rate_hz: float) -> Ints:
-    """Return the filter memories in samples: 2, 4, 8, … up to about MAX_MEMORY_S.
+    """Return the memory lengths of the filters in samples: 2, 4, 8, … up to about MAX_MEMORY_S.
 
     >>> choose_memory_lengths(4.0).tolist()
     [2, 4, 8, 16, 32]
@@ -59,19 +55,19 @@ def choose_memory_lengths(rate_hz: float) -> Ints:
 
 
 def process_noise_intensity(memory_samples: int) -> float:
-    """Return the noise intensity 2ασ_a² of a filter that reduces the noise variance by the factor ``memory_samples``.
+    """Return the process noise intensity of a filter that divides the noise variance by ``memory_samples``.
 
-    Time is measured in samples, and the noise of the measured rate has unit variance. For the intensity q, the steady
-    gain is about √2 q^¼, and the variance of the output is 3/4 of the gain.
+    Time is measured in samples, and the noise of the measured rate has unit variance. For the intensity q, the
+    steady-state gain is about √2 q^¼, and the variance of the filter output is 3/4 of the gain.
     """
     return (4.0 / (3.0 * memory_samples) / sqrt(2.0)) ** 4
 
 
 def compute_gain_table(memories: Ints) -> tuple[Floats, Ints]:
-    """Return one table with the gains of all filters, and the first row of each filter.
+    """Return a table with the gains of all filters, and the index of the first row of each filter.
 
-    The table [rows, 2] has the gains of ω and ω̇, with one row for each age of a filter in samples. The last row of a
-    filter has the steady gains. ``memories`` are the memories of the filters in samples.
+    The table has the shape [rows, 2], with the gains of ω and of the derivative of ω. Each row corresponds to an age of
+    a filter in samples. The last row of each filter contains the steady-state gains.
     """
     tables = [
         _gains(process_noise_intensity(int(memory)), max(SETTLING_SAMPLES[0] * int(memory), SETTLING_SAMPLES[1]))
@@ -82,7 +78,7 @@ def compute_gain_table(memories: Ints) -> tuple[Floats, Ints]:
 
 @compiled
 def _gains(q: float, rows: int) -> Floats:
-    """Return the gains [rows, 2] of a filter with an unknown initial state by the Riccati recursion."""
+    """Return the gains [rows, 2] of a filter with an unknown initial state, computed by the Riccati recursion."""
     out = np.empty((rows, 2))
     p00, p01, p11 = DIFFUSE_VARIANCE, 0.0, DIFFUSE_VARIANCE
     for k in range(rows):
@@ -105,25 +101,24 @@ def filter_rate_sample(
     feedback: Floats,
     feedback_share: float,
 ) -> float:
-    """Process one sample of one axis, and return the filtered rate.
+    """Filter one sample of a gyro axis with all filters, and return the filtered rate.
 
     Parameters
     ----------
     unbiased_rate : float
         Measured rate minus the bias, rad/s.
     bank : ndarray, shape (filters + 1, 5)
-        State of the filters. It is updated in place.
+        State of the filters, updated in place.
     ages : ndarray, shape (filters, 2), int64
-        Ages and gate exceedances of the filters. They are updated in place.
+        Ages and gate exceedances of the filters, updated in place.
     gains, first_gain_rows : ndarray
         Gains and first rows as ``compute_gain_table`` returns them.
     square_sums : ndarray, shape (filters + 1, 2)
-        Sums of the squares of estimate and residual. They are updated in place, and used later if the sample was at
-        rest.
+        Sums of the squared estimates and of the squared residuals. The sums are updated in place.
     feedback : ndarray, shape (1,)
-        Accumulated difference of input and output, in rad/s times samples. It is updated in place.
+        Accumulated difference of input and output in rad/s times samples, updated in place.
     feedback_share : float
-        Share of the feedback that is added to the output in each sample.
+        Share of the accumulated difference that is added to the output at each sample.
 
     Returns
     -------
@@ -164,16 +159,16 @@ def filter_rate_sample(
 
 @compiled
 def predict_over_gap(bank: Floats, ages: Ints, missing_samples: int) -> None:
-    """Advance the filters over missing samples.
+    """Predict the state of the filters over missing samples.
 
-    Filters predict along their slopes. Filters with a memory shorter than the gap are reset.
+    Filters whose memory is shorter than the gap are reset.
 
     Parameters
     ----------
     bank : ndarray, shape (filters + 1, 5)
-        State of the filters. It is updated in place.
+        State of the filters, updated in place.
     ages : ndarray, shape (filters, 2), int64
-        Ages and gate exceedances of the filters. They are updated in place.
+        Ages and gate exceedances of the filters, updated in place.
     missing_samples : int
         Number of missing samples.
     """
@@ -187,12 +182,12 @@ def predict_over_gap(bank: Floats, ages: Ints, missing_samples: int) -> None:
 
 @compiled
 def apply_bias_change(bank: Floats, bias_change: float) -> None:
-    """Correct the filters after the estimate of the bias has changed.
+    """Correct the rates of the filters after the bias estimate has changed.
 
     Parameters
     ----------
     bank : ndarray, shape (filters + 1, 5)
-        State of the filters. It is updated in place.
+        State of the filters, updated in place.
     bias_change : float
         Increase of the bias, rad/s.
     """
@@ -202,18 +197,18 @@ def apply_bias_change(bank: Floats, bias_change: float) -> None:
 
 @compiled
 def update_rest_noise(bank: Floats, square_sums: Floats, sample_count: float, rest_intervals: int) -> None:
-    """Update the noise at rest with an interval that was at rest.
+    """Update the noise estimates of the filters after an interval at rest.
 
     Parameters
     ----------
     bank : ndarray, shape (filters + 1, 5)
-        State of the filters. It is updated in place.
+        State of the filters, updated in place.
     square_sums : ndarray, shape (filters + 1, 2)
         Sums of ``filter_rate_sample`` over the samples of the interval.
     sample_count : float
-        Number of these samples.
+        Number of samples in the interval.
     rest_intervals : int
-        Number of intervals at rest so far, including this one.
+        Number of intervals at rest so far, including the present interval.
     """
     share = max(1.0 / NOISE_MEMORY_INTERVALS, 1.0 / rest_intervals)
     for j in range(bank.shape[0]):

@@ -1,9 +1,7 @@
-"""Quality of a compensated rate at rest. All methods are evaluated in the same way.
+"""Quality of a compensated gyro rate at rest.
 
-Samples that a method has used for learning are not evaluated. A method that learns from a whole recording therefore
-learns from one part and is evaluated on another part. A filter that uses only past samples needs no separate part. The
-mean of the learning part is subtracted from the uncompensated rate. Otherwise, the removal of a constant bias would
-count as an improvement.
+Samples that were used for learning are not evaluated. The mean of the learning samples is subtracted from the
+uncompensated rate, because the removal of a constant bias is not an improvement of the drift.
 """
 
 from dataclasses import dataclass
@@ -16,12 +14,15 @@ from monitor.estimation.allan.batch import cluster_sizes, overlapping_avar_axis
 
 MINUTE_S: Final = 60.0
 SPANS_S: Final = (60.0, 600.0, 3600.0)
-"""Averaging periods in seconds for the mean rate, which is the mean error of the heading rate."""
+"""Averaging periods of the mean rate in seconds."""
 
 
 @dataclass(frozen=True, slots=True)
 class RestScore:
-    """Quality of one axis at rest, in rad/s. A value is NaN if the record is too short."""
+    """Quality of the rate of a gyro axis at rest, in rad/s.
+
+    A value is NaN if the recording is too short.
+    """
 
     rms: float  # rms about zero
     worst_minute: float  # largest rms of a minute
@@ -31,7 +32,7 @@ class RestScore:
 
 
 def score_at_rest(angular_rate: Floats, rate_hz: float) -> RestScore:
-    """Return the quality of a rate whose true value is zero.
+    """Return the quality of an angular rate whose true value is zero.
 
     Parameters
     ----------
@@ -64,6 +65,5 @@ def _span_means(x: Floats, samples: int) -> Floats:
 
 
 def _rms(x: Floats) -> float:
-    """Return the rms of the known values."""
     known = x[np.isfinite(x)]
     return float(np.sqrt(np.mean(known**2))) if known.size else np.nan

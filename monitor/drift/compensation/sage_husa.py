@@ -1,23 +1,19 @@
-"""Adaptive Kalman filter with an ARMA model for the bias of one gyro axis. The time step is one interval.
+"""Adaptive Kalman filter for the bias of a gyro axis. The time step is one interval.
 
-The state is [x, x̂, level]. The elements x and x̂ are the ARMA process and its one-step prediction (see ``arma``). The
-level is a slow random walk, for changes that are slower than the record used for the identification. The measurement z
-is the sum of x, level and white noise v. The noise variances are estimated continuously after Sage and Husa (1969), in
-a form that keeps them positive. With the innovation ε, its variance S and the weight d_k = (1 − b)/(1 − b^{k+1}) of
-interval k:
+The state is [x, x̂, level], where x is an ARMA process and x̂ is the one-step prediction of x. The level is a slow
+random walk. The measured interval mean is z = x + level + v, where v is white noise. The noise variances Q̂ and R̂ are
+estimated after Sage and Husa (1969), in a form that keeps Q̂ and R̂ positive. With the innovation ε, the variance S of
+ε, and the weight d_k = (1 − b)/(1 − b^{k+1}) of interval k:
 
     Q̂ ← Q̂ + d Q̂ D (ε² − S) Dᵀ Q̂,  D = Hᵀ/S        R̂ ← (1 − d) R̂ + d [(1 − H K)² ε² + H P Hᵀ]
 
-Q̂ starts as s B Bᵀ and keeps this form, so only s is updated: s ← s + d s² (ε² − S)/S². The lower limit of R̂ is half
-of the variance that follows from the scatter within intervals. The lower limit of s is MIN_VARIANCE_SHARE of the
-identified value. Without these limits, the estimates could become zero. The means q̂ and r̂ of the noise are not
-estimated, because they cannot be distinguished from the level. On recordings at rest, estimated means increased the
-error up to three times.
+The matrix Q̂ equals s B Bᵀ, so only the factor s is updated: s ← s + d s² (ε² − S)/S². Lower limits prevent s and R̂
+from becoming zero. The means of the noise are not estimated, because estimated means increased the error up to three
+times on recordings at rest.
 
-An interval is rejected if its innovation exceeds OUTLIER_SIGMAS standard deviations, or if its scatter is far above the
-usual scatter. Slow rotation increases the innovation and the scatter, but the rate may pass through zero. After a
-rejected interval, intervals are used again only after GUARD_INTERVALS successive intervals agree. A step of the bias is
-assumed if the new value persists for as long as the previous level was confirmed. The limits are 10 s and 5 min.
+An interval is rejected as an outlier if the innovation exceeds OUTLIER_SIGMAS standard deviations, or if the scatter
+within the interval is unusually large. After an outlier, GUARD_INTERVALS successive intervals must agree before the
+filter uses intervals again. If the bias persists at a new value, the filter assumes a step of the bias.
 """
 
 from typing import Final
@@ -31,25 +27,26 @@ from monitor.drift.compensation.arma import ArmaModel, stationary_covariance
 FORGETTING_FACTOR: Final = 0.995
 """Forgetting factor b of the noise estimate. It corresponds to 200 intervals."""
 MIN_VARIANCE_SHARE: Final = 0.05
-"""Lower limit of s, as a share of the identified variance of a."""
+"""Lower limit of s, relative to the identified innovation variance."""
 OUTLIER_SIGMAS: Final = 6.0
 """Largest innovation of an accepted interval, in predicted standard deviations."""
 MAX_SCATTER_RATIO: Final = (16.0, 10.0)
-"""Largest variance within an interval relative to the usual one, and the number of intervals that define the usual one.
-Noise alone exceeds the limit with a probability of 1e-6 or less."""
+"""Largest ratio of the scatter of an interval to the average scatter, and smallest number of averaged intervals.
+
+White noise exceeds the limit with a probability of 1e-6 or less.
+"""
 GUARD_INTERVALS: Final = 5.0
-"""Intervals that must agree after a rejected interval."""
+"""Number of successive intervals that must agree after a rejected interval."""
 AGREEMENT_SIGMAS: Final = 4.0
 """Largest difference of two intervals at rest that agree, in standard deviations of the difference."""
 STEP_INTERVALS: Final = (10.0, 300.0)
 """Smallest and largest number of intervals after which a persistent change counts as a step."""
 MIN_CONFIRMED_INTERVALS: Final = 5
-"""Successive intervals at rest that confirm the first level, because the carrier may rotate at the start."""
+"""Number of successive intervals at rest that confirm the first bias level."""
 SCATTER_WEIGHT: Final = 0.02
-"""Weight of one interval in the average of the scatter within intervals."""
+"""Weight of an interval in the average scatter."""
 MIN_LEVEL_MEMORY, MAX_LEVEL_MEMORY = 40, 1000
-"""Smallest and largest memory of the level in intervals. Within these limits, the memory is a third of the record used
-for the identification."""
+"""Smallest and largest memory of the bias level in intervals."""
 
 DRIFT_FILTER: Final = np.dtype(
     [
@@ -73,18 +70,20 @@ DRIFT_FILTER: Final = np.dtype(
     ],
     align=True,
 )
-"""Fields of the filter of one axis. Compiled code reads and writes a record of this type in place."""
+"""Fields of the filter of a gyro axis."""
 NOT_AT_REST, USED, REJECTED, STEPPED = range(4)
-"""Outcomes of an interval: not at rest, used, rejected, or used as a step of the bias."""
+"""Possible outcomes of an interval: not at rest, used, rejected, or used as a step of the bias."""
 
 
 def restart_with_model(drift_filter: np.void, model: ArmaModel) -> None:
-    """Set a new model. The state becomes unknown, and the noise is that of the identification.
+    """Restart the filter with a new ARMA model.
+
+    The state becomes unknown, and the noise variances are those of the new model.
 
     Parameters
     ----------
     drift_filter : record of DRIFT_FILTER
-        Filter of one axis. It is updated in place.
+        Filter of a gyro axis, updated in place.
     model : ArmaModel
         Identified model, in rad/s.
     """
@@ -105,7 +104,7 @@ def restart_with_model(drift_filter: np.void, model: ArmaModel) -> None:
 
 @compiled
 def predict_next_interval(drift_filter: np.void) -> None:
-    """Predict the state of the next interval."""
+    """Predict the state of the filter for the next interval."""
     phi1, phi2, g1, s = drift_filter["phi1"], drift_filter["phi2"], drift_filter["g1"], drift_filter["variance"]
     x, p = drift_filter["state"], drift_filter["covariance"]
     x[0], x[1] = x[1], phi2 * x[0] + phi1 * x[1]
@@ -120,14 +119,14 @@ def predict_next_interval(drift_filter: np.void) -> None:
 
 @compiled
 def process_interval_in_motion(drift_filter: np.void) -> None:
-    """Process an interval in motion."""
+    """Process an interval in motion, which discards a bias level that is not confirmed yet."""
     if drift_filter["rest_count"] < MIN_CONFIRMED_INTERVALS:
         drift_filter["rest_count"] = 0.0
 
 
 @compiled
 def expected_bias_and_variance(drift_filter: np.void) -> tuple[float, float]:
-    """Return the expected bias of the interval in rad/s and its variance in (rad/s)²."""
+    """Return the predicted bias in rad/s and the variance of the prediction in (rad/s)²."""
     x, p = drift_filter["state"], drift_filter["covariance"]
     return x[0] + x[2], p[0, 0] + 2.0 * p[0, 2] + p[2, 2]
 
@@ -136,12 +135,12 @@ def expected_bias_and_variance(drift_filter: np.void) -> tuple[float, float]:
 def update_with_interval(
     drift_filter: np.void, interval_mean: float, scatter_variance: float, min_variance: float
 ) -> tuple[float, int]:
-    """Process the mean of an interval at rest.
+    """Update the filter with the mean of an interval at rest.
 
     Parameters
     ----------
     drift_filter : record of DRIFT_FILTER
-        Filter of one axis. It is updated in place.
+        Filter of a gyro axis, updated in place.
     interval_mean : float
         Mean of the interval, rad/s.
     scatter_variance : float
@@ -182,7 +181,7 @@ def update_with_interval(
 
 @compiled
 def _update_scatter(drift: np.void, scatter: float, least: float) -> bool:
-    """Update the average scatter, and return True if the scatter is far above the usual scatter."""
+    """Update the average scatter within intervals, and return True if the new scatter is unusually large."""
     usual = max(drift["scatter"], least)
     loud = drift["scatter_count"] >= MAX_SCATTER_RATIO[1] and scatter > MAX_SCATTER_RATIO[0] * usual
     if scatter == scatter and not loud:
@@ -193,7 +192,8 @@ def _update_scatter(drift: np.void, scatter: float, least: float) -> bool:
 
 @compiled
 def _model_level_only(drift: np.void, z: float, least: float) -> None:
-    """Set the noise before the first identification, when the model is a slowly varying level with white noise."""
+    """Set the noise variances before the first identification, when the model is a slowly varying level with white
+    noise."""
     drift["white_variance"] = max(drift["scatter"], least)
     drift["level_variance"] = drift["white_variance"] / MIN_LEVEL_MEMORY**2
     if drift["rest_count"] == 0.0:
@@ -202,7 +202,7 @@ def _model_level_only(drift: np.void, z: float, least: float) -> None:
 
 @compiled
 def _process_outlier(drift: np.void, z: float, e: float) -> int:
-    """Process an outlier with innovation ``e``, and return REJECTED, or STEPPED if the new value has persisted."""
+    """Process an outlier with the innovation ``e``, and return REJECTED or STEPPED."""
     if drift["rest_count"] < MIN_CONFIRMED_INTERVALS:
         drift["state"][2], drift["covariance"][2, 2], drift["rest_count"] = z, drift["white_variance"], 1.0
         return REJECTED
@@ -219,13 +219,13 @@ def _process_outlier(drift: np.void, z: float, e: float) -> int:
 
 @compiled
 def _agree(drift: np.void, z: float, sigmas: float) -> bool:
-    """Return True if a mean agrees with the last outlier."""
+    """Return True if an interval mean agrees with the last outlier."""
     return bool((z - drift["last_outlier"]) ** 2 < 2.0 * sigmas * sigmas * drift["white_variance"])
 
 
 @compiled
 def _adapt_noise(drift: np.void, e: float, total: float, least: float) -> None:
-    """Update the noise estimate with an innovation ``e`` of variance ``total``, after the correction of the state."""
+    """Update the noise variances with an innovation ``e`` of variance ``total``."""
     d = (1.0 - FORGETTING_FACTOR) / (1.0 - FORGETTING_FACTOR ** (drift["rest_count"] + 1.0))
     r = drift["white_variance"]
     left = r / total  # 1 − H K
@@ -238,7 +238,7 @@ def _adapt_noise(drift: np.void, e: float, total: float, least: float) -> None:
 
 @compiled
 def _correct(drift: np.void, e: float) -> None:
-    """Correct state and covariance with the innovation ``e``: add K ε, and multiply P by I − K H."""
+    """Correct the state and the covariance with the innovation ``e``."""
     x, p = drift["state"], drift["covariance"]
     h = p[0, 0] + p[2, 0], p[0, 1] + p[2, 1], p[0, 2] + p[2, 2]  # H P
     total = h[0] + h[2] + drift["white_variance"]
@@ -253,12 +253,12 @@ def _correct(drift: np.void, e: float) -> None:
 def refilter_history(
     drift_filter: np.void, interval_means: Floats, scatter_variances: Floats, min_variance: float
 ) -> None:
-    """Run the filter over all stored intervals after ``restart_with_model``.
+    """Run the filter over all stored intervals, after ``restart_with_model``.
 
     Parameters
     ----------
     drift_filter : record of DRIFT_FILTER
-        Filter of one axis. It is updated in place.
+        Filter of a gyro axis, updated in place.
     interval_means : ndarray, shape (n,)
         Interval means in rad/s, oldest first; NaN = not at rest.
     scatter_variances : ndarray, shape (n,)

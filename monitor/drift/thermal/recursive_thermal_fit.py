@@ -1,14 +1,10 @@
-"""Recursive least squares: update of the coefficients of a thermal model with each interval.
+"""Recursive least squares, which updates the coefficients of a thermal model with each interval.
 
-The terms of the model, the time constants and φ are not changed. The whitened regressors and values of all intervals
-are stored as the triangular factor R of their QR decomposition. A new interval adds one row, and R is made triangular
-again (Golub & Van Loan, Matrix Computations, 6.5). Except for rounding, the coefficients agree with least squares over
-the whole record, and the cost does not grow with the record. R has further columns for the derivatives with respect to
-the time constants. These columns do not affect the coefficients, but they add the uncertainty of the time constants to
-the prediction intervals.
-
-If the temperature of an interval is missing, the previous temperature is used. A fit to the whole record interpolates
-missing temperatures.
+The regressors and values of all intervals are stored as the triangular factor R of a QR decomposition, which is updated
+with each interval (Golub & Van Loan, Matrix Computations, 6.5). The coefficients equal those of a least-squares fit to
+all intervals, except for rounding errors. Additional columns of R contain the derivatives with respect to the time
+constants. The derivatives add the uncertainty of the time constants to the prediction intervals. The time constants and
+φ are not updated.
 """
 
 from dataclasses import dataclass, replace
@@ -33,26 +29,26 @@ from monitor.drift.thermal.thermal_response import ThermalModelForm, build_regre
 
 @dataclass(frozen=True, slots=True)
 class PredictionInterval:
-    """Predicted mean of one interval and its 95 % prediction interval, rad/s or m/s²."""
+    """Predicted mean of one interval, with a 95 % prediction interval, in rad/s or m/s²."""
 
     bias: float
     lo: float
     hi: float
 
     def side_of_interval(self, bias: float) -> int:
-        """Return 1 if the bias lies above the interval, −1 if below, and 0 if inside or not measured."""
+        """Return 1 if the bias lies above the prediction interval, -1 if the bias lies below, and 0 otherwise."""
         return int(bias > self.hi) - int(bias < self.lo)
 
 
 class RecursiveThermalFit:
-    """Thermal model with coefficients that are updated recursively.
+    """Thermal model with recursively updated coefficients.
 
     Parameters
     ----------
     model : ThermalModel
-        Model whose terms, time constants, φ and reference temperature are used. The coefficients are computed again.
+        Thermal model whose terms, time constants, φ and reference temperature are used.
     means : IntervalMeans
-        Intervals so far.
+        Interval means so far.
     """
 
     def __init__(self, model: ThermalModel, means: IntervalMeans) -> None:
@@ -85,15 +81,14 @@ class RecursiveThermalFit:
 
     @property
     def degrees_of_freedom(self) -> int:
-        """Return the degrees of freedom of the residuals."""
+        """Return the number of degrees of freedom of the residuals."""
         taken = self._terms + 2 * self._k + (self._model.phi > 0.0)
         return max(self._count - taken, 1)
 
     def predict_multi_and_one_step(self, temperature_c: float) -> tuple[PredictionInterval, PredictionInterval]:
-        """Return the multi-step and the one-step prediction of the next interval from its temperature in °C.
+        """Return the multi-step and the one-step prediction of the next interval for a temperature in °C.
 
-        The prediction intervals use Student's t distribution, because the scatter is at first estimated from few
-        intervals.
+        The prediction intervals use Student's t distribution, because few intervals may be known.
         """
         model = self.model
         excess = np.array([self._excess, temperature_c - model.reference_c if np.isfinite(temperature_c) else np.nan])
@@ -112,7 +107,7 @@ class RecursiveThermalFit:
         return both[0], both[1]
 
     def add_interval(self, temperature_c: float, bias: float) -> None:
-        """Add an interval.
+        """Update the coefficients with the temperature and the bias of an interval.
 
         Parameters
         ----------
@@ -139,8 +134,7 @@ class RecursiveThermalFit:
             self.model = self._with_current_coefficients(lowest, highest)
 
     def _next_row(self, excess: float, ends: tuple[float, float] | None) -> tuple[Floats, Floats, Floats]:
-        """Return the regressors of the next interval with their derivatives, the updated lags, and the updated
-        initial-state responses."""
+        """Return the regressors of the next interval, the updated lags, and the updated initial-state responses."""
         lags = self._decays * self._lags + (1.0 - self._decays) * excess
         left = self._initial_responses * self._decays
         shape = replace(self._model.shape, constants_s=())
@@ -149,7 +143,7 @@ class RecursiveThermalFit:
         return np.concatenate([first, lags[1], left[1], *by]), lags, left
 
     def _with_current_coefficients(self, lowest_c: float, highest_c: float) -> ThermalModel:
-        """Return the model with coefficients from all intervals so far."""
+        """Return the thermal model with coefficients from all intervals so far."""
         own = self._terms + self._k
         x, z = self._triangle[:, :own], self._triangle[:, -1]
         scale = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
@@ -169,5 +163,4 @@ class RecursiveThermalFit:
 
 
 def _upper_triangle(rows: Floats) -> Floats:
-    """Return the factor R of the QR decomposition of the rows."""
     return np.asarray(np.linalg.qr(rows, mode="r"))

@@ -1,12 +1,8 @@
-"""Test for a dependence of the bias on temperature, and noise coefficients after removal of this dependence.
+"""Noise coefficients of a recording after the temperature dependence of the bias has been removed.
 
-The input is the analysis of a recording and the temperature of each sample. ``temperature_dependence`` tests the bias
-of each axis for a dependence on temperature against a null hypothesis of correlated noise. If the dependence is
-significant, a model of ``thermal_fit`` is subtracted from the samples. The model is interpolated smoothly between the
-middles of the intervals, because steps and corners would add noise. The Allan deviation and the coefficients are then
-computed again. Axes without a significant dependence are not changed and not reported.
-
-A model can follow a part of a random walk by chance. A share of a few percent of K or R is therefore not significant.
+The bias of each axis is tested for a dependence on temperature. A significant dependence is modelled and subtracted
+from the samples, and the noise coefficients are computed again. A model can follow a part of a random walk by chance,
+so a change of K or R by a few percent is not significant.
 """
 
 from collections.abc import Mapping
@@ -31,7 +27,7 @@ SLOW_LETTERS: Final = ("K", "R")
 
 @dataclass(frozen=True, slots=True)
 class TemperatureRemoval:
-    """Dependence of each axis on temperature, and the coefficients after its removal from the bias."""
+    """Temperature dependence of each axis, and the noise coefficients before and after removing the dependence."""
 
     models: Mapping[str, str]  # axis -> form of its model, for the axes with a fitted model
     before: Coefficients
@@ -41,13 +37,13 @@ class TemperatureRemoval:
 
     @property
     def axes_explained_by_temperature(self) -> tuple[str, ...]:
-        """Return the axes on which temperature explains most of the slow variance."""
+        """Return the axes on which temperature explains most of the bias variation."""
         return tuple(axis for axis, one in self.dependences.items() if one.explains_most_variance)
 
     def variance_share_of_temperature(self, letter: str, axis: str) -> float | None:
-        """Return the share of a coefficient's variance that temperature explains: 1 − after²/before².
+        """Return the share of the variance of a noise coefficient that temperature explains, 1 − after²/before².
 
-        If only an upper bound is known after the removal, the result is a lower bound of the share.
+        If only an upper bound of the coefficient is known after the removal, the result is a lower bound.
 
         Parameters
         ----------
@@ -59,7 +55,7 @@ class TemperatureRemoval:
         Returns
         -------
         float or None
-            The share, at least 0. None if the coefficient was not estimated before the removal, or is unknown after it.
+            The share, at least 0. None if the coefficient is not known before or after the removal.
         """
         at = SYMBOLS.index(letter), AXES.index(axis)
         if self.before.status[at] != Status.ESTIMATED or self.coefficients.status[at] == Status.UNESTIMATED:
@@ -69,8 +65,10 @@ class TemperatureRemoval:
         return max(1.0 - (after / float(self.before.value[at])) ** 2, 0.0)
 
     def coefficient_decreased_significantly(self, letter: str, axis: str) -> bool:
-        """Return True if the upper limit of the new coefficient lies below the confidence interval of the old
-        coefficient.
+        """Return True if the removal of the temperature dependence has reduced a noise coefficient significantly.
+
+        The reduction is significant if the confidence intervals of the coefficient before and after the removal do not
+        overlap.
 
         Parameters
         ----------
@@ -86,7 +84,7 @@ class TemperatureRemoval:
 
 
 def temperature_varied(temperatures_c: Floats) -> bool:
-    """Return True if temperature [n] in °C is known and varied by more than MIN_SWING_C."""
+    """Return True if the temperature [n] in °C is known and has a range of more than MIN_SWING_C."""
     return (
         bool(np.isfinite(temperatures_c).any())
         and float(np.ptp(temperatures_c[np.isfinite(temperatures_c)])) > MIN_SWING_C
@@ -96,7 +94,7 @@ def temperature_varied(temperatures_c: Floats) -> bool:
 def remove_temperature_effect(
     analysis: Analysis, temperature_c: Floats, parallel_map: EachAxis = map
 ) -> TemperatureRemoval | None:
-    """Return the coefficients of an analysis without the temperature part of the bias.
+    """Return the noise coefficients of an analysis after removing the temperature dependence of the bias.
 
     Parameters
     ----------
@@ -110,7 +108,7 @@ def remove_temperature_effect(
     Returns
     -------
     TemperatureRemoval or None
-        None if no axis depends on temperature.
+        The new coefficients, or None if no axis depends on temperature.
     """
     rate_hz = analysis.estimate.rate_hz
     interval_s = choose_interval_s(len(analysis.values) / rate_hz, rate_hz)
@@ -142,9 +140,9 @@ def remove_temperature_effect(
 
 
 def interpolate_with_zero_mean(interval_values: Floats, interval_samples: int, n_samples: int) -> Floats:
-    """Interpolate interval values by a smooth curve of n samples with zero mean.
+    """Interpolate interval values to samples with a natural cubic spline, and subtract the mean.
 
-    The curve is a natural cubic spline through the middles of the intervals, and linear beyond them.
+    The spline passes through the middles of the intervals, and continues linearly beyond the first and the last middle.
 
     Parameters
     ----------
@@ -174,9 +172,9 @@ def interpolate_with_zero_mean(interval_values: Floats, interval_samples: int, n
 
 
 def _natural_spline(y: Floats) -> Floats:
-    """Return the second derivatives of the natural cubic spline through y [n ≥ 2] at steps of one.
+    """Return the second derivatives of the natural cubic spline through the values y [n ≥ 2] at unit steps.
 
-    de Boor, A Practical Guide to Splines, 1978, chapter IV: the system of M is tridiagonal, (1, 4, 1) / 6.
+    The tridiagonal system (1, 4, 1) / 6 is described by de Boor, A Practical Guide to Splines, 1978, chapter IV.
 
     >>> _natural_spline(np.array([0.0, 1.0, 0.0])).tolist()
     [0.0, -3.0, 0.0]

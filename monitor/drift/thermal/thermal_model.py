@@ -1,9 +1,8 @@
-"""Model of bias against temperature: its coefficients, their uncertainty, and predictions of interval means.
+"""Model of the bias against temperature, with coefficients, uncertainty and predictions of interval means.
 
-A multi-step prediction uses temperature only. A one-step prediction also uses the bias measured one interval before.
-The prediction intervals apply to the measured mean. They include the uncertainty of coefficients and time constants,
-and the scatter of the means. ``thermal_fit`` chooses and fits models, and ``recursive_least_squares`` updates their
-coefficients with new intervals.
+A multi-step prediction uses only the temperature. A one-step prediction also uses the bias of the previous interval.
+The prediction intervals include the scatter of the interval means, and the uncertainty of coefficients and time
+constants.
 """
 
 from dataclasses import dataclass
@@ -26,7 +25,7 @@ LOG_TIME_CONSTANT_STEP: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class ThermalModel:
-    """Bias of one axis as a function of temperature and its history."""
+    """Model of the bias of an axis as a function of the temperature and its history."""
 
     shape: ThermalModelForm
     interval_s: float
@@ -41,13 +40,12 @@ class ThermalModel:
 
     @property
     def residual_std(self) -> float:
-        """Return the standard deviation of the multi-step residuals, rad/s or m/s²."""
+        """Return the standard deviation of the multi-step residuals in rad/s or m/s²."""
         return float(self.sigma / (1.0 - self.phi**2) ** 0.5)
 
     @property
     def mean_bias_slope(self) -> float:
-        """Return the mean slope of the bias over the temperatures of the fit after all lags have settled, in rad/s or
-        m/s² per °C."""
+        """Return the mean change of the bias per °C, in rad/s or m/s², after all lags have settled."""
         (lo, hi), powers = self.temperature_range_from_reference_c, np.arange(1, self.shape.powers + 1)
         chords = (hi**powers - lo**powers) / (hi - lo)
         return float(
@@ -56,8 +54,8 @@ class ThermalModel:
 
     @property
     def equation(self) -> dict[str, list[float] | float] | None:
-        """Return the coefficients a, b and c of the difference equation in T − reference; None for a polynomial of
-        order 2 or more."""
+        """Return the coefficients a, b and c of the difference equation, or None for a polynomial of order 2 or
+        more."""
         if self.shape.powers > 1:
             return None
         a, b, c = difference_equation_coefficients(self.shape, self.coefficients, self.interval_s)
@@ -65,13 +63,13 @@ class ThermalModel:
 
     @property
     def temperature_range_from_reference_c(self) -> tuple[float, float]:
-        """Return the lowest and the highest temperature of the fit minus the reference, °C."""
+        """Return the lowest and the highest temperature of the fit, minus the reference temperature, in °C."""
         return self.lowest_c - self.reference_c, self.highest_c - self.reference_c
 
 
 @dataclass(frozen=True, slots=True)
 class ThermalPrediction:
-    """Predicted mean of each interval."""
+    """Predicted interval means, with 95 % prediction intervals."""
 
     bias: Floats  # [n] rad/s or m/s²
     lo: Floats  # [n] 95 % prediction interval of the measured mean
@@ -81,10 +79,10 @@ class ThermalPrediction:
 def predict_interval_means(
     model: ThermalModel, temperature_c: Floats, measured_bias: Floats | None = None, starts_with_fit: bool = False
 ) -> ThermalPrediction:
-    """Predict the interval means, multi-step or one-step.
+    """Predict interval means of the bias, either multi-step or one-step.
 
-    Outside the temperatures of the fit, each power continues with its mean slope between the lowest and the highest
-    temperature. The extrapolated change is added to the uncertainty.
+    Outside the temperature range of the fit, each power continues as a straight line, and the extrapolated change is
+    added to the uncertainty.
 
     Parameters
     ----------
@@ -93,12 +91,10 @@ def predict_interval_means(
     temperature_c : ndarray, shape (n,)
         Mean temperature of each interval, °C; NaN = missing.
     measured_bias : ndarray, shape (n,), or None
-        Measured bias of each interval, rad/s or m/s². Each value is used for the prediction of the next interval. None
-        selects the multi-step prediction from temperature only.
+        Measured bias of each interval in rad/s or m/s², for one-step predictions. None selects multi-step predictions.
     starts_with_fit : bool
         True if the first interval is also the first interval of the fit, so that the initial state is known. If False,
-        temperature is assumed to have been constant before the first interval, and the prediction intervals include the
-        uncertainty of this assumption.
+        the temperature before the first interval is assumed to be constant, which increases the uncertainty.
     """
     excess = interpolate_missing_temperatures(temperature_c) - model.reference_c
     columns = build_regressors(
@@ -128,7 +124,7 @@ def predict_bias_and_variance(
     derivatives: Floats,
     measured_bias: Floats | None,
 ) -> tuple[Floats, Floats]:
-    """Return the expected bias of successive intervals, and the variance of a measured mean about it.
+    """Return the predicted bias of successive intervals, and the variance of the prediction errors.
 
     Parameters
     ----------
@@ -143,14 +139,14 @@ def predict_bias_and_variance(
     derivatives : ndarray, shape (n, k)
         Derivatives of ``bias_derivatives_by_time_constant``.
     measured_bias : ndarray, shape (n,), or None
-        Measured bias, rad/s or m/s². Each value except the last is known to the next interval. None selects multi-step.
+        Measured bias in rad/s or m/s², for one-step predictions. None selects multi-step predictions.
 
     Returns
     -------
     bias : ndarray, shape (n,)
-        Expected bias, rad/s or m/s².
+        Predicted bias in rad/s or m/s².
     variance : ndarray, shape (n,)
-        Variance of the measured mean, in the squared unit.
+        Variance of the prediction errors, in the squared unit.
     """
     bias = regressors @ coefficients
     rows = np.hstack([regressors, derivatives])
@@ -169,13 +165,13 @@ def predict_bias_and_variance(
 
 
 def interpolate_missing_temperatures(temperature_c: Floats) -> Floats:
-    """Return the temperature [n] with interpolated gaps. The lags need the temperature within the gaps."""
+    """Return the temperatures [n] with interpolated values for missing temperatures."""
     there = np.flatnonzero(np.isfinite(temperature_c))
     return np.interp(np.arange(temperature_c.size), there, temperature_c[there])
 
 
 def coefficient_covariance(whitened_regressors: Floats, residual_std: float) -> Floats:
-    """Return the covariance [m, m] of least-squares coefficients.
+    """Return the covariance matrix [m, m] of least-squares coefficients.
 
     Parameters
     ----------
@@ -190,7 +186,7 @@ def coefficient_covariance(whitened_regressors: Floats, residual_std: float) -> 
 
 
 def bias_derivatives_by_time_constant(model: ThermalModel, excess_c: Floats, coefficients: Floats) -> Floats:
-    """Return the derivatives [n, k] of the bias with respect to the logarithm of each time constant.
+    """Return the derivatives [n, k] of the bias with respect to the logarithms of the time constants.
 
     Parameters
     ----------
@@ -207,8 +203,7 @@ def bias_derivatives_by_time_constant(model: ThermalModel, excess_c: Floats, coe
 
 
 def regressor_derivatives(shape: ThermalModelForm, excess_c: Floats, interval_s: float) -> Floats:
-    """Return the derivatives [n, 2 k] of the lags and their initial-state responses with respect to the logarithm of
-    each time constant.
+    """Return the derivatives of lags and initial-state responses with respect to the logarithms of the time constants.
 
     Parameters
     ----------
@@ -232,7 +227,7 @@ def regressor_derivatives(shape: ThermalModelForm, excess_c: Floats, interval_s:
 
 
 def combine_regressor_derivatives(shape: ThermalModelForm, derivatives: Floats, coefficients: Floats) -> Floats:
-    """Return the derivatives [n, k] of the bias with respect to the logarithm of each time constant.
+    """Return the derivatives of the bias by combining the derivatives of the regressors with the coefficients.
 
     Parameters
     ----------

@@ -1,16 +1,16 @@
-"""Response of a bias to temperature, as a sum of terms that are linear in their coefficients.
+"""Response of a bias to temperature, as a sum of terms with linear coefficients.
 
-A **lag** describes heat that reaches the sensor with a delay: L_n = p L_{n−1} + (1 − p) T_n, p = exp(−Δt/τ). Thermal
-resistances and capacitances have only real, positive time constants. A difference equation
+A lag describes heat that reaches the sensor with a delay: L_n = p L_{n−1} + (1 − p) T_n, with p = exp(−Δt/τ). Networks
+of thermal resistances and capacitances have only real, positive time constants. A difference equation
 
     Y_n + a_1 Y_{n−1} + … + a_k Y_{n−k} = b_0 T_n + … + b_m T_{n−m} + c
 
-with roots p_1 … p_k is therefore a sum of k lags, each with its own coefficient. m = k − 1, or m = k if a part of the
-bias follows without delay. The equation is stable by construction. Each root also has an initial-state response p^n,
-which is the effect of temperatures before the first interval.
+with the roots p_1 … p_k is therefore a stable sum of k lags. The order m is k − 1, or k if a part of the bias follows
+the temperature without delay. Each root also has an initial-state response p^n, which describes the effect of
+temperatures before the first interval.
 
-A **polynomial** in T is the established alternative without memory. Outside the temperatures of the fit, each power
-continues as the straight line through its end points, because powers diverge.
+A polynomial describes a bias that follows the temperature without delay. Outside the temperature range of the fit, each
+power continues as a straight line.
 """
 
 from dataclasses import dataclass
@@ -23,19 +23,19 @@ from monitor.common.compiled import compiled
 
 @dataclass(frozen=True, slots=True)
 class ThermalModelForm:
-    """Form of the model: its nonlinear parameters."""
+    """Form of a thermal model: the order of the polynomial, and the time constants of the lags."""
 
     powers: int  # order of the polynomial in T − reference, which acts without delay
     constants_s: tuple[float, ...]  # time constants of the lags, s
 
     @property
     def difference_equation_order(self) -> int:
-        """Return the order k of the difference equation; 0 for a polynomial."""
+        """Return the order k of the difference equation, which is 0 for a polynomial."""
         return len(self.constants_s)
 
     @property
     def name(self) -> str:
-        """Return the name of the form for display.
+        """Return the name of the model form for display.
 
         >>> ThermalModelForm(0, ()).name, ThermalModelForm(3, ()).name
         ('constant', 'polynomial 3')
@@ -67,7 +67,7 @@ def build_regressors(
     with_initial_state: bool = False,
     range_c: tuple[float, float] | None = None,
 ) -> Floats:
-    """Return the regressors [n, terms]: one, powers of T − reference, lags, and initial-state responses.
+    """Return the regressors [n, terms]: a constant, powers of T − reference, lags, and initial-state responses.
 
     Parameters
     ----------
@@ -78,10 +78,10 @@ def build_regressors(
     interval_s : float
         Length of an interval, s.
     with_initial_state : bool
-        True if each lag has a regressor for its initial state, because the earlier temperature is unknown. False if
-        temperature is assumed to have been constant before the first interval.
+        True to add the initial-state response of each lag. False to assume a constant temperature before the first
+        interval.
     range_c : (float, float) or None
-        Lowest and highest T − reference of the fit, °C. Outside this range, powers continue as straight lines.
+        Lowest and highest T − reference of the fit, °C. Outside of the range, powers continue as straight lines.
 
     Examples
     --------
@@ -99,7 +99,8 @@ def build_regressors(
 
 
 def temperature_beyond_range(excess_c: Floats, range_c: tuple[float, float]) -> Floats:
-    """Return the signed distance of each temperature from the range of the fit in °C; 0 inside.
+    """Return the signed distance of each temperature from the temperature range of the fit in °C. Inside, the distance
+    is 0.
 
     Parameters
     ----------
@@ -112,7 +113,7 @@ def temperature_beyond_range(excess_c: Floats, range_c: tuple[float, float]) -> 
 
 
 def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
-    """Return a power of x, continued outside the range as the straight line through its end points."""
+    """Return a power of x, which continues outside the range as a straight line through the end points."""
     if ends is None or ends[1] <= ends[0]:
         return np.asarray(x**power)
     chord = (ends[1] ** power - ends[0] ** power) / (ends[1] - ends[0])
@@ -121,7 +122,7 @@ def _power(x: Floats, power: int, ends: tuple[float, float] | None) -> Floats:
 
 @compiled
 def apply_first_order_lag(values: Floats, root: float) -> Floats:
-    """Return a first-order lag of x, L_n = p L_{n−1} + (1 − p) x_n, settled at the first value.
+    """Apply a first-order lag, L_n = p L_{n−1} + (1 − p) x_n, which starts at the first value.
 
     Parameters
     ----------
@@ -139,9 +140,7 @@ def apply_first_order_lag(values: Floats, root: float) -> Floats:
 
 
 def solve_least_squares(regressors: Floats, values: Floats) -> Floats:
-    """Return the least-squares coefficients [terms].
-
-    The columns are scaled, so that their units have no effect.
+    """Return the least-squares coefficients [terms], computed with scaled columns.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Thermal models fitted in one recording, and their predictions for another recording."""
+"""Reports of thermal fits to a recording, and of thermal predictions for another recording."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from monitor.drift.thermal.thermal_fit import ThermalFit
 from monitor.drift.thermal.thermal_model import ThermalModel, ThermalPrediction, predict_interval_means
 
 DEFAULT_INTERVALS: Final = 72
-"""Number of intervals in a recording, if no interval is given. The paper uses 72 h in intervals of 1 h."""
+"""Default number of intervals in a recording. Wang et al. use 72 intervals of 1 h."""
 ROUND_INTERVALS_S: Final = (
     0.1,
     0.2,
@@ -39,7 +39,7 @@ ROUND_INTERVALS_S: Final = (
 
 @dataclass(frozen=True, slots=True)
 class ThermalFitReport:
-    """Thermal models fitted in one recording."""
+    """Thermal models that were fitted to a recording."""
 
     recording: str
     interval_s: float
@@ -51,11 +51,11 @@ class ThermalFitReport:
 
 @dataclass(frozen=True, slots=True)
 class ThermalModelComparison:
-    """Comparison of a thermal model with the interval means of a recording."""
+    """Prediction errors of a thermal model for the interval means of a recording."""
 
     multi_step: ThermalPrediction
     one_step: ThermalPrediction
-    offset: float  # mean of measured minus multi-step; a bias changes from one start to the next
+    offset: float  # mean difference of measured and multi-step bias, because the bias differs after each start
     rms: float  # rms of measured minus multi-step, rad/s or m/s²
     rms_without_offset: float  # rms of measured minus multi-step minus offset
     rms_one_step: float  # rms of measured minus one-step
@@ -65,7 +65,7 @@ class ThermalModelComparison:
 
 @dataclass(frozen=True, slots=True)
 class ThermalPredictionReport:
-    """Predictions of models for a recording."""
+    """Prediction errors of the thermal models of all axes for a recording."""
 
     recording: str
     interval_s: float
@@ -76,7 +76,7 @@ class ThermalPredictionReport:
 
 
 def compare_model_with_means(model: ThermalModel, means: IntervalMeans) -> ThermalModelComparison:
-    """Compare a model with interval means that were not used for the fit.
+    """Compare the predictions of a thermal model with interval means that were not used for the fit.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ def compare_model_with_means(model: ThermalModel, means: IntervalMeans) -> Therm
 
 
 def choose_interval_s(recording_s: float, rate_hz: float) -> float:
-    """Return a round interval length in seconds, such that a recording has about DEFAULT_INTERVALS intervals.
+    """Return a round interval length in seconds that divides a recording into about DEFAULT_INTERVALS intervals.
 
     Parameters
     ----------
@@ -122,5 +122,4 @@ def choose_interval_s(recording_s: float, rate_hz: float) -> float:
 
 
 def _rms(x: Floats) -> float:
-    """Return the rms of x."""
     return float(np.sqrt(np.mean(x**2)))
