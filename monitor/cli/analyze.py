@@ -29,7 +29,7 @@ def analyze(
         typer.Option(metavar="FILE.png|.html", help="Allan deviations as a picture, or the whole result as a page."),
     ] = None,
 ) -> None:
-    """Print the Allan deviation of a recording, Q, N, B, K, R with confidence intervals, motion and changes."""
+    """Print the Allan deviations, noise coefficients Q, N, B, K, R, motion and noise changes of a recording."""
     from monitor.commands import analyze as offline
     from monitor.publishing.messages.analysis_json import AnalysisMessage, FailedAnalysisMessage
 

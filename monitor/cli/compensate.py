@@ -30,7 +30,7 @@ def compensate(
         Path | None, typer.Option(metavar="FILE.png", help="Drift and Allan deviations as a picture.")
     ] = None,
 ) -> None:
-    """Write a recording without the drift of its gyroscopes, by the method of the service or another method."""
+    """Remove the gyro drift from a recording, and write the compensated recording."""
     from rich.console import Console
 
     from monitor.commands import compensate as compensating

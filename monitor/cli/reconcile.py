@@ -31,7 +31,7 @@ def reconcile(
     last: options.Last = None,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
-    """Find where recording and model disagree, which effects are missing, and what remains with these effects."""
+    """Compare recordings with a noise model, and find the effects that are missing in the model."""
     check_extra("reconcile", "reconcile")
     from rich.console import Console
 

@@ -29,7 +29,7 @@ def simulate(
     ] = False,
     json: Annotated[Path | None, typer.Option(metavar="FILE", help="Result as JSON; - = standard output.")] = None,
 ) -> None:
-    """Write a recording of a noise model. An incomplete file never appears."""
+    """Simulate a noise model and write the samples to a recording."""
     from monitor.commands import simulate as simulation
     from monitor.noise.model_loading import load_model
 

@@ -81,8 +81,8 @@ def show_progress_bar() -> Iterator[ProgressCallback]:
 
 
 def compile_analysis_kernels(report_progress: ProgressCallback) -> None:
-    """Compile the numerical kernels for the analysis of recordings, unless the kernels are already in the cache on
-    disk."""
+    """Compile the numerical kernels for the analysis of recordings, if the cache on disk does not contain the
+    kernels."""
     from monitor.daemon.kernels import kernel_compilation, kernel_parts
 
     for group in kernel_parts.GROUPS:

@@ -290,8 +290,8 @@ def _to_model(z: Floats, white: float, origin: float, scale: float, best: _Order
 def _confidence_intervals(z: Floats, white: float, order: Order, u: Floats) -> tuple[_Triple, _Triple]:
     """Return the 95 % confidence intervals of φ1, φ2 and θ1 by the profile likelihood.
 
-    If a root of φ nearly cancels θ, the likelihood has a long ridge or two maxima, and the curvature of the likelihood
-    underestimates the uncertainty. The profile likelihood does not depend on the curvature.
+    If a root of φ nearly cancels θ, the likelihood has a long ridge or two maxima. The curvature of the likelihood then
+    underestimates the uncertainty. The confidence intervals therefore cover all maxima within the 95 % limit.
     """
     there = (order[0] > 0, order[0] > 1, order[1] > 0)
     tops = _likelihood_maxima(z, white, order, u)

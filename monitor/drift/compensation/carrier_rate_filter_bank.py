@@ -6,9 +6,10 @@ Each filter uses the "current" statistical model of Zhou & Kumar (1984) with the
 acceleration variance. The intensity q determines the gains and the memory of a filter.
 
 Filters with memories of 2, 4, 8, … samples run in parallel, and the filter with the least estimated error determines
-the output. The mean square error of a filter is the noise variance of the filter output plus the increase of the mean
-square residual (Mallows' C_p, Technometrics 15, 1973). The noise variance and the normal residual are measured at rest,
-so no noise model is needed. A filter is not used while the residual exceeds GATE standard deviations.
+the output. The measured rate is used if no filter has a smaller error. The mean square error of a filter is the noise
+variance of the filter output plus the increase of the mean square residual (Mallows' C_p, Technometrics 15, 1973). The
+noise variance and the normal residual are measured at rest, so no noise model is needed. A filter is not used while the
+residual exceeds GATE standard deviations.
 
 Switching between filters would cause an error of the integrated angle. The difference between input and output is
 therefore accumulated and slowly added to the output.

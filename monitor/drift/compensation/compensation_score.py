@@ -1,7 +1,7 @@
 """Quality of a compensated gyro rate at rest.
 
 Samples that were used for learning are not evaluated. The mean of the learning samples is subtracted from the
-uncompensated rate, because the removal of a constant bias is not an improvement of the drift.
+uncompensated rate, so that the removal of a constant bias does not count as an improvement.
 """
 
 from dataclasses import dataclass

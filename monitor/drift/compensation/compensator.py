@@ -190,7 +190,7 @@ class Compensator:
         # Numba compiles one version per memory layout and access flag, so the array is always contiguous and read-only.
         values = np.ascontiguousarray(values, np.float64).view()
         values.flags.writeable = False
-        # After a gap, the motion detector decides about all waiting blocks at once, and each block may end an interval.
+        # After missing samples, the motion detector decides about all waiting blocks at once. Each may end an interval.
         outcomes = np.empty((len(values) // self.interval_samples + 2 + MAX_PENDING_BLOCKS, 1 + 6 * GYROS))
         filled = _advance(values, self.sample_count, self.block_samples, self._state, out, outcomes)
         self.sample_count += len(values)

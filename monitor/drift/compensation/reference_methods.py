@@ -1,6 +1,6 @@
 """Published methods that remove drift and noise from a finished recording, for comparison.
 
-All methods learn from samples at rest and do not detect motion. The methods ``emd`` and ``wavelet`` need future
+All methods use samples at rest for learning and do not detect motion. The methods ``emd`` and ``wavelet`` need future
 samples. The method ``ar`` assumes that the recording has the spectrum of the noise at rest.
 """
 

@@ -31,9 +31,9 @@ def compute_interval_means(values: Floats, temperature_c: Floats, rate_hz: float
     """Return the means of the bias and the temperature over successive intervals.
 
     An interval is divided into PARTS_PER_INTERVAL parts. The variance of a part is half the mean square difference
-    between the means of neighbouring parts. The standard error is the square root of this variance divided by the
-    number of parts. A drift within the interval has little effect on the standard error. Samples after the last
-    complete interval are not used.
+    between the means of neighbouring parts. The standard error is the square root of the variance divided by the number
+    of parts. A drift within the interval has little effect on the standard error. Samples after the last complete
+    interval are not used.
 
     Parameters
     ----------
