@@ -735,7 +735,11 @@ def test_a_step_of_the_bias_is_an_event_of_its_time():
             rig.station._push(make_block(at * 10_000_000, values, np.full(1000, 20.0), at))
         rig.work(1000.0 + i, drain=i == 59)
         rig.finish_models()
-    told = [event for _, event in rig.caught.events if event.kind == "drift_unexplained" and "step of the bias" in event.text]
+    told = [
+        event
+        for _, event in rig.caught.events
+        if event.kind == "drift_unexplained" and "step of the bias" in event.text
+    ]
     assert [event.axis for event in told] == ["gy"]
     assert told[0].values["bias"]["size"] == pytest.approx(0.02, rel=0.05)
     assert 390 < told[0].t_ns / 1e9 < 510  # as long as the level before had been confirmed, 5 min at most
